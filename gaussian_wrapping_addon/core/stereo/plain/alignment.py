@@ -48,8 +48,9 @@ ANGLES = (0.03, 0.8)
 """Range of the baseline over the depth of sources; those up to :data:`_WIDE` preferred."""
 _WIDE = 0.3
 
-LEAST_GAIN, LEAST_CORRELATION = 0.01, 0.6
-"""Gain of correlation by a move, and correlation after it, for which a plane is moved."""
+LEAST_GAIN, LEAST_CORRELATION, LEAST_TEXTURE_SHARE = 0.01, 0.6, 0.2
+"""Gain of correlation by a move, and correlation after it, for which a plane is moved, if its
+texture has such a share of the power besides noise."""
 
 FALSE_CORRELATION, LEAST_TEXTURE, NOISE_MARGIN = 0.4, 0.12, 1.25
 """A plane whose texture correlates less at both scales is no surface, if there is texture of so
@@ -117,7 +118,10 @@ class Aligner:
             place, best = search.climbed(place, level, steps)
         if search.is_false(place):
             return None
-        if best > start + LEAST_GAIN and best > LEAST_CORRELATION:
+        # Noise takes its share of every correlation.
+        share = search.texture_share(1, 1.0)
+        clear = search.texture_share(1, NOISE_MARGIN) > LEAST_TEXTURE_SHARE
+        if clear and best > start + LEAST_GAIN * share and best > LEAST_CORRELATION * share:
             return plane.moved(*search.plane(place))
         return plane
 
@@ -229,14 +233,18 @@ class _Search:
 
     def is_false(self, place: np.ndarray) -> bool:
         """Tell whether both textures correlate so little that there is no surface at a place."""
-        for level, noise in enumerate(self.aligner.noise):
-            power = self.texture_levels(level) ** 2
-            texture = power - (NOISE_MARGIN * noise) ** 2
-            # Noise takes its share of the correlation.
-            expected = FALSE_CORRELATION * texture / max(power, 1e-12)
-            if texture <= LEAST_TEXTURE**2 or self.score(place, level) >= expected:
+        for level in range(len(STEPS)):
+            share = self.texture_share(level, NOISE_MARGIN)
+            if share * self.texture_levels(level) ** 2 <= LEAST_TEXTURE**2:
+                return False
+            if self.score(place, level) >= FALSE_CORRELATION * share:
                 return False
         return True
+
+    def texture_share(self, level: int, margin: float) -> float:
+        """Return the share of a texture's power that is not noise, taken ``margin`` times."""
+        noise = margin * float(self.aligner.noise[level])
+        return max(0.0, 1.0 - noise**2 / max(self.texture_levels(level) ** 2, 1e-12))
 
     def texture_levels(self, level: int) -> float:
         """Return the root mean square of a texture at the samples, grey levels."""
