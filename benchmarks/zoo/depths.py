@@ -173,7 +173,8 @@ def wrong(maps: Sequence[DepthMap], truth: Sequence[np.ndarray]) -> float:
     """Return per cent of the known pixels whose depth errs by more than :data:`WRONG_SHARE`."""
     pairs = zip(maps, truth, strict=True)
     errors = [np.abs(m.depth / depth - 1.0)[m.confidence > 0] for m, depth in pairs]
-    return round(100.0 * float((np.concatenate(errors) > WRONG_SHARE).mean()), 1)
+    error = np.concatenate(errors)
+    return round(100.0 * float((error > WRONG_SHARE).mean()), 1) if len(error) else 0.0
 
 
 if __name__ == "__main__":

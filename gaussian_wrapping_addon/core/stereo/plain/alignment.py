@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from .evidence import PackedPhotos
 from .evidence_kernels import THROUGH_SHARE, correlate
-from .noise import noise_levels, smoothed_noise
+from .noise import smoothed_noise
 from .planes import LEAST_INVERSE_DEPTH, Plane, image_plane, lifted_pixels, with_ones
 
 SCALES_PX = ((1.5, 8.0), (0.7, 5.0))
@@ -26,6 +26,9 @@ MOST_NOISE_LEVELS, MOST_COARSENING = 0.2, 4.0
 """Noise of a texture, grey levels, from which its scale is made coarser, and the largest factor.
 Noise lowers every correlation: those of a rendered room's true planes fell to .13 to .31
 where its photos were matched at full size."""
+
+NOISY_PHOTOS = 0.8
+"""Quantile of the photos' noise that the scales are made for."""
 
 STEPS = ((0.01, 0.005), (0.0025, 0.00125, 0.0006, 0.0003))
 """Of the search at each scale, as shares of the depth at the edges of the plane's segments."""
@@ -58,7 +61,7 @@ many grey levels (root mean square) besides noise, taken so many times as large 
 fine scale alone refuses planes that are off by a pixel, and walls whose finest texture is that of
 rounding to whole levels."""
 
-_LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 @dataclass(frozen=True)
@@ -87,20 +90,23 @@ class Aligner:
     photos : PackedPhotos
     segments : (n, h, w) int32
         Numbers of the plain segments of each photo from 1, 0 elsewhere.
+    noise : (n,) float64
+        Of the grey levels of each photo.
     """
 
     def __init__(
-        self, photos: PackedPhotos, segments: np.ndarray, random: np.random.Generator
-    ) -> None:
+        self, photos: PackedPhotos, segments: np.ndarray, noise: np.ndarray,
+        random: np.random.Generator,
+    ) -> None:  # fmt: skip
         self.photos, self.plain, self.random = photos, segments > 0, random
-        grey = photos.images @ _LUMA  # (n, h, w)
+        grey = photos.images @ LUMA  # (n, h, w)
         scales = np.array(SCALES_PX)
         # White noise falls with the standard deviation of the Gaussian that smooths it.
-        left = smoothed_noise(noise_levels(list(grey), list(self.plain)), scales[:, 0])  # (2,)
-        coarsening = np.clip(left / MOST_NOISE_LEVELS, 1.0, MOST_COARSENING)
-        scales *= coarsening[:, None]
-        self.noise = left / coarsening
-        """(2,) standard deviation of the noise of both textures, grey levels."""
+        left = smoothed_noise(np.quantile(noise, NOISY_PHOTOS), scales[:, 0])  # (2,)
+        self.coarsening = np.clip(left / MOST_NOISE_LEVELS, 1.0, MOST_COARSENING)
+        scales *= self.coarsening[:, None]
+        self.noise = smoothed_noise(noise, scales[:, :1])
+        """(2, n) standard deviation of the noise of both textures of each photo, grey levels."""
         self.textures = [_textures(grey, segments, *scale) for scale in scales]
 
     def aligned(self, plane: Plane, parts: Sequence[Part]) -> Plane | None:
@@ -233,18 +239,33 @@ class _Search:
 
     def is_false(self, place: np.ndarray) -> bool:
         """Tell whether both textures correlate so little that there is no surface at a place."""
+        spoken = False
         for level in range(len(STEPS)):
             share = self.texture_share(level, NOISE_MARGIN)
             if share * self.texture_levels(level) ** 2 <= LEAST_TEXTURE**2:
+                # Once it is made coarser, the fine scale may refuse alone.
+                if self.aligner.coarsening[1] > 1.0:
+                    continue
                 return False
             if self.score(place, level) >= FALSE_CORRELATION * share:
                 return False
-        return True
+            spoken = True
+        return spoken
 
     def texture_share(self, level: int, margin: float) -> float:
-        """Return the share of a texture's power that is not noise, taken ``margin`` times."""
-        noise = margin * float(self.aligner.noise[level])
-        return max(0.0, 1.0 - noise**2 / max(self.texture_levels(level) ** 2, 1e-12))
+        """Return the share of a texture's power that is not noise, taken ``margin`` times.
+
+        Of the photos of the parts and of those compared with, the geometric mean: as noise lowers
+        a correlation.
+        """
+        power = max(self.texture_levels(level) ** 2, 1e-12)
+        own = np.array([part.view for part in self.parts])
+        others = np.concatenate([part.others for part in self.parts])
+        shares = [
+            max(0.0, 1.0 - float(np.mean((margin * self.aligner.noise[level, views]) ** 2)) / power)
+            for views in (own, others)
+        ]
+        return float(np.sqrt(shares[0] * shares[1]))
 
     def texture_levels(self, level: int) -> float:
         """Return the root mean square of a texture at the samples, grey levels."""
@@ -259,7 +280,8 @@ def _textures(
 ) -> np.ndarray:
     """Return (n, h, w) float32 band of the grey levels of each segment alone, NaN elsewhere.
 
-    The sky beside a wall would otherwise be a step in the wall's own texture.
+    The sky beside a wall would otherwise be a step in the wall's own texture, and shading would be
+    one at its border: a linear fit is taken out.
     """
     band = np.full(grey.shape, np.nan, np.float32)
     for view, numbers in enumerate(segments):
@@ -268,11 +290,20 @@ def _textures(
                 continue
             own = numbers[box] == number
             weight = own.astype(np.float32)
-            weighted = grey[view][box] * weight
+            weighted = np.zeros_like(weight)
+            weighted[own] = _without_slope(own, grey[view][box][own])
             means = [
-                ndimage.gaussian_filter(weighted, sigma)
-                / np.maximum(ndimage.gaussian_filter(weight, sigma), 1e-3)
+                ndimage.gaussian_filter(weighted, sigma, mode="constant")
+                / np.maximum(ndimage.gaussian_filter(weight, sigma, mode="constant"), 1e-3)
                 for sigma in (fine_px, coarse_px)
             ]
             band[view][box][own] = (means[0] - means[1])[own]
     return band
+
+
+def _without_slope(own: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values (p,) at the pixels of a mask less their linear fit."""
+    places = np.stack(np.nonzero(own), 1).astype(np.float64)
+    places = np.column_stack([places - places.mean(0), np.ones(len(places))])  # (p, 3)
+    fit = np.linalg.lstsq(places.T @ places, places.T @ values, rcond=None)[0]
+    return values - places @ fit

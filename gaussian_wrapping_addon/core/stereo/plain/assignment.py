@@ -92,7 +92,7 @@ def on_planes(
 
 def assigned(
     segment: Segment, planes: Sequence[Plane], photos: PackedPhotos, *, first: bool,
-    is_false: Callable[[Assignment], bool] = lambda _: False,
+    is_false: Callable[[Segment, Assignment], bool] = lambda *_: False,
 ) -> Assignment | None:  # fmt: skip
     """Return the planes that explain most of what is known around a segment and pass the votes.
 
@@ -111,7 +111,7 @@ def assigned(
         inverse = assignment.inverse_depths(choices.sampled_on(assignment))
         votes = photos.votes(segment.view, choices.sampled, inverse)
         passes = votes.like >= LEAST_LIKE and votes.through <= through
-        if passes and not is_false(assignment):
+        if passes and not is_false(segment, assignment):
             return assignment
     return None
 
@@ -192,6 +192,7 @@ def continued(
     found: Sequence[Assignment | None],
     planes: Sequence[Plane],
     photos: PackedPhotos,
+    is_false: Callable[[Segment, Assignment], bool] = lambda *_: False,
 ) -> list[Assignment | None]:
     """Return the assignments with those that segments take over from like ones nearby."""
     found = list(found)
@@ -199,7 +200,7 @@ def continued(
         own = [number for number, segment in enumerate(segments) if segment.view == view]
         colors = {n: np.median(_colors(segments[n], photos), axis=0) for n in own}
         for _ in range(SPREADING_TURNS):
-            taken = _taken_over(own, segments, found, colors, planes, photos)
+            taken = _taken_over(own, segments, found, colors, planes, photos, is_false)
             if not taken:
                 break
             for number, assignment in taken.items():
@@ -218,6 +219,7 @@ def _taken_over(
     colors: dict[int, np.ndarray],
     planes: Sequence[Plane],
     photos: PackedPhotos,
+    is_false: Callable[[Segment, Assignment], bool],
 ) -> dict[int, Assignment]:
     """Return the assignments that segments of one photo take over in one turn."""
     view = segments[own[0]].view
@@ -243,7 +245,7 @@ def _taken_over(
                 continue
             assignment = found[int(other)]
             assert assignment is not None  # or it would not be the nearest
-            if _may_have(segment, assignment, planes, photos):
+            if _may_have(segment, assignment, planes, photos) and not is_false(segment, assignment):
                 taken[number] = assignment
                 break
     return taken

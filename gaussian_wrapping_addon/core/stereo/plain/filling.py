@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -13,10 +13,11 @@ from scipy import ndimage
 from ...progress import Progress
 from ..depth_maps import DepthMap
 from ..matching_cost import WORST_COST
-from .alignment import Aligner, Part
+from .alignment import LUMA, Aligner, Part
 from .assignment import FAR_DISTANCE, Assignment, assigned, continued, lies_far, on_planes
 from .candidates import SPEAKING_SHARE, proposed_planes
 from .evidence import AGREEING, NEARER, THROUGH, PackedPhotos, packed
+from .noise import BRIGHTEST, DARKEST, noise_level
 from .planes import (
     LEAST_INVERSE_DEPTH,
     Plane,
@@ -104,16 +105,23 @@ def fill_plain_parts(
         if turn + 1 < TURNS:
             fitted = _fitted(planes, tried, found, depth_maps, photos)
             planes = pooled(fitted)
-    aligner = Aligner(photos, _numbered(segments, photos), random)
+    numbers = _numbered(segments, photos)
+    aligner = Aligner(photos, numbers, _noise(depth_maps, numbers), random)
     planes = _aligned(planes, tried, found, photos, aligner, progress)
-    found = _assigned(tried, planes, photos, progress, first=False, aligner=aligner)
+
+    def is_false(segment: Segment, assignment: Assignment) -> bool:
+        parts = _parts(segment, assignment, planes, photos)
+        return any(aligner.contradicts(*part) for part in parts)
+
+    found = _assigned(tried, planes, photos, progress, first=False, is_false=is_false)
     every = [*tried, *(s for s in segments if not s.large)]
-    found = continued(every, [*found, *[None] * (len(every) - len(tried))], planes, photos)
+    found = [*found, *[None] * (len(every) - len(tried))]
+    found = continued(every, found, planes, photos, is_false)
     found = [
         Assignment(()) if one is None and segment.large and lies_far(segment, photos) else one
         for segment, one in zip(every, found, strict=True)
     ]
-    found = continued(every, found, planes, photos)
+    found = continued(every, found, planes, photos, is_false)
     filled = _Filled(photos, planes)
     for segment, assignment in zip(every, found, strict=True):
         if assignment is not None:
@@ -146,19 +154,26 @@ def _proposals(
 
 def _assigned(
     segments: Sequence[Segment], planes: Sequence[Plane], photos: PackedPhotos,
-    progress: Progress, *, first: bool, aligner: Aligner | None = None,
+    progress: Progress, *, first: bool,
+    is_false: Callable[[Segment, Assignment], bool] = lambda *_: False,
 ) -> list[Assignment | None]:  # fmt: skip
-    """Return the planes of each segment, with an aligner only where the texture allows them."""
     found = []
     for segment in segments:
         progress.check()
-
-        def is_false(assignment: Assignment, segment: Segment = segment) -> bool:
-            parts = _parts(segment, assignment, planes, photos)
-            return aligner is not None and any(aligner.contradicts(*part) for part in parts)
-
         found.append(assigned(segment, planes, photos, first=first, is_false=is_false))
     return found
+
+
+def _noise(depth_maps: Sequence[DepthMap], numbers: np.ndarray) -> np.ndarray:
+    """Return (n,) the noise of the grey levels of each photo, in its plain segments."""
+    found = []
+    for depth_map, own in zip(depth_maps, numbers > 0, strict=True):
+        height, width = depth_map.depth.shape
+        color = depth_map.color.astype(np.float32)
+        shown = ((color > DARKEST) & (color < BRIGHTEST)).all(-1)
+        grey = (color @ LUMA)[..., None]
+        found.append(noise_level(grey, own[:height, :width] & shown))
+    return np.array(found)
 
 
 def _parts(

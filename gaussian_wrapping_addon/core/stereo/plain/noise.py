@@ -3,43 +3,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
 LEAST_PIXELS = 200
-"""Plain pixels of an image below which it does not count."""
+"""Plain pixels of a photo that its noise is measured in, at least."""
+
+DARKEST, BRIGHTEST = 1.0, 254.0
+"""Grey levels between which noise shows."""
 
 _SECOND_DIFFERENCES = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
 _MEDIAN_OF_UNIT_NOISE = 6.0 * 0.6745
 """Of the size of second differences of white noise: their standard deviation is 6."""
 
 
-def noise_levels(images: Sequence[np.ndarray], plain: Sequence[np.ndarray]) -> float:
-    """Return the standard deviation of noise, grey levels, the median over images; 0 if unknown.
+def noise_level(color: np.ndarray, plain: np.ndarray) -> float:
+    """Return the standard deviation of noise of a photo, grey levels, of its channels' mean.
 
     From second differences in both directions, which leave out shading and straight steps
-    [Immerkaer 1996].
+    [Immerkaer 1996]. Too few plain pixels tell no noise: 0.
 
     Parameters
     ----------
-    images : sequence of (h, w) float32
-    plain : sequence of (h, w) bool
-        Pixels without texture, of each image.
+    color : (h, w, c) float32
+        Channels of the photo as taken, or one grey one.
+    plain : (h, w) bool
+        Pixels without texture; those that are black or saturated are left out, as they show none.
     """
-    found = []
-    for image, where in zip(images, plain, strict=True):
-        inner = ndimage.binary_erosion(where, np.ones((3, 3)))
-        if inner.sum() >= LEAST_PIXELS:
-            curved = ndimage.convolve(image, _SECOND_DIFFERENCES)[inner]
-            found.append(float(np.median(np.abs(curved))) / _MEDIAN_OF_UNIT_NOISE)
-    return float(np.median(found)) if found else 0.0
+    shown = ((color > DARKEST) & (color < BRIGHTEST)).all(-1)
+    inner = ndimage.binary_erosion(plain & shown, np.ones((3, 3)))
+    if inner.sum() < LEAST_PIXELS:
+        return 0.0
+    found = [
+        np.median(np.abs(ndimage.convolve(channel, _SECOND_DIFFERENCES)[inner]))
+        for channel in np.moveaxis(color, -1, 0)
+    ]
+    return float(np.mean(found)) / _MEDIAN_OF_UNIT_NOISE
 
 
-def smoothed_noise(noise: float, sigma_px: Any) -> Any:
-    """Return the standard deviation of white noise after Gaussian filters of these widths."""
+def smoothed_noise(noise: Any, sigma_px: Any) -> Any:
+    """Return the standard deviations of white noise after Gaussian filters of these widths."""
     return noise / (2.0 * np.sqrt(np.pi) * sigma_px)
 
 

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from ..depth_maps import DepthMap
 from ..planar_prior import points_in_view
-from .noise import noise_levels, smoothed_step_noise
+from .noise import noise_level, smoothed_step_noise
 
 STEP_LEVELS = 2.5
 """Largest difference of grey levels of neighbours, smoothed by the first of the widths below,
@@ -88,7 +88,9 @@ def plain_pixels(depth_map: DepthMap) -> np.ndarray:
     """Return (h, w) bool: no step of grey levels to a neighbour, and no mask excludes the pixel."""
     color = depth_map.color.astype(np.float32)
     plain = _without_steps(color, SMOOTHING_PX[-1])
-    noise = noise_levels(list(np.moveaxis(color, -1, 0)), [plain] * color.shape[-1])
+    if depth_map.mask is not None:
+        plain &= depth_map.mask
+    noise = noise_level(color, plain)
     for width in SMOOTHING_PX:
         if _step_levels(width) >= CLEAR_OF_NOISE * smoothed_step_noise(noise, width):
             break

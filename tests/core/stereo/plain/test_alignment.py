@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap
 from gaussian_wrapping_addon.core.stereo.plain.alignment import Aligner, Part
 from gaussian_wrapping_addon.core.stereo.plain.evidence import packed
+from gaussian_wrapping_addon.core.stereo.plain.filling import _noise
 from gaussian_wrapping_addon.core.stereo.plain.segments import plain_pixels
 from tests.core.stereo.plain.plain_room import (
+    COUNT,
     FAINT_LEVELS,
+    SKY,
     WALL,
     WALL_Y,
     cameras,
@@ -28,7 +32,7 @@ from tests.core.stereo.plain.test_planes import wall_plane
 def aligner_of(maps) -> Aligner:
     photos = packed(maps, np.random.default_rng(0))
     segments = np.stack([ndimage.label(plain_pixels(found))[0] for found in maps])
-    return Aligner(photos, segments, np.random.default_rng(0))
+    return Aligner(photos, segments, _noise(maps, segments), np.random.default_rng(0))
 
 
 def wall_parts(plain: np.ndarray | None = None) -> list[Part]:
@@ -70,7 +74,7 @@ def test_noise_makes_no_true_plane_false(noise: float) -> None:
     assert np.abs(corners @ found.normal - found.offset).max() < 0.02 * WALL_Y
 
 
-@pytest.mark.parametrize("noise", [1.5, 3.0])
+@pytest.mark.parametrize("noise", [1.5, 3.0, 5.0])
 def test_noise_makes_no_false_plane_true(noise: float) -> None:
     aligner = aligner_of(noisy_maps(noise))
     false = wall_plane().moved(np.array([0.0, 1.0, 0.0]), 0.6 * WALL_Y)
@@ -95,18 +99,43 @@ def test_a_sky_beside_the_wall_is_not_its_texture() -> None:
             assert np.abs(values).max() < 3.0 * FAINT_LEVELS
 
 
-@pytest.mark.parametrize("noise", [0.0, 1.5, 3.0])
-def test_without_texture_a_plane_stays(noise: float) -> None:
-    maps = []
-    for found, random in zip(noisy_maps(noise), np.random.default_rng(2).spawn(99), strict=False):
-        color = found.color.copy()
-        wall = traced(found.camera)[1] == WALL
-        levels = np.array([140, 136, 130]) + noise * random.normal(size=(int(wall.sum()), 3))
-        color[wall] = np.rint(levels).astype(np.uint8)
-        maps.append(dataclasses.replace(found, color=color))
+def without_texture(maps: list[DepthMap], noise: list[float]) -> list[DepthMap]:
+    """Return the maps with a wall of one colour and noise, and a saturated sky, in the photos."""
+    found = []
+    for number, (one, level) in enumerate(zip(maps, noise, strict=True)):
+        part, color = traced(one.camera)[1], one.color.copy()
+        random = np.random.default_rng(number)
+        flat = np.array([140, 136, 130]) + level * random.normal(size=(*part.shape, 3))
+        color[part == WALL] = np.rint(flat).astype(np.uint8)[part == WALL]
+        color[part == SKY] = 255
+        found.append(dataclasses.replace(one, color=color))
+    return found
+
+
+@pytest.mark.parametrize(
+    "noise", [[0.0] * COUNT, [1.5] * COUNT, [3.0] * COUNT, [0.7, 3.0] * (COUNT // 2)]
+)
+def test_without_texture_a_plane_stays(noise: list[float]) -> None:
     start = wall_plane(WALL_Y + 0.05)
+    aligner = aligner_of(without_texture(noisy_maps(0.0), noise))
+    parts = wall_parts(aligner.plain)
+    assert aligner.aligned(start, parts) is start
+    assert not any(aligner.contradicts(start, part) for part in parts)
+
+
+@pytest.mark.parametrize("factor", [0.75, 0.85, 1.2])
+def test_shading_makes_no_false_plane_true(factor: float) -> None:
+    maps = []
+    for found in noisy_maps(3.0):
+        part, points = traced(found.camera)[1:]
+        ramp = np.where(part == WALL, 6.0 * np.where(part == WALL, points[..., 0], 0.0), 0.0)
+        color = np.clip(found.color + np.rint(ramp)[..., None], 0, 255).astype(np.uint8)
+        maps.append(dataclasses.replace(found, color=color))
     aligner = aligner_of(maps)
-    assert aligner.aligned(start, wall_parts(aligner.plain)) is start
+    parts = wall_parts(aligner.plain)
+    assert aligner.aligned(wall_plane(), parts) is not None
+    false = wall_plane().moved(np.array([0.0, 1.0, 0.0]), factor * WALL_Y)
+    assert aligner.aligned(false, parts) is None
 
 
 def test_small_parts_do_not_move_a_plane() -> None:
