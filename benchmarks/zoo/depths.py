@@ -63,6 +63,9 @@ def main(given: Sequence[str] | None = None) -> int:
         "--noise", type=float, default=0.0, metavar="LEVELS",
         help="standard deviation of the noise that photos get, grey levels",
     )  # fmt: skip
+    parser.add_argument(
+        "--jpeg", type=int, default=0, metavar="QUALITY", help="compress photos; 0: do not"
+    )
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, default=DOCUMENTS, help="folder of the page")
     options = parser.parse_args(given)
@@ -72,7 +75,7 @@ def main(given: Sequence[str] | None = None) -> int:
     names = options.only or development
     rows = []
     for name in names:
-        rows.append(_row(name, options.match_px, options.noise, options.threads))
+        rows.append(_row(name, options.match_px, options.noise, options.jpeg, options.threads))
         _logger.info("%s", " ".join(str(cell) for cell in rows[-1]))
     table = Table(
         "Depths before and after planes",
@@ -90,7 +93,9 @@ def main(given: Sequence[str] | None = None) -> int:
         f"`{COMMAND}`, {today}, {processor_name()}, {versions()},",
         f"threads: {options.threads}. Photos of at most",
         f"{PHOTO_PX} px are matched at {options.match_px} px or less,",
-        f"with noise of {options.noise:g} grey levels added. Known is the share of all",
+        f"with noise of {options.noise:g} grey levels added"
+        + (f" and JPEG of quality {options.jpeg}" if options.jpeg else "")
+        + ". Known is the share of all",
         "pixels, within the share of the known ones whose depth errs by less, relative to it, per",
         "cent.",
         "Seconds are of the processor, kernels compiled before.",
@@ -102,11 +107,13 @@ def main(given: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _row(name: str, match_px: int, noise: float, threads: int) -> tuple[str | float | int, ...]:
+def _row(
+    name: str, match_px: int, noise: float, jpeg_quality: int, threads: int
+) -> tuple[str | float | int, ...]:
     at = ensure_zoo_scene(name, threads) if name in SCENES else ensure_scene(name)
     with tempfile.TemporaryDirectory() as folder:
         scene = load_scene(at, Path(folder), Progress())
-        photos = NoisyPhotos(scene, PHOTO_PX, noise)
+        photos = NoisyPhotos(scene, PHOTO_PX, noise, jpeg_quality)
         views = list(training_views(scene, photos, HELD_OUT))
         begun_s = time.process_time()
         matched = estimate_depth_maps(

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Photos with noise: those of the zoo have none, those of cameras do."""
+"""Photos with noise, and compressed ones: those of the zoo are neither, those of cameras are."""
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
+from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
 from gaussian_wrapping_addon.core.dataset.scene import Scene
 
 
 class NoisyPhotos(PhotoStore):
-    """A photo store whose photos get white noise, at full size, before they are made smaller.
+    """A photo store whose photos get white noise and are compressed, at full size.
 
     Parameters
     ----------
@@ -18,16 +21,25 @@ class NoisyPhotos(PhotoStore):
         As for :class:`PhotoStore`.
     noise : float
         Standard deviation in grey levels, of each channel.
+    jpeg_quality : int
+        0: not compressed.
     """
 
-    def __init__(self, scene: Scene, max_image_px: int, noise: float) -> None:
+    def __init__(
+        self, scene: Scene, max_image_px: int, noise: float, jpeg_quality: int = 0
+    ) -> None:
         super().__init__(scene, max_image_px)
-        self._noise = noise
+        self._noise, self._jpeg_quality = noise, jpeg_quality
 
     def _make_photo(self, index: int, divisor: int) -> np.ndarray:
         photo = super()._make_photo(index, divisor)
-        if divisor > 1 or self._noise == 0.0:
+        if divisor > 1:
             return photo  # made from the full size
         random = np.random.default_rng([17, index])
         noisy = photo + self._noise * random.normal(size=photo.shape)
-        return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        photo = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        if self._jpeg_quality == 0:
+            return photo
+        compressed = io.BytesIO()
+        Image.fromarray(photo).save(compressed, "JPEG", quality=self._jpeg_quality)
+        return np.asarray(Image.open(compressed))

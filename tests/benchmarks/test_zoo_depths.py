@@ -31,6 +31,15 @@ def test_noise_is_added_once_at_full_size(tmp_path: Path) -> None:
     np.testing.assert_array_equal(NoisyPhotos(scene, 300, 0.0).photo(0), clean.photo(0))
 
 
+def test_photos_are_compressed(tmp_path: Path) -> None:
+    scene = make_scene(tmp_path, count=1, width=300, height=200)
+    clean = PhotoStore(scene, 300).photo(0).astype(float)
+    good, bad = (NoisyPhotos(scene, 300, 0.0, quality).photo(0) for quality in (95, 20))
+    assert 0.0 < np.abs(good - clean).mean() < np.abs(bad - clean).mean()
+    assert good.dtype == np.uint8
+    assert good.shape == clean.shape
+
+
 def test_known_right_and_wrong_pixels_are_counted() -> None:
     found = depth_map(cameras()[0])
     known = found.confidence > 0

@@ -9,12 +9,10 @@ import numpy as np
 from scipy import ndimage
 
 from ..dataset.camera import Camera
+from ..imaging.luma import LUMA
 from .consistency import NO_BRIGHTNESS, brightness_of, confirm
 from .matching_cost import WORST_COST
 from .sweep import sweep
-
-_GREY = np.array([0.299, 0.587, 0.114])
-"""Luma of ITU-R BT.601."""
 
 _NEAREST = ((-1, 0), (0, -1), (1, 0), (0, 1))
 _FAR_PX = (3, 5, 9, 7)
@@ -35,7 +33,7 @@ NO_DEPTHS = np.zeros(1, np.float32)
 
 def grey_levels(photo: np.ndarray) -> np.ndarray:
     """Return a photo (h, w, 3) uint8 as (h, w) uint8 grey levels."""
-    return np.asarray(photo @ _GREY + 0.5, np.uint8)
+    return np.asarray(photo @ np.array(LUMA) + 0.5, np.uint8)
 
 
 class MatchingLevel:

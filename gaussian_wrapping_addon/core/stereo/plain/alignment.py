@@ -13,10 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from ...imaging.luma import grey_of
+from ...progress import Progress
 from .evidence import PackedPhotos
 from .evidence_kernels import THROUGH_SHARE, correlate
 from .noise import smoothed_noise
 from .planes import LEAST_INVERSE_DEPTH, Plane, image_plane, lifted_pixels, with_ones
+from .segments import Segment, numbered
 
 SCALES_PX = ((1.5, 8.0), (0.7, 5.0))
 """Standard deviations of the two Gaussians whose difference is the texture, coarse and fine, of
@@ -61,8 +64,6 @@ many grey levels (root mean square) besides noise, taken so many times as large 
 fine scale alone refuses planes that are off by a pixel, and walls whose finest texture is that of
 rounding to whole levels."""
 
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-
 
 @dataclass(frozen=True)
 class Part:
@@ -88,18 +89,22 @@ class Aligner:
     Parameters
     ----------
     photos : PackedPhotos
-    segments : (n, h, w) int32
-        Numbers of the plain segments of each photo from 1, 0 elsewhere.
-    noise : (n,) float64
-        Of the grey levels of each photo.
+    segments : sequence of Segment
+        All plain ones.
+    random : numpy.random.Generator
+    progress : Progress
+        Checked for cancellation, here only.
     """
 
     def __init__(
-        self, photos: PackedPhotos, segments: np.ndarray, noise: np.ndarray,
-        random: np.random.Generator,
+        self, photos: PackedPhotos, segments: Sequence[Segment], random: np.random.Generator,
+        progress: Progress,
     ) -> None:  # fmt: skip
-        self.photos, self.plain, self.random = photos, segments > 0, random
-        grey = photos.images @ LUMA  # (n, h, w)
+        numbers = numbered(segments, photos.depths.shape)
+        self.photos, self.plain, self.random = photos, numbers > 0, random
+        noise = np.zeros(len(numbers))
+        for segment in segments:
+            noise[segment.view] = segment.noise
         scales = np.array(SCALES_PX)
         # White noise falls with the standard deviation of the Gaussian that smooths it.
         left = smoothed_noise(np.quantile(noise, NOISY_PHOTOS), scales[:, 0])  # (2,)
@@ -107,7 +112,13 @@ class Aligner:
         scales *= self.coarsening[:, None]
         self.noise = smoothed_noise(noise, scales[:, :1])
         """(2, n) standard deviation of the noise of both textures of each photo, grey levels."""
-        self.textures = [_textures(grey, segments, *scale) for scale in scales]
+        self.textures = np.full((len(scales), *numbers.shape), np.nan, np.float32)
+        """(2, n, h, w) both textures of each photo, NaN outside of its segments."""
+        for view, own in enumerate(numbers):
+            progress.check()
+            grey = grey_of(photos.images[view])
+            for level, scale in enumerate(scales):
+                _draw_texture(grey, own, scale, self.textures[level, view])
 
     def aligned(self, plane: Plane, parts: Sequence[Part]) -> Plane | None:
         """Return the plane where it matches best, or ``None`` where it is no surface.
@@ -275,30 +286,25 @@ class _Search:
         return float(np.sqrt(np.mean(clipped**2)))
 
 
-def _textures(
-    grey: np.ndarray, segments: np.ndarray, fine_px: float, coarse_px: float
-) -> np.ndarray:
-    """Return (n, h, w) float32 band of the grey levels of each segment alone, NaN elsewhere.
+def _draw_texture(
+    grey: np.ndarray, numbers: np.ndarray, sigmas_px: np.ndarray, band: np.ndarray
+) -> None:
+    """Write the band of the grey levels (h, w) of each segment alone, between two Gaussians.
 
     The sky beside a wall would otherwise be a step in the wall's own texture, and shading would be
     one at its border: a linear fit is taken out.
     """
-    band = np.full(grey.shape, np.nan, np.float32)
-    for view, numbers in enumerate(segments):
-        for number, box in enumerate(ndimage.find_objects(numbers), 1):
-            if box is None:
-                continue
-            own = numbers[box] == number
-            weight = own.astype(np.float32)
-            weighted = np.zeros_like(weight)
-            weighted[own] = _without_slope(own, grey[view][box][own])
-            means = [
-                ndimage.gaussian_filter(weighted, sigma, mode="constant")
-                / np.maximum(ndimage.gaussian_filter(weight, sigma, mode="constant"), 1e-3)
-                for sigma in (fine_px, coarse_px)
-            ]
-            band[view][box][own] = (means[0] - means[1])[own]
-    return band
+    for number, box in enumerate(ndimage.find_objects(numbers), 1):
+        own = numbers[box] == number
+        weight = own.astype(np.float32)
+        weighted = np.zeros_like(weight)
+        weighted[own] = _without_slope(own, grey[box][own])
+        means = [
+            ndimage.gaussian_filter(weighted, sigma, mode="constant")
+            / np.maximum(ndimage.gaussian_filter(weight, sigma, mode="constant"), 1e-3)
+            for sigma in sigmas_px
+        ]
+        band[box][own] = (means[0] - means[1])[own]
 
 
 def _without_slope(own: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
+from .alignment import Aligner, Part
 from .candidates import FULL_SPREAD, LEAST_SPREAD, LEAST_WEIGHT, SPEAKING_SHARE, spreads
 from .evidence import ALIKE, PackedPhotos
 from .planes import Plane, image_plane, with_ones
@@ -81,37 +82,60 @@ class Assignment:
         return each.argmax(1) if self.nearer else each.argmin(1)
 
 
-def on_planes(
-    assignment: Assignment, planes: Sequence[Plane], photos: PackedPhotos, segment: Segment
-) -> np.ndarray:
-    """Return (p, planes) inverse depths of a segment's pixels on each of its planes."""
-    camera = photos.cameras[segment.view]
-    q = np.array([image_plane(planes[number], camera) for number in assignment.planes])
-    return with_ones(segment.pixels) @ q.T
+@dataclass(frozen=True)
+class PlaneSet:
+    """Planes, and who tells whether a segment lies on them."""
+
+    planes: Sequence[Plane]
+    photos: PackedPhotos
+    aligner: Aligner | None = None
+    """Asked about the texture of segments, once the planes are aligned."""
+
+    def on_planes(self, segment: Segment, assignment: Assignment) -> np.ndarray:
+        """Return (p, planes) inverse depths of a segment's pixels on each of its planes."""
+        camera = self.photos.cameras[segment.view]
+        q = np.array([image_plane(self.planes[number], camera) for number in assignment.planes])
+        return with_ones(segment.pixels) @ q.T
+
+    def parts(self, segment: Segment, assignment: Assignment) -> list[tuple[int, Part]]:
+        """Return the number of each plane of a segment with the pixels on it; none if it is far."""
+        if assignment.far:
+            return []
+        owners = assignment.owners(self.on_planes(segment, assignment))
+        return [
+            (number, Part(segment.view, segment.pixels[owners == place]))
+            for place, number in enumerate(assignment.planes)
+        ]
+
+    def is_false(self, segment: Segment, assignment: Assignment) -> bool:
+        """Tell whether the texture of a part is that of no surface on its plane."""
+        if self.aligner is None:
+            return False
+        return any(
+            self.aligner.contradicts(self.planes[number], part)
+            for number, part in self.parts(segment, assignment)
+        )
 
 
-def assigned(
-    segment: Segment, planes: Sequence[Plane], photos: PackedPhotos, *, first: bool,
-    is_false: Callable[[Segment, Assignment], bool] = lambda *_: False,
-) -> Assignment | None:  # fmt: skip
+def assigned(segment: Segment, known: PlaneSet, *, first: bool) -> Assignment | None:
     """Return the planes that explain most of what is known around a segment and pass the votes.
 
     Parameters
     ----------
+    segment : Segment
+    known : PlaneSet
     first : bool
         Planes are proposals of single segments still.
-    is_false : callable
-        Whether anything else speaks against an assignment that passes the votes.
     """
-    if not planes or segment.weights.sum() < LEAST_WEIGHT:
+    if not known.planes or segment.weights.sum() < LEAST_WEIGHT:
         return None
     through = MOST_THROUGH if first else MOST_THROUGH_LATER
-    choices = _Choices(segment, planes, photos, LEAST_SPREAD if first else LATER_SPREAD)
+    choices = _Choices(segment, known, LEAST_SPREAD if first else LATER_SPREAD)
     for assignment in choices.best():
         inverse = assignment.inverse_depths(choices.sampled_on(assignment))
-        votes = photos.votes(segment.view, choices.sampled, inverse)
+        votes = known.photos.votes(segment.view, choices.sampled, inverse)
         passes = votes.like >= LEAST_LIKE and votes.through <= through
-        if passes and not is_false(segment, assignment):
+        if passes and not known.is_false(segment, assignment):
             return assignment
     return None
 
@@ -119,12 +143,11 @@ def assigned(
 class _Choices:
     """Single planes and pairs that a segment may lie on."""
 
-    def __init__(
-        self, segment: Segment, planes: Sequence[Plane], photos: PackedPhotos, least_spread: float
-    ) -> None:
+    def __init__(self, segment: Segment, known: PlaneSet, least_spread: float) -> None:
         self.segment, self.least_spread = segment, least_spread
+        planes = known.planes
         self.trust = np.array([len(p.views) / (len(p.views) + FEW_VIEWS) for p in planes])
-        camera = photos.cameras[segment.view]
+        camera = known.photos.cameras[segment.view]
         self.image_planes = np.array([image_plane(plane, camera) for plane in planes])
         step = max(1, len(segment.pixels) // VOTING_PIXELS)
         self.sampled = segment.pixels[::step]
@@ -188,19 +211,15 @@ def lies_far(segment: Segment, photos: PackedPhotos) -> bool:
 
 
 def continued(
-    segments: Sequence[Segment],
-    found: Sequence[Assignment | None],
-    planes: Sequence[Plane],
-    photos: PackedPhotos,
-    is_false: Callable[[Segment, Assignment], bool] = lambda *_: False,
+    segments: Sequence[Segment], found: Sequence[Assignment | None], known: PlaneSet
 ) -> list[Assignment | None]:
     """Return the assignments with those that segments take over from like ones nearby."""
     found = list(found)
     for view in sorted({segment.view for segment in segments}):
         own = [number for number, segment in enumerate(segments) if segment.view == view]
-        colors = {n: np.median(_colors(segments[n], photos), axis=0) for n in own}
+        colors = {n: np.median(_colors(segments[n], known.photos), axis=0) for n in own}
         for _ in range(SPREADING_TURNS):
-            taken = _taken_over(own, segments, found, colors, planes, photos, is_false)
+            taken = _taken_over(own, segments, found, colors, known)
             if not taken:
                 break
             for number, assignment in taken.items():
@@ -217,13 +236,11 @@ def _taken_over(
     segments: Sequence[Segment],
     found: Sequence[Assignment | None],
     colors: dict[int, np.ndarray],
-    planes: Sequence[Plane],
-    photos: PackedPhotos,
-    is_false: Callable[[Segment, Assignment], bool],
+    known: PlaneSet,
 ) -> dict[int, Assignment]:
     """Return the assignments that segments of one photo take over in one turn."""
-    view = segments[own[0]].view
-    done = np.zeros((photos.cameras[view].height, photos.cameras[view].width), np.int64)
+    camera = known.photos.cameras[segments[own[0]].view]
+    done = np.zeros((camera.height, camera.width), np.int64)
     for number in own:
         if found[number] is not None:
             done[segments[number].rows, segments[number].columns] = number + 1
@@ -245,18 +262,16 @@ def _taken_over(
                 continue
             assignment = found[int(other)]
             assert assignment is not None  # or it would not be the nearest
-            if _may_have(segment, assignment, planes, photos) and not is_false(segment, assignment):
+            if _may_have(segment, assignment, known) and not known.is_false(segment, assignment):
                 taken[number] = assignment
                 break
     return taken
 
 
-def _may_have(
-    segment: Segment, assignment: Assignment, planes: Sequence[Plane], photos: PackedPhotos
-) -> bool:
+def _may_have(segment: Segment, assignment: Assignment, known: PlaneSet) -> bool:
     if assignment.far:
-        return lies_far(segment, photos)
+        return lies_far(segment, known.photos)
     step = max(1, len(segment.pixels) // VOTING_PIXELS)
-    inverse = assignment.inverse_depths(on_planes(assignment, planes, photos, segment)[::step])
-    votes = photos.votes(segment.view, segment.pixels[::step], inverse)
+    inverse = assignment.inverse_depths(known.on_planes(segment, assignment)[::step])
+    votes = known.photos.votes(segment.view, segment.pixels[::step], inverse)
     return votes.like >= LEAST_LIKE and votes.through <= MOST_THROUGH_LATER

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -13,11 +13,10 @@ from scipy import ndimage
 from ...progress import Progress
 from ..depth_maps import DepthMap
 from ..matching_cost import WORST_COST
-from .alignment import LUMA, Aligner, Part
-from .assignment import FAR_DISTANCE, Assignment, assigned, continued, lies_far, on_planes
+from .alignment import Aligner, Part
+from .assignment import FAR_DISTANCE, Assignment, PlaneSet, assigned, continued, lies_far
 from .candidates import SPEAKING_SHARE, proposed_planes
 from .evidence import AGREEING, NEARER, THROUGH, PackedPhotos, packed
-from .noise import BRIGHTEST, DARKEST, noise_level
 from .planes import (
     LEAST_INVERSE_DEPTH,
     Plane,
@@ -27,7 +26,7 @@ from .planes import (
     refined,
     with_ones,
 )
-from .segments import BORDER_PX, Segment, segments_of
+from .segments import BORDER_PX, Segment, numbered, segments_of
 
 _logger = logging.getLogger(__name__)
 
@@ -99,30 +98,23 @@ def fill_plain_parts(
         return list(depth_maps)
     progress.update(1.0, "looking for planes of walls and ground")
     photos = packed(depth_maps, random)
-    planes = _proposals(tried, photos, random, progress)
+    known = PlaneSet(_proposals(tried, photos, random, progress), photos)
     for turn in range(TURNS):
-        found = _assigned(tried, planes, photos, progress, first=turn == 0)
+        found = _assigned(tried, known, progress, first=turn == 0)
         if turn + 1 < TURNS:
-            fitted = _fitted(planes, tried, found, depth_maps, photos)
-            planes = pooled(fitted)
-    numbers = _numbered(segments, photos)
-    aligner = Aligner(photos, numbers, _noise(depth_maps, numbers), random)
-    planes = _aligned(planes, tried, found, photos, aligner, progress)
-
-    def is_false(segment: Segment, assignment: Assignment) -> bool:
-        parts = _parts(segment, assignment, planes, photos)
-        return any(aligner.contradicts(*part) for part in parts)
-
-    found = _assigned(tried, planes, photos, progress, first=False, is_false=is_false)
+            known = PlaneSet(pooled(_fitted(known, tried, found, depth_maps)), photos)
+    aligner = Aligner(photos, segments, random, progress)
+    known = PlaneSet(_aligned(known, tried, found, aligner, progress), photos, aligner)
+    found = _assigned(tried, known, progress, first=False)
     every = [*tried, *(s for s in segments if not s.large)]
     found = [*found, *[None] * (len(every) - len(tried))]
-    found = continued(every, found, planes, photos, is_false)
+    found = continued(every, found, known)
     found = [
         Assignment(()) if one is None and segment.large and lies_far(segment, photos) else one
         for segment, one in zip(every, found, strict=True)
     ]
-    found = continued(every, found, planes, photos, is_false)
-    filled = _Filled(photos, planes)
+    found = continued(every, found, known)
+    filled = _Filled(known)
     for segment, assignment in zip(every, found, strict=True):
         if assignment is not None:
             filled.put(segment, assignment)
@@ -131,9 +123,9 @@ def fill_plain_parts(
     whole = sum(int((layer > 0).sum()) for layer in filled.inverse)
     _logger.info(
         "stereo: %d planes through plain parts, %.0f %% of the pixels",
-        len(planes), 100.0 * whole / sum(m.depth.size for m in depth_maps),
+        len(known.planes), 100.0 * whole / sum(m.depth.size for m in depth_maps),
     )  # fmt: skip
-    borrowed = _numbered(tried, photos) > 0
+    borrowed = numbered(tried, photos.depths.shape) > 0
     behind = filled.behind()
     return [
         filled.applied(depth_map, view, borrowed, behind)
@@ -153,54 +145,29 @@ def _proposals(
 
 
 def _assigned(
-    segments: Sequence[Segment], planes: Sequence[Plane], photos: PackedPhotos,
-    progress: Progress, *, first: bool,
-    is_false: Callable[[Segment, Assignment], bool] = lambda *_: False,
-) -> list[Assignment | None]:  # fmt: skip
+    segments: Sequence[Segment], known: PlaneSet, progress: Progress, *, first: bool
+) -> list[Assignment | None]:
     found = []
     for segment in segments:
         progress.check()
-        found.append(assigned(segment, planes, photos, first=first, is_false=is_false))
+        found.append(assigned(segment, known, first=first))
     return found
 
 
-def _noise(depth_maps: Sequence[DepthMap], numbers: np.ndarray) -> np.ndarray:
-    """Return (n,) the noise of the grey levels of each photo, in its plain segments."""
-    found = []
-    for depth_map, own in zip(depth_maps, numbers > 0, strict=True):
-        height, width = depth_map.depth.shape
-        color = depth_map.color.astype(np.float32)
-        shown = ((color > DARKEST) & (color < BRIGHTEST)).all(-1)
-        grey = (color @ LUMA)[..., None]
-        found.append(noise_level(grey, own[:height, :width] & shown))
-    return np.array(found)
-
-
-def _parts(
-    segment: Segment, assignment: Assignment, planes: Sequence[Plane], photos: PackedPhotos
-) -> list[tuple[Plane, Part]]:
-    """Return each plane of a segment with the pixels on it."""
-    owners = assignment.owners(on_planes(assignment, planes, photos, segment))
-    return [
-        (planes[number], Part(segment.view, segment.pixels[owners == place]))
-        for place, number in enumerate(assignment.planes)
-    ]
-
-
 def _fitted(
-    planes: Sequence[Plane], segments: Sequence[Segment], found: Sequence[Assignment | None],
-    depth_maps: Sequence[DepthMap], photos: PackedPhotos,
+    on: PlaneSet, segments: Sequence[Segment], found: Sequence[Assignment | None],
+    depth_maps: Sequence[DepthMap],
 ) -> list[Plane]:  # fmt: skip
     """Return the planes of several photos, fitted to the confirmed pixels that are tilted alike."""
     result = []
-    for number, plane in enumerate(planes):
+    for number, plane in enumerate(on.planes):
         exact: list[tuple[np.ndarray, np.ndarray]] = []
         known: list[tuple[np.ndarray, np.ndarray]] = []
         views, support = set(), 0.0
         for segment, assignment in zip(segments, found, strict=True):
             if assignment is None or number not in assignment.planes:
                 continue
-            camera = photos.cameras[segment.view]
+            camera = on.photos.cameras[segment.view]
             on_plane = with_ones(segment.places) @ image_plane(plane, camera)
             near = np.abs(on_plane / segment.inverse_depths - 1.0) < SPEAKING_SHARE
             if near.sum() < 8:
@@ -255,40 +222,30 @@ def _tilted_alike(
 
 
 def _aligned(
-    planes: Sequence[Plane], segments: Sequence[Segment], found: Sequence[Assignment | None],
-    photos: PackedPhotos, aligner: Aligner, progress: Progress,
+    known: PlaneSet, segments: Sequence[Segment], found: Sequence[Assignment | None],
+    aligner: Aligner, progress: Progress,
 ) -> list[Plane]:  # fmt: skip
     """Return the planes where the texture of their segments matches; those of no surface go."""
+    parts: list[list[Part]] = [[] for _ in known.planes]
+    for segment, assignment in zip(segments, found, strict=True):
+        if assignment is not None:
+            for number, part in known.parts(segment, assignment):
+                parts[number].append(part)
     result = []
-    for number, plane in enumerate(planes):
+    for plane, own in zip(known.planes, parts, strict=True):
         progress.check()
-        parts = [
-            _parts(segment, assignment, planes, photos)[assignment.planes.index(number)][1]
-            for segment, assignment in zip(segments, found, strict=True)
-            if assignment is not None and number in assignment.planes
-        ]
-        moved = aligner.aligned(plane, parts)
+        moved = aligner.aligned(plane, own)
         if moved is not None:
             result.append(moved)
     return pooled(result, fit=False)
 
 
-def _numbered(segments: Sequence[Segment], photos: PackedPhotos) -> np.ndarray:
-    """Return (n, h, w) int32 numbers of the segments of each photo from 1, 0 elsewhere."""
-    numbers = np.zeros(photos.depths.shape, np.int32)
-    count = np.zeros(len(numbers), np.int32)
-    for segment in segments:
-        count[segment.view] += 1
-        numbers[segment.view, segment.rows, segment.columns] = count[segment.view]
-    return numbers
-
-
 class _Filled:
     """Inverse depths on planes, 0 elsewhere, and which plane."""
 
-    def __init__(self, photos: PackedPhotos, planes: Sequence[Plane]) -> None:
-        self.photos, self.planes = photos, planes
-        shapes = [(camera.height, camera.width) for camera in photos.cameras]
+    def __init__(self, known: PlaneSet) -> None:
+        self.known, self.photos, self.planes = known, known.photos, known.planes
+        shapes = [(camera.height, camera.width) for camera in self.photos.cameras]
         self.inverse = [np.zeros(shape) for shape in shapes]
         self.owner = [np.full(shape, _NOBODY, np.int32) for shape in shapes]
 
@@ -297,7 +254,7 @@ class _Filled:
         if assignment.far:
             self.owner[segment.view][segment.rows, segment.columns] = _FAR
             return
-        each = on_planes(assignment, self.planes, self.photos, segment)
+        each = self.known.on_planes(segment, assignment)
         at = (segment.rows, segment.columns)
         self.inverse[segment.view][at] = np.maximum(assignment.inverse_depths(each), 0.0)
         self.owner[segment.view][at] = np.array(assignment.planes)[assignment.owners(each)]

@@ -8,39 +8,54 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-LEAST_PIXELS = 200
-"""Plain pixels of a photo that its noise is measured in, at least."""
-
 DARKEST, BRIGHTEST = 1.0, 254.0
 """Grey levels between which noise shows."""
 
+SIDES_PX = (1, 2)
+"""Of the squares whose means are looked at. Resizing and JPEG take noise of single pixels away and
+leave that of squares, which texture is made of, too; squares of 4 px show faint texture itself."""
+
+LEAST_SQUARES = 200
+"""Plain squares of one side that noise is measured in, at least."""
+
 _SECOND_DIFFERENCES = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
-_MEDIAN_OF_UNIT_NOISE = 6.0 * 0.6745
-"""Of the size of second differences of white noise: their standard deviation is 6."""
+_MEAN_OF_UNIT_NOISE = 6.0 * np.sqrt(2.0 / np.pi)
+"""Of the size of second differences of white noise: their standard deviation is 6. The median would
+be 0 where JPEG has flattened most blocks."""
 
 
-def noise_level(color: np.ndarray, plain: np.ndarray) -> float:
-    """Return the standard deviation of noise of a photo, grey levels, of its channels' mean.
+def noise_levels(color: np.ndarray, plain: np.ndarray) -> np.ndarray:
+    """Return (c,) the standard deviations of white noise as strong as that of a photo, grey levels.
 
     From second differences in both directions, which leave out shading and straight steps
-    [Immerkaer 1996]. Too few plain pixels tell no noise: 0.
+    [Immerkaer 1996], of pixels and of means of squares; the largest counts. Too few plain pixels
+    tell no noise: 0.
 
     Parameters
     ----------
     color : (h, w, c) float32
-        Channels of the photo as taken, or one grey one.
+        Channels of the photo as taken.
     plain : (h, w) bool
         Pixels without texture; those that are black or saturated are left out, as they show none.
     """
-    shown = ((color > DARKEST) & (color < BRIGHTEST)).all(-1)
-    inner = ndimage.binary_erosion(plain & shown, np.ones((3, 3)))
-    if inner.sum() < LEAST_PIXELS:
-        return 0.0
-    found = [
-        np.median(np.abs(ndimage.convolve(channel, _SECOND_DIFFERENCES)[inner]))
-        for channel in np.moveaxis(color, -1, 0)
-    ]
-    return float(np.mean(found)) / _MEDIAN_OF_UNIT_NOISE
+    usable = plain & ((color > DARKEST) & (color < BRIGHTEST)).all(-1)
+    found = np.zeros(color.shape[-1])
+    for side in SIDES_PX:
+        inner = ndimage.binary_erosion(_means(usable, side) == 1.0, np.ones((3, 3)))
+        if inner.sum() < LEAST_SQUARES:
+            continue
+        for number, channel in enumerate(np.moveaxis(color, -1, 0)):
+            differences = ndimage.convolve(_means(channel, side), _SECOND_DIFFERENCES)[inner]
+            level = side * float(np.mean(np.abs(differences))) / _MEAN_OF_UNIT_NOISE
+            found[number] = max(found[number], level)
+    return found
+
+
+def _means(image: np.ndarray, side: int) -> np.ndarray:
+    """Return the means over squares of an image (h, w), as many as fit."""
+    height, width = image.shape[0] // side, image.shape[1] // side
+    squares = image[: height * side, : width * side].reshape(height, side, width, side)
+    return squares.mean((1, 3), dtype=np.float32)
 
 
 def smoothed_noise(noise: Any, sigma_px: Any) -> Any:

@@ -10,9 +10,10 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
+from ...imaging.luma import grey_of
 from ..depth_maps import DepthMap
 from ..planar_prior import points_in_view
-from .noise import noise_level, smoothed_step_noise
+from .noise import noise_levels, smoothed_step_noise
 
 STEP_LEVELS = 2.5
 """Largest difference of grey levels of neighbours, smoothed by the first of the widths below,
@@ -56,6 +57,8 @@ class Segment:
     large: bool
     unknown: float
     """Share of its pixels whose depth no source confirms."""
+    noise: float
+    """Standard deviation of white noise as strong as that of its photo's grey levels."""
 
     @cached_property
     def pixels(self) -> np.ndarray:
@@ -84,20 +87,42 @@ def segments_of(depth_maps: Sequence[DepthMap], points: np.ndarray) -> list[Segm
     ]
 
 
-def plain_pixels(depth_map: DepthMap) -> np.ndarray:
-    """Return (h, w) bool: no step of grey levels to a neighbour, and no mask excludes the pixel."""
+def numbered(segments: Sequence[Segment], shape: tuple[int, ...]) -> np.ndarray:
+    """Return (n, h, w) int32 numbers of the segments of each photo from 1, 0 elsewhere.
+
+    Parameters
+    ----------
+    segments : sequence of Segment
+    shape : (3,) int
+        Number of photos, height and width of the largest.
+    """
+    numbers = np.zeros(shape, np.int32)
+    count = np.zeros(len(numbers), np.int32)
+    for segment in segments:
+        count[segment.view] += 1
+        numbers[segment.view, segment.rows, segment.columns] = count[segment.view]
+    return numbers
+
+
+def plain_pixels(depth_map: DepthMap) -> tuple[np.ndarray, float]:
+    """Return the plain pixels of a photo and the noise of its grey levels.
+
+    Returns
+    -------
+    plain : (h, w) bool
+        No step of grey levels to a neighbour, and no mask excludes the pixel.
+    noise : float
+        Standard deviation of white noise as strong.
+    """
     color = depth_map.color.astype(np.float32)
-    plain = _without_steps(color, SMOOTHING_PX[-1])
-    if depth_map.mask is not None:
-        plain &= depth_map.mask
-    noise = noise_level(color, plain)
+    shown = True if depth_map.mask is None else depth_map.mask
+    channels = np.concatenate([color, grey_of(color)[..., None]], -1)
+    *of_colors, of_grey = noise_levels(channels, _without_steps(color, SMOOTHING_PX[-1]) & shown)
     for width in SMOOTHING_PX:
-        if _step_levels(width) >= CLEAR_OF_NOISE * smoothed_step_noise(noise, width):
+        step_noise = smoothed_step_noise(float(np.mean(of_colors)), width)
+        if _step_levels(width) >= CLEAR_OF_NOISE * step_noise:
             break
-    plain = _without_steps(color, width)
-    if depth_map.mask is not None:
-        plain &= depth_map.mask
-    return plain
+    return _without_steps(color, width) & shown, float(of_grey)
 
 
 def _step_levels(smoothing_px: float) -> float:
@@ -119,7 +144,7 @@ def _without_steps(color: np.ndarray, smoothing_px: float) -> np.ndarray:
 
 
 def _segments(depth_map: DepthMap, view: int, points: np.ndarray) -> list[Segment]:
-    plain = plain_pixels(depth_map)
+    plain, noise = plain_pixels(depth_map)
     numbers, count = ndimage.label(plain)
     sizes = np.bincount(numbers.reshape(-1), minlength=count + 1)
     confirmed = depth_map.confidence > 0
@@ -155,6 +180,7 @@ def _segments(depth_map: DepthMap, view: int, points: np.ndarray) -> list[Segmen
                 np.concatenate([weight, np.full(int(own.sum()), SPARSE_WEIGHT)]),
                 bool(sizes[number] >= LARGE_SHARE * plain.size),
                 1.0 - len(inner_row) / len(row),
+                noise,
             )
         )
     return found

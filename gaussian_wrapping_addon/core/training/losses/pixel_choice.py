@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...imaging.luma import LUMA
 from ...kernels.array_store import ArrayStore
 from ...kernels.compiled import kernel
 from ...kernels.parallel import even_bounds, run_chunks
@@ -17,8 +18,7 @@ BORDER_PX = 2
 BLOCK_PX = 8
 """Pixels are traversed in blocks of this side, so that a stratum is a patch and not a line."""
 NO_MASK = np.zeros((0, 0), np.bool_)
-# Luma of Rec. 601, the common grey of colour photos.
-RED, GREEN, BLUE = 0.299, 0.587, 0.114
+RED, GREEN, BLUE = LUMA
 
 
 def grey_image(

@@ -7,15 +7,17 @@ import dataclasses
 
 import numpy as np
 
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.stereo.plain.alignment import Aligner
 from gaussian_wrapping_addon.core.stereo.plain.assignment import (
     Assignment,
+    PlaneSet,
     assigned,
     continued,
     lies_far,
-    on_planes,
 )
 from gaussian_wrapping_addon.core.stereo.plain.evidence import packed
-from gaussian_wrapping_addon.core.stereo.plain.segments import segments_of
+from gaussian_wrapping_addon.core.stereo.plain.segments import Segment, segments_of
 from tests.core.stereo.plain.plain_room import (
     SKY,
     WALL,
@@ -28,21 +30,27 @@ from tests.core.stereo.plain.test_candidates import wall_segment
 from tests.core.stereo.plain.test_planes import wall_plane
 
 
-def planes():
+def known(*, with_texture: bool = False) -> PlaneSet:
     """Return the floor extended, the wall, and a plane parallel to the wall in the air."""
     floor = wall_plane().moved(np.array([0.0, 0.0, 1.0]), 0.0)
-    return [floor, wall_plane(), wall_plane(2.0)]
+    planes = [floor, wall_plane(), wall_plane(2.0)]
+    photos = packed(depth_maps(), np.random.default_rng(0))
+    if not with_texture:
+        return PlaneSet(planes, photos)
+    segments = segments_of(depth_maps(), sparse_points())
+    aligner = Aligner(photos, segments, np.random.default_rng(0), Progress())
+    return PlaneSet(planes, photos, aligner)
 
 
 def test_the_wall_gets_the_wall() -> None:
-    photos = packed(depth_maps(), np.random.default_rng(0))
+    planes = known()
     for view in range(len(cameras())):
         segment = dataclasses.replace(wall_segment(view), view=view)
         for first in (True, False):
-            found = assigned(segment, planes(), photos, first=first)
+            found = assigned(segment, planes, first=first)
             assert found is not None
             assert 1 in found.planes
-            inverse = found.inverse_depths(on_planes(found, planes(), photos, segment))
+            inverse = found.inverse_depths(planes.on_planes(segment, found))
             depth, part, _ = traced(cameras()[view])
             wall = part[segment.rows, segment.columns] == WALL
             error = np.abs(inverse * depth[segment.rows, segment.columns] - 1.0)
@@ -50,16 +58,15 @@ def test_the_wall_gets_the_wall() -> None:
 
 
 def test_the_sky_gets_nothing() -> None:
-    photos = packed(depth_maps(), np.random.default_rng(0))
+    planes = known()
     for segment in segments_of(depth_maps(), sparse_points()):
         part = traced(cameras()[segment.view])[1][segment.rows, segment.columns]
         if segment.large and np.median(part) == SKY:
-            assert assigned(segment, planes(), photos, first=False) is None
+            assert assigned(segment, planes, first=False) is None
 
 
 def test_without_planes_there_is_nothing_to_assign() -> None:
-    photos = packed(depth_maps(), np.random.default_rng(0))
-    assert assigned(wall_segment(0), [], photos, first=True) is None
+    assert assigned(wall_segment(0), PlaneSet([], known().photos), first=True) is None
 
 
 def test_two_planes_meet_where_one_is_nearer() -> None:
@@ -71,22 +78,34 @@ def test_two_planes_meet_where_one_is_nearer() -> None:
     assert far.owners(each).tolist() == [1, 0]
 
 
-def test_segments_of_like_colour_nearby_are_continued_and_others_are_not() -> None:
-    photos = packed(depth_maps(), np.random.default_rng(0))
-    whole = dataclasses.replace(wall_segment(3), view=3)
-    middle = int(np.median(whole.columns))
-    left, right = whole.columns < middle - 2, whole.columns > middle + 2
-    halves = [
-        dataclasses.replace(whole, rows=whole.rows[half], columns=whole.columns[half])
-        for half in (left, right)
+def halves_of(segment: Segment) -> list[Segment]:
+    """Return a segment's pixels to the left and to the right of its middle."""
+    middle = int(np.median(segment.columns))
+    return [
+        dataclasses.replace(segment, rows=segment.rows[half], columns=segment.columns[half])
+        for half in (segment.columns < middle - 2, segment.columns > middle + 2)
     ]
-    sky = next(
+
+
+def sky_segment(view: int) -> Segment:
+    part = traced(cameras()[view])[1]
+    return next(
         s
         for s in segments_of(depth_maps(), sparse_points())
-        if s.view == 3 and s.large and np.median(traced(cameras()[3])[1][s.rows, s.columns]) == SKY
+        if s.view == view and s.large and np.median(part[s.rows, s.columns]) == SKY
     )
-    found = continued([*halves, sky], [Assignment((1,)), None, None], planes(), photos)
+
+
+def test_segments_of_like_colour_nearby_are_continued_and_others_are_not() -> None:
+    halves = halves_of(dataclasses.replace(wall_segment(3), view=3))
+    found = continued([*halves, sky_segment(3)], [Assignment((1,)), None, None], known())
     assert found == [Assignment((1,)), Assignment((1,)), None]
+
+
+def test_what_is_far_is_continued() -> None:
+    far = Assignment(())
+    halves = halves_of(sky_segment(3))
+    assert continued(halves, [far, None], known(with_texture=True)) == [far, far]
 
 
 def test_the_sky_lies_far_and_the_wall_does_not() -> None:
