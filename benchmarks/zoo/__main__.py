@@ -24,7 +24,7 @@ from .build import build_zoo_scene
 from .cache import ensure_zoo_scene
 from .catalogue import DEVELOPMENT, PARTS, SCENES, zoo_scene
 from .document import write_document
-from .runs import BASELINES, alpha_case, find_scene, is_made, make_one, run_case
+from .runs import BASELINES, TAKEN, alpha_case, find_scene, is_made, make_one, run_case
 from .sheet import draw_sheet
 
 _logger = logging.getLogger("benchmarks")
@@ -42,6 +42,10 @@ def _arguments(given: Sequence[str]) -> argparse.Namespace:
     )  # fmt: skip
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--label", help="folder of the records (default: the preset)")
+    parser.add_argument(
+        "--taken", action="store_true",
+        help=f"photos as a camera takes them; the label gets {TAKEN} at its end",
+    )  # fmt: skip
     parser.add_argument("--runs", type=int, default=0, help="make at most so many; 0: no limit")
     parser.add_argument("--again", action="store_true", help="make runs that have a record, too")
     parser.add_argument("--threads", type=int, default=1)
@@ -95,7 +99,7 @@ def main(given: Sequence[str] | None = None) -> int:
 
 def _make_runs(names: Sequence[str], options: argparse.Namespace, further: Sequence[str]) -> int:
     """Make the alpha shapes and runs that are missing; return 1 where one failed, else 0."""
-    label = options.label or options.preset
+    label = (options.label or options.preset) + (TAKEN if options.taken else "")
     if label == BASELINES or (further and not options.label):
         raise UsageError(
             f"Runs of {label!r} need a label of their own.",

@@ -16,7 +16,7 @@ from ..study.origin import made_by, reading
 from ..study.record import RECORDS, Record, read_record
 from ..tables import Table
 from .catalogue import FAMILIES, PARTS, SCENES, ZooScene
-from .runs import BASELINES, FIGURES, STUDY, is_present
+from .runs import BASELINES, FIGURES, STUDY, TAKEN, is_present
 
 PAGE, READING = "zoo.md", "zoo-reading.md"
 COMMAND = "python -m benchmarks.zoo"
@@ -152,7 +152,9 @@ def write_document(out: Path, root: Path = RECORDS) -> Path | None:
     for label, records in found.items():
         given = next(iter(records.values())).case
         more = f" -- {' '.join(given.arguments)}" if given.arguments else ""
-        name = "" if label == given.preset else f" --label {label}"
+        taken = " --taken" if label.endswith(TAKEN) else ""
+        own = label.removesuffix(TAKEN)
+        name = taken if own == given.preset else f" --label {own}{taken}"
         command = f"{COMMAND} --preset {given.preset}{name}{more}"
         judged = {r.case.scene for r in records.values()}
         others = [dataclasses.replace(given, scene=name) for name in SCENES if name not in judged]

@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
-from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
 from gaussian_wrapping_addon.core.dataset.scene import Scene
+
+from .taken_photos import compressed
 
 
 class NoisyPhotos(PhotoStore):
@@ -38,8 +37,4 @@ class NoisyPhotos(PhotoStore):
         random = np.random.default_rng([17, index])
         noisy = photo + self._noise * random.normal(size=photo.shape)
         photo = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
-        if self._jpeg_quality == 0:
-            return photo
-        compressed = io.BytesIO()
-        Image.fromarray(photo).save(compressed, "JPEG", quality=self._jpeg_quality)
-        return np.asarray(Image.open(compressed))
+        return compressed(photo, self._jpeg_quality) if self._jpeg_quality else photo

@@ -24,11 +24,15 @@ from ..study.making import KEPT_RUNS, make, rounded, run_folder
 from ..study.record import Record, read_record, record_path, write_record
 from .cache import ensure_zoo_scene, scene_folder
 from .catalogue import draw_photography, zoo_scene
+from .taken_photos import ensure_taken_scene, taken_folder
 
 STUDY = "zoo"
 BASELINES = "baselines"
 ALPHA = "alpha"
 """The alpha shape of the sparse points, with the best alpha by the truth."""
+
+TAKEN = "-taken"
+"""Ends the labels of runs on photos as a camera takes them (:mod:`.taken_photos`)."""
 
 FIGURES = "zoo"
 """Key of a record's scores for what :func:`judged` returns, and the scene's folder (``scene``)."""
@@ -55,13 +59,18 @@ def run_case(name: str, label: str, preset: str, arguments: Sequence[str]) -> Ca
 
 def find_scene(case: Case) -> Path:
     """Return the folder of a case's scene; render it where missing."""
-    return ensure_zoo_scene(case.scene)
+    return (ensure_taken_scene if _is_taken(case) else ensure_zoo_scene)(case.scene)
 
 
 def is_present(record: Record) -> bool:
     """Tell whether a run was made on the scene as today's sources draw it."""
     made_on = record.scores.get(FIGURES, {}).get("scene")
-    return bool(made_on == scene_folder(record.case.scene).name)
+    folder = (taken_folder if _is_taken(record.case) else scene_folder)(record.case.scene)
+    return bool(made_on == folder.name)
+
+
+def _is_taken(case: Case) -> bool:
+    return case.study.endswith(TAKEN)
 
 
 def is_made(case: Case) -> bool:
