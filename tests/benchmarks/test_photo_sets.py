@@ -23,10 +23,10 @@ from gaussian_wrapping_addon.core.files import write_json
 def report(held_out: float | None) -> dict[str, Any]:
     return {
         "stages": [
-            {"name": "cameras", "processor_seconds": 10.0},
-            {"name": "train", "processor_seconds": 100.0},
-            {"name": "mesh-region", "processor_seconds": 20.0},
-            {"name": "texture-region", "processor_seconds": 5.0},
+            {"name": "cameras", "processor_seconds": 10.0, "seconds": 70.0},
+            {"name": "train", "processor_seconds": 100.0, "seconds": 110.0},
+            {"name": "mesh-region", "processor_seconds": 20.0, "seconds": 21.0},
+            {"name": "texture-region", "processor_seconds": 5.0, "seconds": 6.0},
         ],
         "cameras": {"views": 14, "facts": {"mean_reprojection_error_px": 0.25}},
         "training": {
@@ -57,7 +57,8 @@ def record(name: str, held_out: float | None, date: str = "2026-11-25T10:00") ->
 def test_what_is_kept_of_a_report() -> None:
     kept = kept_of(report(25.0))
     assert kept["processor_s"] == {"cameras": 10.0, "train": 100.0, "mesh": 20.0, "texture": 5.0}
-    assert spent_s(kept) == 135.0
+    assert kept["clock_s"]["cameras"] == 70.0
+    assert spent_s(kept) == 125.0
     assert (kept["placed"], kept["reprojection_px"], kept["held_out_psnr"]) == (14, 0.25, 25.0)
     assert (kept["mesh_psnr"], kept["covered"], kept["coverage"]) == (26.5, 0.4, 0.875)
     assert kept["decisions"] == {"growth": "off"}
@@ -79,7 +80,7 @@ def test_page_has_a_row_for_each_set_and_version(tmp_path: Path) -> None:
     text = page.read_text()
     assert "2026-11-25 to 2026-11-26" in text
     (fox,) = [line for line in text.splitlines() if line.startswith("| fox")]
-    for cell in ("14 of 16", "0.25", "27.25", "26.50", "40", "yes", "135"):
+    for cell in ("14 of 16", "0.25", "27.25", "26.50", "40", "yes", "70", "125"):
         assert f" {cell} " in fox
 
 

@@ -178,6 +178,8 @@ def test_fewer_faces_become_a_lighter_object_with_a_normal_map(job: JobFolder) -
     assert (job.baked / "Foreign_light" / "normal.png").is_file()
     assert psnr_of_textures(light) > GOOD_DB
     assert thing.hide_get()
+    assert bpy.context.view_layer.objects.active == light
+    assert light.select_get()
     assert thing.data.materials.keys() == []
     # It is shaded and exported with the result.
     bpy.ops.gwrap.set_shading(shading="UNLIT")
@@ -187,7 +189,7 @@ def test_fewer_faces_become_a_lighter_object_with_a_normal_map(job: JobFolder) -
     assert exported == ["Foreign_light.glb", "auto.glb"]
     # Once more: the same object, not another one.
     thing.hide_set(False)
-    thing.select_set(True)
+    select_alone(thing)
     bake.faces = 300
     assert press(job).state == "DONE"
     assert [t.name for t in bpy.data.objects if tags.kind_of(t) == "baked"] == ["Foreign light"]
@@ -224,11 +226,18 @@ def test_quads_become_an_object_with_photos_and_maps(job: JobFolder) -> None:
     assert not thing.data.materials
     # Once more: the same object, not another one.
     thing.hide_set(False)
-    thing.select_set(True)
+    select_alone(thing)
     choose_quads(200)
     assert press(job).state == "DONE"
     assert [t.name for t in bpy.data.objects if tags.kind_of(t) == "baked"] == ["Foreign quads"]
     assert len(bpy.data.objects["Foreign quads"].data.polygons) < 250
+
+
+def select_alone(thing: bpy.types.Object) -> None:
+    for other in bpy.context.selected_objects:
+        other.select_set(False)
+    thing.select_set(True)
+    bpy.context.view_layer.objects.active = thing
 
 
 def choose_quads(count: int) -> None:

@@ -69,8 +69,34 @@ def steps() -> Iterator[float]:
     nodes: Any = light.material_slots[0].material.node_tree.nodes
     check("Normal Map" in nodes, "it has a normal map")
     check(bpy.data.objects["Ball"].hide_get(), "the dense mesh is hidden")
+    check(bpy.context.view_layer.objects.active == light, "the lighter one is active instead")
     yield 1.0
     screenshot("4-lighter")
+
+    light.hide_set(True)
+    bpy.data.objects["Ball"].hide_set(False)
+    select("Ball")
+    bpy.context.scene.gwrap.bake.retopology = "QUADS"
+    bpy.context.scene.gwrap.bake.quads = 400
+    yield 0.5
+    press(bpy.ops.gwrap.bake_photos)
+    yield from until(lambda: len(objects("baked")) == 2, "a mesh of quads is there", WAIT_S)
+    (quads,) = (thing for thing in objects("baked") if thing.name.endswith("quads"))
+    sides = [len(polygon.vertices) for polygon in quads.data.polygons]
+    check(set(sides) == {4} and 280 < len(sides) < 440, "it has about the quads asked for")
+    nodes = quads.material_slots[0].material.node_tree.nodes
+    check("Normal Map" in nodes, "the quads have a normal map")
+    driving.frame_view()
+    yield 1.0
+    screenshot("5-quads")
+
+
+def select(name: str) -> None:
+    """Select one object alone, as a click does."""
+    press(bpy.ops.object.select_all, action="DESELECT")
+    thing: Any = bpy.data.objects[name]
+    thing.select_set(True)
+    bpy.context.view_layer.objects.active = thing
 
 
 def add(name: str) -> None:

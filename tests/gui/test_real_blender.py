@@ -42,10 +42,10 @@ def test_regions_are_drawn_and_dragged(visit: Visit) -> None:
 
 @pytest.mark.timeout(900)
 def test_photos_are_baked_onto_meshes_of_the_scene(visit: Visit) -> None:
-    """A monkey without UVs, and a ball made lighter, with the real worker."""
+    """A monkey without UVs, and a ball made lighter and made of quads, with the real worker."""
     write_ball_job(visit.folder).root.rename(visit.folder / "ball")
     visit.run("drive_bake.py", deadline_s=800, GW_GUI_WORKER=sys.executable)
-    for name in ("1-bake", "2-baking", "3-baked", "4-lighter"):
+    for name in ("1-bake", "2-baking", "3-baked", "4-lighter", "5-quads"):
         assert colours_of(visit.folder / f"{name}.png") > 100, f"{name} is (nearly) empty"
 
 

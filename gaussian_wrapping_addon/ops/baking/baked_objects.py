@@ -111,9 +111,19 @@ def _new_object(
             bpy.data.meshes.remove(old)
     _set_material(thing, frame, baked)
     if dense is not None:
-        dense.hide_set(True)
-        dense.hide_render = True
+        _stand_in(thing, dense)
     return thing
+
+
+def _stand_in(thing: bpy.types.Object, dense: bpy.types.Object) -> None:
+    """Hide the dense mesh; where it was the active object, the new one is, and selected."""
+    layer = bpy.context.view_layer
+    was_active = layer.objects.active == dense and dense.mode == "OBJECT"
+    dense.hide_set(True)
+    dense.hide_render = True
+    if was_active and thing.name in layer.objects:
+        thing.select_set(True)
+        layer.objects.active = thing
 
 
 def _retopology(baked: BakedFiles) -> str:

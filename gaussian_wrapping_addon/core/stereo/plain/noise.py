@@ -15,13 +15,16 @@ SIDES_PX = (1, 2)
 """Of the squares whose means are looked at. Resizing and JPEG take noise of single pixels away and
 leave that of squares, which texture is made of, too; squares of 4 px show faint texture itself."""
 
-LEAST_SQUARES = 200
-"""Plain squares of one side that noise is measured in, at least."""
+BLOCK, LEAST_USED, LEAST_BLOCKS = 16, 0.5, 4
+"""Squares along the side of a block, share of them that must be usable, and blocks needed."""
 
-_SECOND_DIFFERENCES = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
-_MEAN_OF_UNIT_NOISE = 6.0 * np.sqrt(2.0 / np.pi)
-"""Of the size of second differences of white noise: their standard deviation is 6. The median would
-be 0 where JPEG has flattened most blocks."""
+QUIET_BLOCKS, QUIET_SHARE = 0.25, 0.945
+"""Quantile of the blocks that counts, and share of white noise that it shows. Faint texture shows
+in most blocks; within one the mean of the power counts, as JPEG flattens most blocks of its own and
+leaves few differences, large ones."""
+
+_SECOND_DIFFERENCES = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32) / 6.0
+"""Leave the standard deviation of white noise as it is."""
 
 
 def noise_levels(color: np.ndarray, plain: np.ndarray) -> np.ndarray:
@@ -42,11 +45,14 @@ def noise_levels(color: np.ndarray, plain: np.ndarray) -> np.ndarray:
     found = np.zeros(color.shape[-1])
     for side in SIDES_PX:
         inner = ndimage.binary_erosion(_means(usable, side) == 1.0, np.ones((3, 3)))
-        if inner.sum() < LEAST_SQUARES:
+        used = _means(inner, BLOCK)
+        chosen = used >= LEAST_USED
+        if chosen.sum() < LEAST_BLOCKS:
             continue
         for number, channel in enumerate(np.moveaxis(color, -1, 0)):
-            differences = ndimage.convolve(_means(channel, side), _SECOND_DIFFERENCES)[inner]
-            level = side * float(np.mean(np.abs(differences))) / _MEAN_OF_UNIT_NOISE
+            differences = ndimage.convolve(_means(channel, side), _SECOND_DIFFERENCES)
+            power = _means(np.where(inner, differences, 0.0) ** 2, BLOCK)[chosen] / used[chosen]
+            level = side / QUIET_SHARE * np.sqrt(np.quantile(power, QUIET_BLOCKS))
             found[number] = max(found[number], level)
     return found
 

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy import ndimage
 
 from gaussian_wrapping_addon.core.stereo.plain.noise import (
-    LEAST_SQUARES,
+    BLOCK,
     noise_levels,
     smoothed_noise,
     smoothed_step_noise,
@@ -91,7 +91,7 @@ def test_black_and_saturated_parts_tell_nothing(level: float) -> None:
 
 def test_photos_without_plain_pixels_tell_nothing() -> None:
     few = np.zeros(SHAPE, bool)
-    few[: LEAST_SQUARES // 10, :9] = True
+    few[:BLOCK, : 3 * BLOCK] = True
     assert noise_levels(noisy(2.0)[..., None], few)[0] == 0.0
     assert noise_levels(noisy(0.0)[..., None], WHOLE)[0] < 0.05
 
