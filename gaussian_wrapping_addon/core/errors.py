@@ -94,6 +94,10 @@ class ResourceError(WrapError):
     exit_code = EXIT_RESOURCES
 
 
+class MemoryShortageError(ResourceError):
+    """The system or the user allows less memory than is needed, not a limit of this program."""
+
+
 class Cancelled(WrapError):  # noqa: N818 - a request, not an error
     """The user cancelled."""
 

@@ -11,7 +11,8 @@ import threading
 import time
 from pathlib import Path
 
-from ..errors import WrapError
+from ..errors import MemoryShortageError, WrapError
+from .address_space import limit_address_space
 from .helper_process import emit
 from .peak_memory import own_peak_bytes
 from .process_identity import Caller
@@ -23,10 +24,8 @@ _PARENT_POLL_S = 1.0
 def main(arguments: list[str]) -> int:
     """Run ``arguments = [module, folder, memory_bytes]``; return the exit code."""
     module, folder, memory_bytes = arguments[0], Path(arguments[1]), int(arguments[2])
-    if memory_bytes and sys.platform.startswith("linux"):
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    if memory_bytes:
+        limit_address_space(memory_bytes)
     caller = Caller()
     _request_parent_death_signal()
     threading.Thread(target=_exit_with_caller, args=(caller,), daemon=True).start()
@@ -34,17 +33,23 @@ def main(arguments: list[str]) -> int:
         package = __name__.rpartition(".processes.")[0]
         importlib.import_module(f"{package}.{module}").main(folder)
     except WrapError as error:
-        emit(error=error.message, hint=error.hint)
-        return error.exit_code
+        return _tell(error)
     except ImportError as error:
         missing = package_error(error)
         if missing is None:
             raise
-        emit(error=missing.message, hint=missing.hint)
-        return missing.exit_code
+        return _tell(missing)
     finally:
         emit(peak_bytes=own_peak_bytes())
     return 0
+
+
+def _tell(error: WrapError) -> int:
+    emit(
+        error=error.message, hint=error.hint,
+        is_short_of_memory=isinstance(error, MemoryShortageError),
+    )  # fmt: skip
+    return error.exit_code
 
 
 def _request_parent_death_signal() -> None:

@@ -20,22 +20,37 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
 from .. import limits
-from ..errors import EXIT_OTHER, DatasetError, ResourceError, WorkerError
+from ..errors import (
+    EXIT_OTHER,
+    DatasetError,
+    MemoryShortageError,
+    ResourceError,
+    WorkerError,
+    WrapError,
+)
 from ..progress import Progress
+from .address_space import allows_address_space
 from .peak_memory import record_helper_peak
 from .process_identity import caller_option
 from .spawn import kill_group, spawn
 from .worker_environment import PACKAGES_OPTION, interpreter_of
+from .worker_requirements import NO_ROOM
 
 _logger = logging.getLogger(__name__)
 
 _POLL_S = 0.1
 _running: set[subprocess.Popen[bytes]] = set()
 _OUTPUT_TAIL_LINES = 20
+_OUT_OF_MEMORY = ("MemoryError", "bad_alloc")
+"""What Python and C++ say where an allocation fails."""
+_MEMORY_HINT = (
+    "Close other programs, or allow more memory (ulimit -v, a container's limit), then resume."
+)
 _MAX_SAID = 300
 """Most characters of a crashed helper's last line in the message."""
 
@@ -93,9 +108,11 @@ def run_helper(
         The helper reported another typed failure.
     ResourceError
         The deadline passed.
+    MemoryShortageError
+        The system gave the helper too little memory.
     WorkerError
-        The helper crashed: the message names the signal and its last line, the log has the end of
-        its output. Or the worker's Python lacks a package.
+        The helper crashed, or reached ``memory_bytes``: the message names the signal and its last
+        line, the log has the end of its output. Or the worker's Python lacks a package.
     """
     command = child_command("processes.helper_entry", module, str(folder), str(memory_bytes or 0))
     process = spawn(command)
@@ -140,14 +157,28 @@ def run_helper(
             reader.join(1.0)
     code = process.returncode
     if failure:
-        kind = WorkerError if code == EXIT_OTHER else DatasetError
+        kind: type[WrapError] = WorkerError if code == EXIT_OTHER else DatasetError
+        if failure.get("is_short_of_memory"):
+            kind = MemoryShortageError
         raise kind(str(failure["error"]), str(failure.get("hint", "")))
     if code != 0:
         reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
         for line in output_tail:
             _logger.error("%s: %s", module, line)
         last = f": {output_tail[-1][:_MAX_SAID]}" if output_tail else "."
+        if _is_short_of_memory(code, output_tail, memory_bytes):
+            raise MemoryShortageError(f"{module} {reason}{last}", _MEMORY_HINT)
         raise WorkerError(f"{module} {reason}{last}", "See the log.")
+
+
+def _is_short_of_memory(code: int, output: Sequence[str], memory_bytes: int | None) -> bool:
+    """Tell whether a helper ended for want of memory that the system did not give."""
+    # Linux kills what takes the last memory; nobody else sends this signal to a helper.
+    if code == -getattr(signal, "SIGKILL", 0) and code != 0:
+        return True
+    if memory_bytes and allows_address_space(memory_bytes):
+        return False  # it had what it may take at most
+    return any(mark in line for line in output for mark in (*_OUT_OF_MEMORY, *NO_ROOM))
 
 
 def _drain(stream: IO[bytes], name: str, lines: queue.Queue[tuple[str, str]]) -> None:

@@ -9,7 +9,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import ResourceError, UsageError, WorkerError, WrapError
+from ..errors import MemoryShortageError, UsageError, WorkerError, WrapError
 
 FILE_NAME = "requirements-worker.txt"
 HASHES_NAME = "requirements-worker-hashes.txt"
@@ -19,7 +19,7 @@ _COMPARE = {
     "==": operator.eq, "!=": operator.ne, ">=": operator.ge, "<=": operator.le,
     ">": operator.gt, "<": operator.lt,
 }  # fmt: skip
-_NO_ROOM = (
+NO_ROOM = (
     "failed to map segment",
     "annot allocate memory",
     "cannot apply additional memory protection",
@@ -98,8 +98,8 @@ def package_error(error: ImportError | OSError) -> WrapError | None:
     every reason as a file that is not there.
     """
     text = str(error)
-    if any(words in text for words in _NO_ROOM) or _LLVM in text:
-        return ResourceError(
+    if any(words in text for words in NO_ROOM) or _LLVM in text:
+        return MemoryShortageError(
             f"A package of the worker's Python, {sys.executable}, could not be loaded, probably "
             f"for want of memory: {text.strip().splitlines()[-1]}",
             "Close other programs, or allow more memory (ulimit -v, a container's limit), then "

@@ -3,13 +3,20 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, ResourceError, WorkerError
+from gaussian_wrapping_addon.core.errors import (
+    Cancelled,
+    DatasetError,
+    MemoryShortageError,
+    ResourceError,
+    WorkerError,
+)
 from gaussian_wrapping_addon.core.processes import helper_entry, helper_process, peak_memory
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 
@@ -22,6 +29,10 @@ HELPERS = {
     "sleeps": "time.sleep(60)",
     "large": "held = b'x' * (150 * 2**20)",
     "greedy": "bytearray(4 * 2**30)",
+    "limited": "import resource; resource.setrlimit(resource.RLIMIT_AS, 2 * (3 * 2**30,)); "
+    "bytearray(4 * 2**30)",
+    "killed": "os.kill(os.getpid(), 9)",
+    "no_room": "raise ImportError('x.so: failed to map segment from shared object')",
 }
 
 
@@ -108,9 +119,51 @@ def test_the_memory_limit_holds(run) -> None:
         run("greedy", memory_bytes=2 * 2**30)
 
 
-@pytest.mark.skipif(
-    not sys.platform.startswith("linux"), reason="elsewhere it includes the parent's"
-)
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits are Linux's")
+
+
+@linux
+@pytest.mark.parametrize("memory_bytes", [None, 8 * 2**30])
+def test_what_the_system_does_not_give_is_told_apart(
+    run, monkeypatch: pytest.MonkeyPatch, memory_bytes: int | None
+) -> None:
+    """A limit that the user has set (ulimit -v) is below what the helper may take."""
+    monkeypatch.setattr(helper_process, "allows_address_space", lambda _: False)
+    with pytest.raises(MemoryShortageError, match="MemoryError") as caught:
+        run("limited", memory_bytes=memory_bytes)
+    assert "ulimit" in caught.value.hint
+
+
+@linux
+def test_a_lower_limit_of_the_user_stays() -> None:
+    code = (
+        "import resource, sys\n"
+        f"sys.path.insert(0, {str(Path(__file__).resolve().parents[3])!r})\n"
+        "from gaussian_wrapping_addon.core.processes.address_space import *\n"
+        "G = 2**30\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (3 * G, 4 * G))\n"
+        "assert allows_address_space(3 * G) and not allows_address_space(3 * G + 1)\n"
+        "limit_address_space(8 * G)\n"
+        "assert resource.getrlimit(resource.RLIMIT_AS) == (3 * G, 4 * G)\n"
+        "limit_address_space(2 * G)\n"
+        "assert resource.getrlimit(resource.RLIMIT_AS) == (2 * G, 2 * G)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@linux
+def test_a_helper_that_the_system_kills_was_short_of_memory(run) -> None:
+    with pytest.raises(MemoryShortageError, match="signal 9"):
+        run("killed")
+
+
+@linux
+def test_packages_without_room_in_memory_are_a_shortage(run) -> None:
+    with pytest.raises(MemoryShortageError, match="want of memory"):
+        run("no_room")
+
+
+@linux
 def test_the_peak_is_the_helpers_own_and_the_largest_is_kept(
     run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

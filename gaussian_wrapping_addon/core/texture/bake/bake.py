@@ -24,9 +24,9 @@ from .visibility import photo_visibility
 KEPT_VIEWS = 15
 """Odd, so that the median of the views is one of them. With five, the median changed wherever one
 view replaced another: flakes along the rim of a pot whose photos differ in exposure."""
-SHARPNESS = 6.0
-"""Exponent of the weights, so that the best view dominates. On held-out photos of the banana set, 6
-costs 0.1 dB against 1 and keeps a tenth more of the gradients."""
+SHARPNESS = 3.0
+"""Exponent of the weights: how far the best views dominate. More keeps gradients, noise and
+highlights of single photos, less blurs (docs/benchmarks/texturing.md)."""
 OUTLIER_FLOOR = 20.0
 """Views within this many of 255 levels of the median are never outliers."""
 OUTLIER_FACTOR = 2.5

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DatasetError, ResourceError, WorkerError
+from ...errors import DatasetError, MemoryShortageError, ResourceError, WorkerError
 from ...mesh.face_graph import face_graph, uv_charts
 from ...processes.helper_process import run_helper
 from ...progress import Progress
@@ -103,6 +103,8 @@ def find_charts(
     copy = smooth_vertices(vertices, faces)
     try:
         first = _charts(vertices, copy, faces, folder, progress.span(0.0, 0.6), polygons)
+    except MemoryShortageError:
+        raise
     except (WorkerError, ResourceError, DatasetError) as error:
         _logger.info("xatlas failed on the smoothed copy: %s", error.message)
         return _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0), polygons)

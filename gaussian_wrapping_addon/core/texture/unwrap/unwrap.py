@@ -11,7 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DISK_FULL_ERRNOS, DatasetError, ResourceError, WorkerError, unwritable_error
+from ...errors import (
+    DISK_FULL_ERRNOS,
+    DatasetError,
+    MemoryShortageError,
+    ResourceError,
+    WorkerError,
+    unwritable_error,
+)
 from ...mesh.face_graph import FaceGraph, face_graph, uv_charts
 from ...mesh.surface_mesh import SurfaceMesh
 from ...mesh.topology import edge_lengths
@@ -91,6 +98,11 @@ def unwrap(
     -----
     xatlas crashes, hangs or returns NaN on some meshes. In all of these cases a box projection
     replaces it, with a warning and ``method = "box"``.
+
+    Raises
+    ------
+    MemoryShortageError
+        The system gave xatlas too little memory.
     """
     graph = face_graph(mesh.vertices, mesh.faces)
     try:
@@ -100,8 +112,10 @@ def unwrap(
         )  # fmt: skip
         method, reason = "xatlas", ""
     except (WorkerError, ResourceError, DatasetError) as error:
-        if isinstance(error.__cause__, OSError):
-            raise  # a full disk: nothing else could be written either
+        # A full disk: nothing else could be written either. Or memory is short today: the texture
+        # would depend on it.
+        if isinstance(error, MemoryShortageError) or isinstance(error.__cause__, OSError):
+            raise
         reason = error.message[:MAX_REASON]
         _logger.warning("xatlas could not unwrap the mesh (%s): using box projection", reason)
         corner_uvs, face_atlas, gutter_left_px = box_unwrap(

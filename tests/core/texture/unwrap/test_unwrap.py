@@ -10,7 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, ResourceError
+from gaussian_wrapping_addon.core.errors import (
+    Cancelled,
+    DatasetError,
+    MemoryShortageError,
+    ResourceError,
+)
 from gaussian_wrapping_addon.core.mesh.face_graph import components, face_graph
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
@@ -273,6 +278,23 @@ def test_bad_answers_of_xatlas_are_refused(
     unwrapped = unwrap(mesh, 256, 4, tmp_path, Progress())
     assert unwrapped.method == "box"
     assert_usable(mesh, unwrapped, 256, 4)
+
+
+def test_a_shortage_of_memory_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same job with enough memory would have another texture."""
+    asked = []
+
+    def helper(module: str, *_: object, **__: object) -> None:
+        asked.append(module)
+        raise MemoryShortageError("memory is short", "Wait.")
+
+    monkeypatch.setattr(charts_module, "run_helper", helper)
+    with pytest.raises(MemoryShortageError, match="memory is short"):
+        unwrap(sphere(2), 256, 4, tmp_path, Progress())
+    assert asked == [charts_module.CHARTS_HELPER]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_cancelling_leaves_nothing_behind(tmp_path: Path) -> None:
