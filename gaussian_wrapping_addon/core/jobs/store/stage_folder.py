@@ -24,7 +24,7 @@ _logger = logging.getLogger(__name__)
 # Increase a number when a stage's code changes its result: old stage folders are not re-used then.
 # Keys of later stages hold those of earlier ones. Finished trainings can be meshed and trained on
 # whatever the number of their cameras; with another number of their own they cannot.
-STAGE_VERSIONS = {"cameras": 2, "train": 6, "mesh": 11, "texture": 11, "bake": 1}
+STAGE_VERSIONS = {"cameras": 2, "train": 6, "mesh": 11, "texture": 12, "bake": 2}
 
 DONE_NAME = "done.json"
 HASH_CHARACTERS = 12
