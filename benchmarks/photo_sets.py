@@ -39,23 +39,30 @@ _logger = logging.getLogger("benchmarks")
 STUDY = "photo_sets"
 PAGE, READING = "photo-sets.md", "photo-sets-reading.md"
 COMMAND = "python -m benchmarks.photo_sets"
+PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the runs that have no record, then write the page; return 1 where a run failed."""
     parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
-    parser.add_argument("folder", type=Path, metavar="FOLDER", nargs="?", help="of the sets")
+    parser.add_argument(
+        "folder", type=lambda word: Path(word).resolve(), metavar="FOLDER", nargs="?",
+        help="of the sets",
+    )  # fmt: skip
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="sets to wrap")
     parser.add_argument("--preset", default="draft")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument(
-        "--checkout", type=Path, default=ROOT, metavar="DIR", help="version of the program to run"
-    )
+        "--checkout", type=lambda word: Path(word).resolve(), default=ROOT, metavar="DIR",
+        help="version of the program to run, without uncommitted changes",
+    )  # fmt: skip
     parser.add_argument("--document", action="store_true", help="make no run, write the page")
     options = parser.parse_args(arguments)
     if options.folder is None and not options.document:
         parser.error("say which FOLDER has the sets, or --document")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    if not options.document and _git(options.checkout, "status", "--porcelain", "--", PACKAGE):
+        parser.error(f"{options.checkout / PACKAGE} has changes: commit them, a record names code")
     failed = 0
     for photos in [] if options.document else _sets(options.folder, options.only):
         path = record_path(
@@ -90,9 +97,13 @@ def record_path(photos: str, preset: str, core: str, root: Path = RECORDS) -> Pa
     return root / STUDY / f"{photos}-{preset}-{core}.json"
 
 
-def _commit(root: Path, what: str = "HEAD") -> str:
-    git = ["git", "-C", str(root), "rev-parse", "--short=10", what]
+def _git(root: Path, *words: str) -> str:
+    git = ["git", "-C", str(root), *words]
     return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def _commit(root: Path, what: str = "HEAD") -> str:
+    return _git(root, "rev-parse", "--short=10", what)
 
 
 def _run(photos: Path, preset: str, root: Path, threads: int) -> dict[str, Any]:
@@ -111,7 +122,7 @@ def _run(photos: Path, preset: str, root: Path, threads: int) -> dict[str, Any]:
         raise WorkerError(f"A run failed with exit code {done.returncode}: {words}")
     return {
         "set": photos.name,
-        "photos": sum(1 for path in (photos / "images").iterdir() if path.is_file()),
+        "photos": sum(path.suffix.lower() in PHOTOS for path in (photos / "images").iterdir()),
         "preset": preset,
         "commit": _commit(root),
         "machine": processor_name(),
@@ -130,7 +141,7 @@ def kept_of(report: Mapping[str, Any]) -> dict[str, Any]:
     for entry in report["stages"]:
         stage = entry["name"].partition("-")[0]
         for seconds, name in ((processor_s, "processor_seconds"), (clock_s, "seconds")):
-            seconds[stage] = round(seconds.get(stage, 0.0) + entry[name], 1)
+            seconds[stage] = round(seconds.get(stage, 0.0) + (entry[name] or 0.0), 1)
     (region,) = report["regions"].values()
     training, rendered = report["training"], region["mesh_rendering"]
     statistics, facts = region["statistics"], report["cameras"]["facts"]

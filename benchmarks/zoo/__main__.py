@@ -26,6 +26,7 @@ from .catalogue import DEVELOPMENT, PARTS, SCENES, zoo_scene
 from .document import write_document
 from .runs import BASELINES, TAKEN, alpha_case, find_scene, is_made, make_one, run_case
 from .sheet import draw_sheet
+from .taken_photos import ensure_taken_scene
 
 _logger = logging.getLogger("benchmarks")
 
@@ -89,7 +90,8 @@ def main(given: Sequence[str] | None = None) -> int:
             return _make_runs(names, options, further)
         for name in names:
             begun_s = time.monotonic()
-            folder = ensure_zoo_scene(name, options.threads)
+            ensure = ensure_taken_scene if options.taken else ensure_zoo_scene
+            folder = ensure(name, options.threads)
             _logger.info("%s: %.0f s, %s", name, time.monotonic() - begun_s, folder.name)
     except WrapError as error:
         _logger.error("%s", error)
@@ -99,6 +101,8 @@ def main(given: Sequence[str] | None = None) -> int:
 
 def _make_runs(names: Sequence[str], options: argparse.Namespace, further: Sequence[str]) -> int:
     """Make the alpha shapes and runs that are missing; return 1 where one failed, else 0."""
+    if options.label and options.label.endswith(TAKEN):
+        raise UsageError(f"Labels do not end with {TAKEN}.", "Say --taken, which adds it.")
     label = (options.label or options.preset) + (TAKEN if options.taken else "")
     if label == BASELINES or (further and not options.label):
         raise UsageError(

@@ -227,10 +227,14 @@ def test_quads_become_an_object_with_photos_and_maps(job: JobFolder) -> None:
     # Once more: the same object, not another one.
     thing.hide_set(False)
     select_alone(thing)
+    made.hide_set(True)
     choose_quads(200)
     assert press(job).state == "DONE"
     assert [t.name for t in bpy.data.objects if tags.kind_of(t) == "baked"] == ["Foreign quads"]
-    assert len(bpy.data.objects["Foreign quads"].data.polygons) < 250
+    made = bpy.data.objects["Foreign quads"]
+    assert len(made.data.polygons) < 250
+    assert not made.hide_get()
+    assert made.select_get()
 
 
 def select_alone(thing: bpy.types.Object) -> None:

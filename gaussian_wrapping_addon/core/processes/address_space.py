@@ -20,11 +20,11 @@ def limit_address_space(most_bytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (lowered[0], lowered[1]))
 
 
-def allows_address_space(wanted_bytes: int) -> bool:
-    """Tell whether the limit that this process was given leaves room for another limit."""
+def is_limited_below(wanted_bytes: int) -> bool:
+    """Tell whether this process was given a lower limit than one that it wants to set."""
     if not sys.platform.startswith("linux"):
         return False
     import resource
 
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return soft == resource.RLIM_INFINITY or soft >= wanted_bytes
+    return soft != resource.RLIM_INFINITY and soft < wanted_bytes

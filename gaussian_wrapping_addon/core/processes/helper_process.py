@@ -34,7 +34,7 @@ from ..errors import (
     WrapError,
 )
 from ..progress import Progress
-from .address_space import allows_address_space
+from .address_space import is_limited_below
 from .peak_memory import record_helper_peak
 from .process_identity import caller_option
 from .spawn import kill_group, spawn
@@ -46,10 +46,11 @@ _logger = logging.getLogger(__name__)
 _POLL_S = 0.1
 _running: set[subprocess.Popen[bytes]] = set()
 _OUTPUT_TAIL_LINES = 20
-_OUT_OF_MEMORY = ("MemoryError", "bad_alloc")
-"""What Python and C++ say where an allocation fails."""
+_OUT_OF_MEMORY = ("MemoryError", "bad_alloc", "out of memory", "Memory allocation still failed")
+"""What Python, C++, LLVM and OpenBLAS say where an allocation fails."""
 _MEMORY_HINT = (
-    "Close other programs, or allow more memory (ulimit -v, a container's limit), then resume."
+    "Close other programs, or allow more memory (ulimit -v, a container's limit), then resume. If "
+    "it happens again, use fewer photos, or a longer edge of the mesh."
 )
 _MAX_SAID = 300
 """Most characters of a crashed helper's last line in the message."""
@@ -173,10 +174,12 @@ def run_helper(
 
 def _is_short_of_memory(code: int, output: Sequence[str], memory_bytes: int | None) -> bool:
     """Tell whether a helper ended for want of memory that the system did not give."""
-    # Linux kills what takes the last memory; nobody else sends this signal to a helper.
-    if code == -getattr(signal, "SIGKILL", 0) and code != 0:
+    # Linux kills what takes the last memory, containers what takes more than they may.
+    if code != 0 and code == -getattr(signal, "SIGKILL", 0):
         return True
-    if memory_bytes and allows_address_space(memory_bytes):
+    if memory_bytes and is_limited_below(memory_bytes) and code < 0:
+        return True  # native code crashes where an allocation fails, and says nothing
+    if memory_bytes and sys.platform.startswith("linux") and not is_limited_below(memory_bytes):
         return False  # it had what it may take at most
     return any(mark in line for line in output for mark in (*_OUT_OF_MEMORY, *NO_ROOM))
 

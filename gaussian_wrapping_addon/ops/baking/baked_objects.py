@@ -116,12 +116,15 @@ def _new_object(
 
 
 def _stand_in(thing: bpy.types.Object, dense: bpy.types.Object) -> None:
-    """Hide the dense mesh; where it was the active object, the new one is, and selected."""
+    """Show an object and hide its dense mesh; where that was active, it is instead, selected."""
     layer = bpy.context.view_layer
+    is_there = thing.name in layer.objects
+    if is_there:
+        thing.hide_set(False)
     was_active = layer.objects.active == dense and dense.mode == "OBJECT"
     dense.hide_set(True)
     dense.hide_render = True
-    if was_active and thing.name in layer.objects:
+    if was_active and is_there:
         thing.select_set(True)
         layer.objects.active = thing
 

@@ -128,10 +128,21 @@ def test_what_the_system_does_not_give_is_told_apart(
     run, monkeypatch: pytest.MonkeyPatch, memory_bytes: int | None
 ) -> None:
     """A limit that the user has set (ulimit -v) is below what the helper may take."""
-    monkeypatch.setattr(helper_process, "allows_address_space", lambda _: False)
+    monkeypatch.setattr(helper_process, "is_limited_below", lambda _: True)
     with pytest.raises(MemoryShortageError, match="MemoryError") as caught:
         run("limited", memory_bytes=memory_bytes)
     assert "ulimit" in caught.value.hint
+
+
+@linux
+def test_native_code_that_crashes_under_a_users_limit_was_short_of_memory(
+    run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(WorkerError, match="signal 11"):
+        run("crash", memory_bytes=8 * 2**30)
+    monkeypatch.setattr(helper_process, "is_limited_below", lambda _: True)
+    with pytest.raises(MemoryShortageError, match="signal 11"):
+        run("crash", memory_bytes=8 * 2**30)
 
 
 @linux
@@ -142,7 +153,7 @@ def test_a_lower_limit_of_the_user_stays() -> None:
         "from gaussian_wrapping_addon.core.processes.address_space import *\n"
         "G = 2**30\n"
         "resource.setrlimit(resource.RLIMIT_AS, (3 * G, 4 * G))\n"
-        "assert allows_address_space(3 * G) and not allows_address_space(3 * G + 1)\n"
+        "assert is_limited_below(3 * G + 1) and not is_limited_below(3 * G)\n"
         "limit_address_space(8 * G)\n"
         "assert resource.getrlimit(resource.RLIMIT_AS) == (3 * G, 4 * G)\n"
         "limit_address_space(2 * G)\n"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import ResourceError, WorkerError
+from ...errors import MemoryShortageError, ResourceError, WorkerError
 from ...progress import Progress
 from ...report_warning import ReportWarning
 from ...tolerances import NEAR_Z, SCENE_RADIUS
@@ -41,11 +41,18 @@ def make_start_points(
 
     Triangulation keeps the poses of the input. If it finds too few points (no texture, inaccurate
     poses), points are drawn at random in view of the cameras, and a warning is added.
+
+    Raises
+    ------
+    MemoryShortageError
+        The system gave the triangulation too little memory.
     """
     try:
         points, colors = triangulate_points(
             cameras, photos, masks, work_folder, progress, seed=seed, threads=threads
         )
+    except MemoryShortageError:
+        raise  # with enough memory the same photos would give points
     except (WorkerError, ResourceError) as error:
         _logger.warning("triangulation failed: %s", error)
         text = f"Start points could not be triangulated: {error.message}"

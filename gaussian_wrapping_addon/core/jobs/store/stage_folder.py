@@ -23,7 +23,8 @@ _logger = logging.getLogger(__name__)
 
 # Increase a number when a stage's code changes its result: old stage folders are not re-used then.
 # Keys of later stages hold those of earlier ones. Finished trainings can be meshed and trained on
-# whatever the number of their cameras; with another number of their own they cannot.
+# whatever the number of their cameras; with another number of their own they cannot: a training
+# that comes out better now keeps its number.
 STAGE_VERSIONS = {"cameras": 2, "train": 6, "mesh": 11, "texture": 12, "bake": 2}
 
 DONE_NAME = "done.json"

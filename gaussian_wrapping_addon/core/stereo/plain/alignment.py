@@ -105,6 +105,7 @@ class Aligner:
         noise = np.zeros(len(numbers))
         for segment in segments:
             noise[segment.view] = segment.noise
+        noise *= grey_of(photos.gains)  # textures are of photos whose exposure is taken out
         scales = np.array(SCALES_PX)
         # White noise falls with the standard deviation of the Gaussian that smooths it.
         left = smoothed_noise(np.quantile(noise, NOISY_PHOTOS), scales[:, 0])  # (2,)

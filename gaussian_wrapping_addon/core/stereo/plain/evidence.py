@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -54,6 +55,7 @@ class PackedPhotos:
     sizes: np.ndarray  # (n, 2) int64
     depths: np.ndarray  # (n, h, w) float32, 0 where unknown
     images: np.ndarray  # (n, h, w, 3) uint8, exposure taken out
+    gains: np.ndarray  # (n, 3) float64, by which that was done
 
     def asked(self) -> np.ndarray:
         """Return (m,) int64 numbers of the photos to ask."""
@@ -95,7 +97,7 @@ class PackedPhotos:
 
     def with_depths(self, depths: np.ndarray) -> PackedPhotos:
         """Return the same photos with other known depths."""
-        return PackedPhotos(self.cameras, self.projections, self.sizes, depths, self.images)
+        return dataclasses.replace(self, depths=depths)
 
 
 def photos_asked(count: int) -> np.ndarray:
@@ -119,12 +121,13 @@ def packed(depth_maps: Sequence[DepthMap], random: np.random.Generator) -> Packe
         np.array([(camera.width, camera.height) for camera in cameras], np.int64),
         depths,
         images,
+        np.ones((len(cameras), 3)),
     )
     gains = np.exp(-_log_gains(photos, random))  # (n, 3)
     for view, gain in enumerate(gains):
         corrected = (images[view].astype(np.float32) + _DARK) * gain.astype(np.float32) - _DARK
         images[view] = np.clip(corrected + 0.5, 0, 255).astype(np.uint8)
-    return photos
+    return dataclasses.replace(photos, gains=gains)
 
 
 def _projection(camera: Camera) -> np.ndarray:

@@ -16,7 +16,8 @@ SIDES_PX = (1, 2)
 leave that of squares, which texture is made of, too; squares of 4 px show faint texture itself."""
 
 BLOCK, LEAST_USED, LEAST_BLOCKS = 16, 0.5, 4
-"""Squares along the side of a block, share of them that must be usable, and blocks needed."""
+"""Squares along the side of a block (so that a block of squares of 2 px has 32), share of them that
+must be usable, and blocks needed."""
 
 QUIET_BLOCKS, QUIET_SHARE = 0.25, 0.945
 """Quantile of the blocks that counts, and share of white noise that it shows. Faint texture shows

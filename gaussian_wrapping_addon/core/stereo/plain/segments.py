@@ -58,7 +58,7 @@ class Segment:
     unknown: float
     """Share of its pixels whose depth no source confirms."""
     noise: float
-    """Standard deviation of white noise as strong as that of its photo's grey levels."""
+    """Standard deviation of white noise as strong as that of its photo's grey levels, as taken."""
 
     @cached_property
     def pixels(self) -> np.ndarray:

@@ -98,7 +98,7 @@ def find_charts(
     Raises
     ------
     WorkerError, DatasetError, ResourceError
-        xatlas crashed, returned invalid results or took too long.
+        xatlas crashed, returned invalid results, took too long or got too little memory.
     """
     copy = smooth_vertices(vertices, faces)
     try:
@@ -227,7 +227,7 @@ def pack_charts(
     Raises
     ------
     WorkerError, DatasetError, ResourceError
-        xatlas crashed, returned invalid results or took too long.
+        xatlas crashed, returned invalid results, took too long or got too little memory.
     """
     # Rows of a texture go down, v goes up: flipped here, so that charts keep their orientation.
     flat = (charts.corner_uvs * [1.0, -1.0]).astype(np.float32)

@@ -94,15 +94,17 @@ def unwrap(
         Polygon that each face is a part of: seams run between polygons, not through them, but for
         folded ones with more than four sides, and the fallback.
 
-    Notes
-    -----
-    xatlas crashes, hangs or returns NaN on some meshes. In all of these cases a box projection
-    replaces it, with a warning and ``method = "box"``.
-
     Raises
     ------
     MemoryShortageError
         The system gave xatlas too little memory.
+    ResourceError
+        The disk is full.
+
+    Notes
+    -----
+    xatlas crashes, hangs or returns NaN on some meshes. In these cases a box projection replaces
+    it, with a warning and ``method = "box"``.
     """
     graph = face_graph(mesh.vertices, mesh.faces)
     try:

@@ -151,6 +151,23 @@ def test_without_texture_a_plane_stays_in_processed_photos(processed) -> None:
     assert not any(aligner.contradicts(start, part) for part in parts)
 
 
+@pytest.mark.parametrize("exposures", [[1.0, 0.4] * (COUNT // 2), [1.0] * (COUNT - 2) + [0.4] * 2])
+def test_noise_of_dark_photos_is_that_of_their_brightened_textures(exposures: list[float]) -> None:
+    random = np.random.default_rng(5)
+    maps = []
+    for found, exposure in zip(
+        without_texture(noisy_maps(0.0), [0.0] * COUNT), exposures, strict=True
+    ):
+        color = exposure * found.color + 3.0 * random.normal(size=found.color.shape)
+        maps.append(
+            dataclasses.replace(found, color=np.clip(np.rint(color), 0, 255).astype(np.uint8))
+        )
+    start, aligner = wall_plane(WALL_Y + 0.05), aligner_of(maps)
+    parts = wall_parts(aligner.plain)
+    assert aligner.aligned(start, parts) is start
+    assert not any(aligner.contradicts(start, part) for part in parts)
+
+
 @pytest.mark.parametrize("factor", [0.75, 0.85, 1.2])
 def test_shading_makes_no_false_plane_true(factor: float) -> None:
     maps = []

@@ -48,7 +48,7 @@ def test_noise_of_shaded_photos_is_found(noise: float) -> None:
 def test_noise_of_resized_and_compressed_photos_is_that_of_their_texture(
     processed, tolerance: float
 ) -> None:
-    """Single pixels show two thirds of it after resizing, a quarter after JPEG."""
+    """Single pixels show three quarters of it after resizing, a quarter after JPEG."""
     clean = noisy(0.0)
     with_noise = processed(clean, 2.0 * np.random.default_rng(0).normal(size=SHAPE))
     without = processed(clean, np.zeros(SHAPE))
