@@ -4,7 +4,8 @@
 Photos of spot with a known texture are rendered by rays and baked back; then a mesh of 375 thousand
 faces is unwrapped and baked at 4096 x 4096 from 40 photos of 2 megapixels, in a process of its own.
 With ``--jobs`` finished jobs of real photos are textured without their held-out photos and compared
-with these. ``texturing.md`` and its pictures go into ``docs/benchmarks``.
+with these, and so are true meshes of the zoo's glossy scenes with its test views. ``texturing.md``
+and its pictures go into ``docs/benchmarks``.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from gaussian_wrapping_addon.core.settings import TextureSettings
 from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 
+from .texturing_parts.glossy import SCENES as GLOSSY
+from .texturing_parts.glossy import glossy_figures
 from .texturing_parts.held_out import held_out_figures
 from .texturing_parts.judge import photos_that_see, psnr, seams, steps_between_texels, true_albedo
 from .texturing_parts.photographed import (
@@ -45,7 +48,7 @@ OUT = Path(__file__).resolve().parents[1] / "docs" / "benchmarks"
 PHOTOS, WIDTH, HEIGHT, SUPERSAMPLING = 24, 640, 480, 3
 SIZES_PX = (512, 1024)
 GREY = 140.0
-PARTS = ("known", "uneven", "large", "real")
+PARTS = ("known", "uneven", "large", "real", "glossy")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -81,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "uneven": _uneven,
         "large": _large,
         "real": lambda threads: _real(options.jobs, out, threads, options.unshown),
+        "glossy": lambda threads: _glossy(out, threads),
     }
     for name in options.only:
         lines += ["", *parts[name](options.threads)]
@@ -234,6 +238,33 @@ def _real(jobs: Sequence[Path], out: Path, threads: int, unshown: Sequence[str])
         if picture is not None:
             pictures += ["", f"![{job.name}]({picture.name})"]
     return lines + pictures if jobs else [*lines[:2], "No job was named with `--jobs`."]
+
+
+def _glossy(out: Path, threads: int) -> list[str]:
+    lines = [
+        "## Glossy things, test views",
+        "",
+        (
+            "True meshes of the zoo's glossy scenes, textured from their photos and rendered from "
+            "the cameras of test views. A texture has no gloss: what is right is what most photos "
+            "show. PSNR and SSIM of the pixels that the mesh covers. Pictures: the test view of "
+            "median PSNR left, the rendering right."
+        ),
+        "",
+        "| scene | photos | texture | PSNR | SSIM | covered |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    pictures = []
+    for name in GLOSSY:
+        _logger.info("test views of %s", name)
+        picture = out / f"texturing-{name}.jpg"
+        f = glossy_figures(name, picture, threads)
+        lines.append(
+            f"| {name} | {f['photos']} | {f['size_px']} | {f['psnr']:.2f} dB | {f['ssim']:.3f} "
+            f"| {100 * f['covered']:.0f} % |"
+        )
+        pictures += ["", f"![{name}]({picture.name})"]
+    return lines + pictures
 
 
 if __name__ == "__main__":

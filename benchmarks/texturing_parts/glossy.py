@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""True meshes of glossy scenes of the zoo, textured from their photos, beside test views."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
+from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
+from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
+from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
+from gaussian_wrapping_addon.core.evaluation.views.side_by_side import write_side_by_side
+from gaussian_wrapping_addon.core.limits import MAX_IMAGE_SIDE_PX
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.settings import TextureSettings
+from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
+
+from ..speed_error.score import test_views
+from ..zoo.cache import ensure_zoo_scene
+from .held_out import PICTURE_WIDTH_PX
+
+SCENES = ("gloss-d1", "gloss-d2", "gloss-d3")
+
+
+def glossy_figures(name: str, picture: Path, threads: int) -> dict[str, Any]:
+    """Texture the true mesh of a scene from its photos, and compare with its test views.
+
+    Parameters
+    ----------
+    name : str
+        Of a scene of the zoo; its photos are rendered where they are missing.
+    picture : Path
+        Gets the test view of median PSNR, left, and the rendering, right.
+
+    Returns
+    -------
+    dict
+        ``psnr``, ``ssim`` and ``covered``: means over the test views, of the pixels that the mesh
+        covers wholly; ``photos``, ``size_px``.
+    """
+    folder = ensure_zoo_scene(name, threads)
+    truth = read_truth(folder).mesh
+    assert truth is not None
+    vertices, faces = truth
+    with tempfile.TemporaryDirectory() as work:
+        scene = load_scene(folder, Path(work), Progress())
+        to_scene = scene.world_from_scene.inverse()
+        mesh = SurfaceMesh(to_scene.points(vertices), np.asarray(faces, np.int32))
+        textured = texture_mesh(
+            mesh, scene, PhotoStore(scene, MAX_IMAGE_SIDE_PX), TextureSettings(), Path(work),
+            Progress(), threads=threads,
+        )  # fmt: skip
+    views = test_views(folder, to_scene)
+    shown: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+    def keep(view: str, photo: np.ndarray, image: np.ndarray) -> None:
+        shown[view] = photo, image
+
+    score = render_views(
+        textured, [c for c, _ in views], [i for _, i in views], threads=threads, on_view=keep
+    )
+    ranked = sorted(score.views, key=lambda view: view.scores.psnr)
+    write_side_by_side(
+        picture, *shown[ranked[len(ranked) // 2].name], max_width_px=PICTURE_WIDTH_PX
+    )
+    return {
+        "photos": len(scene.views),
+        "size_px": textured.statistics["size_px"],
+        "psnr": score.psnr,
+        "ssim": score.ssim,
+        "covered": score.covered,
+    }
