@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -119,6 +120,10 @@ def test_processes_of_a_folder_are_found_until_they_end(tmp_path: Path) -> None:
     words = [sys.executable, "-c", code, processes.WORKER_MODULE, str(tmp_path)]
     process = subprocess.Popen(words, stdin=subprocess.PIPE)
     try:
+        # A process that begins has no command line for a moment.
+        end_s = time.monotonic() + 5.0
+        while not processes.processes_of(tmp_path) and time.monotonic() < end_s:
+            time.sleep(0.01)
         assert processes.wait_until_gone(tmp_path, 0.1)[1] == [process.pid]
         assert processes.worker_of(tmp_path) == process.pid
         assert processes.peak_address_space(process.pid) > 1_000_000

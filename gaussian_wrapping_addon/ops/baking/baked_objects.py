@@ -118,6 +118,7 @@ def _new_object(
 def _stand_in(thing: bpy.types.Object, dense: bpy.types.Object) -> None:
     """Show an object and hide its dense mesh; where that was active, it is instead, selected."""
     layer = bpy.context.view_layer
+    layer.update()  # or it does not have an object that was linked just now
     is_there = thing.name in layer.objects
     if is_there:
         thing.hide_set(False)
