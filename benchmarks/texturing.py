@@ -217,12 +217,17 @@ def _real(jobs: Sequence[Path], out: Path, threads: int, unshown: Sequence[str])
         (
             "Each mesh is textured without the photos that the training held out, and rendered "
             "from their cameras. PSNR and SSIM of the pixels that the mesh covers; fitted: with "
-            "one gain a channel for each photo, as the exposure of a held-out photo is unknown. "
+            "one gain a channel for each photo, as the exposure of a held-out photo is unknown; of "
+            "themselves: baked from the held-out photos alone, about as much as one unlit texture "
+            "can have, where there are more than a few of them. "
             "Pictures: the photo of median PSNR left, the rendering right."
         ),
         "",
-        "| job | photos | held out | faces | texture | PSNR | fitted | SSIM | covered | overlaps |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        (
+            "| job | photos | held out | faces | texture | PSNR | fitted | of themselves | SSIM "
+            "| covered | overlaps |"
+        ),
+        "| --- " * 11 + "|",
     ]
     pictures = []
     for job in jobs:
@@ -230,9 +235,9 @@ def _real(jobs: Sequence[Path], out: Path, threads: int, unshown: Sequence[str])
         picture = None if job.name in unshown else out / f"texturing-{job.name}.jpg"
         f = held_out_figures(job, picture, threads)
         lines.append(
-            f"| {job.name} | {f['photos']} | {f['held_out']} | {f['faces']:,} "
+            f"| {job.name} | {f['photos']} | {f['views']} | {f['faces']:,} "
             f"| {f['texture']['size_px']} | {f['psnr']:.2f} dB | {f['fitted_psnr']:.2f} dB "
-            f"| {f['ssim']:.3f} | {100 * f['covered']:.0f} % "
+            f"| {f['itself_psnr']:.2f} dB | {f['ssim']:.3f} | {100 * f['covered']:.0f} % "
             f"| {f['texture']['texels_overlapping']} |"
         )
         if picture is not None:

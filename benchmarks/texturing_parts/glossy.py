@@ -12,8 +12,6 @@ import numpy as np
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
-from gaussian_wrapping_addon.core.evaluation.views.side_by_side import write_side_by_side
 from gaussian_wrapping_addon.core.limits import MAX_IMAGE_SIDE_PX
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
@@ -22,7 +20,7 @@ from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 
 from ..speed_error.score import test_views
 from ..zoo.cache import ensure_zoo_scene
-from .held_out import PICTURE_WIDTH_PX
+from .compared import compared
 
 SCENES = ("gloss-d1", "gloss-d2", "gloss-d3")
 
@@ -40,8 +38,7 @@ def glossy_figures(name: str, picture: Path, threads: int) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``psnr``, ``ssim`` and ``covered``: means over the test views, of the pixels that the mesh
-        covers wholly; ``photos``, ``size_px``.
+        What :func:`.compared.compared` returns, ``photos`` and ``size_px``.
     """
     folder = ensure_zoo_scene(name, threads)
     truth = read_truth(folder).mesh
@@ -56,22 +53,9 @@ def glossy_figures(name: str, picture: Path, threads: int) -> dict[str, Any]:
             Progress(), threads=threads,
         )  # fmt: skip
     views = test_views(folder, to_scene)
-    shown: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-
-    def keep(view: str, photo: np.ndarray, image: np.ndarray) -> None:
-        shown[view] = photo, image
-
-    score = render_views(
-        textured, [c for c, _ in views], [i for _, i in views], threads=threads, on_view=keep
-    )
-    ranked = sorted(score.views, key=lambda view: view.scores.psnr)
-    write_side_by_side(
-        picture, *shown[ranked[len(ranked) // 2].name], max_width_px=PICTURE_WIDTH_PX
-    )
+    cameras, photos = zip(*views, strict=True)
     return {
         "photos": len(scene.views),
         "size_px": textured.statistics["size_px"],
-        "psnr": score.psnr,
-        "ssim": score.ssim,
-        "covered": score.covered,
+        **compared(textured, cameras, photos, picture, threads),
     }

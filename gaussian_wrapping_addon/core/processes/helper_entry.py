@@ -11,9 +11,9 @@ import threading
 import time
 from pathlib import Path
 
-from ..errors import MemoryShortageError, WrapError
+from ..errors import WrapError
 from .address_space import limit_address_space
-from .helper_process import emit
+from .helper_process import FAILURES, emit
 from .peak_memory import own_peak_bytes
 from .process_identity import Caller
 from .worker_requirements import package_error
@@ -45,11 +45,13 @@ def main(arguments: list[str]) -> int:
 
 
 def _tell(error: WrapError) -> int:
-    emit(
-        error=error.message, hint=error.hint,
-        is_short_of_memory=isinstance(error, MemoryShortageError),
-    )  # fmt: skip
+    kind = next((name for name in map(_name, type(error).__mro__) if name in FAILURES), "")
+    emit(error=error.message, hint=error.hint, kind=kind)
     return error.exit_code
+
+
+def _name(kind: type) -> str:
+    return kind.__name__
 
 
 def _request_parent_death_signal() -> None:

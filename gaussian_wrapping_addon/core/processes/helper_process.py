@@ -3,9 +3,9 @@
 
 A helper is a module with ``main(folder)``; it reads ``task.json`` and arrays in the folder, writes
 its results there, and reports on stdout, one JSON object per line:
-``{"fraction": 0.5, "message": "..."}``. A typed failure is ``{"error": "...", "hint": "..."}``
-followed by its exit code. The last line of every helper that exits normally is
-``{"peak_bytes": ...}``, its peak memory.
+``{"fraction": 0.5, "message": "..."}``. A typed failure is
+``{"error": "...", "hint": "...", "kind": "DatasetError"}``. The last line of every helper that
+exits normally is ``{"peak_bytes": ...}``, its peak memory.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ from typing import IO, Any
 
 from .. import limits
 from ..errors import (
-    EXIT_OTHER,
     DatasetError,
     MemoryShortageError,
+    MeshingError,
     ResourceError,
+    UsageError,
     WorkerError,
     WrapError,
 )
@@ -43,6 +44,13 @@ from .worker_requirements import NO_ROOM
 
 _logger = logging.getLogger(__name__)
 
+FAILURES: dict[str, type[WrapError]] = {
+    kind.__name__: kind
+    for kind in (
+        DatasetError, MemoryShortageError, MeshingError, ResourceError, UsageError, WorkerError,
+    )
+}  # fmt: skip
+"""Typed failures of a helper that its caller raises again; others become a ``WorkerError``."""
 _POLL_S = 0.1
 _running: set[subprocess.Popen[bytes]] = set()
 _OUTPUT_TAIL_LINES = 20
@@ -105,10 +113,10 @@ def run_helper(
     ------
     Cancelled
         The user asked to stop; the helper has been ended.
-    DatasetError
-        The helper reported another typed failure.
+    DatasetError, MeshingError, UsageError
+        The helper reported such a failure.
     ResourceError
-        The deadline passed.
+        The helper reported one, or the deadline passed.
     MemoryShortageError
         The system gave the helper too little memory.
     WorkerError
@@ -158,9 +166,7 @@ def run_helper(
             reader.join(1.0)
     code = process.returncode
     if failure:
-        kind: type[WrapError] = WorkerError if code == EXIT_OTHER else DatasetError
-        if failure.get("is_short_of_memory"):
-            kind = MemoryShortageError
+        kind = FAILURES.get(str(failure.get("kind")), WorkerError)
         raise kind(str(failure["error"]), str(failure.get("hint", "")))
     if code != 0:
         reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
@@ -177,10 +183,11 @@ def _is_short_of_memory(code: int, output: Sequence[str], memory_bytes: int | No
     # Linux kills what takes the last memory, containers what takes more than they may.
     if code != 0 and code == -getattr(signal, "SIGKILL", 0):
         return True
-    if memory_bytes and is_limited_below(memory_bytes) and code < 0:
-        return True  # native code crashes where an allocation fails, and says nothing
-    if memory_bytes and sys.platform.startswith("linux") and not is_limited_below(memory_bytes):
-        return False  # it had what it may take at most
+    if memory_bytes and sys.platform.startswith("linux"):
+        if not is_limited_below(memory_bytes):
+            return False  # it had what it may take at most
+        if code < 0:
+            return True  # native code crashes where an allocation fails, and says nothing
     return any(mark in line for line in output for mark in (*_OUT_OF_MEMORY, *NO_ROOM))
 
 

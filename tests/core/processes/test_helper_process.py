@@ -14,8 +14,11 @@ from gaussian_wrapping_addon.core.errors import (
     Cancelled,
     DatasetError,
     MemoryShortageError,
+    MeshingError,
     ResourceError,
+    UsageError,
     WorkerError,
+    WrapError,
 )
 from gaussian_wrapping_addon.core.processes import helper_entry, helper_process, peak_memory
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
@@ -23,6 +26,11 @@ from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 HELPERS = {
     "good": "emit(fraction=0.5, message='half'); (folder / 'out').write_text('1')",
     "typed": "raise DatasetError('The photo is odd.', 'Remove it.')",
+    "broken_file": "raise errors.ParseError('a.bin', 'byte 3', 'it is short.', 'Copy it again.')",
+    "bad_setting": "raise errors.SettingError('a.b', '1 to 3')",
+    "no_time": "raise errors.ResourceError('It took long.')",
+    "no_surface": "raise errors.MeshingError('No surface.')",
+    "base": "raise errors.WrapError('Odd.')",
     "crash": "os.kill(os.getpid(), 11)",
     "raises": "raise RuntimeError('unexpected words')",
     "noise": "sys.stdout.write('not json\\n[1]\\n'); (folder / 'out').write_text('1')",
@@ -45,6 +53,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             "import os, sys, time\nfrom pathlib import Path\n"
             f"sys.path.insert(0, {str(Path(__file__).resolve().parents[3])!r})\n"
             "from gaussian_wrapping_addon.core.processes import helper_entry\n"
+            "from gaussian_wrapping_addon.core import errors\n"
             "from gaussian_wrapping_addon.core.errors import DatasetError\n"
             "from gaussian_wrapping_addon.core.processes.helper_process import emit\n"
             "import types, importlib\n"
@@ -79,6 +88,22 @@ def test_typed_failures_keep_message_and_hint(run) -> None:
         run("typed")
     assert caught.value.message == "The photo is odd."
     assert caught.value.hint == "Remove it."
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "message"),
+    [
+        ("broken_file", DatasetError, "a.bin, byte 3: it is short."),
+        ("bad_setting", UsageError, "Setting a.b is out of range."),
+        ("no_time", ResourceError, "It took long."),
+        ("no_surface", MeshingError, "No surface."),
+        ("base", WorkerError, "Odd."),
+    ],
+)
+def test_typed_failures_keep_their_exit_code(run, name: str, kind: type, message: str) -> None:
+    with pytest.raises(WrapError) as caught:
+        run(name)
+    assert (type(caught.value), caught.value.message) == (kind, message)
 
 
 def test_a_crash_names_the_signal(run) -> None:

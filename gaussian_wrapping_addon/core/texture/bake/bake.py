@@ -24,9 +24,12 @@ from .visibility import photo_visibility
 KEPT_VIEWS = 15
 """Odd, so that the median of the views is one of them. With five, the median changed wherever one
 view replaced another: flakes along the rim of a pot whose photos differ in exposure."""
-SHARPNESS = 3.0
-"""Exponent of the weights: how far the best views dominate. More keeps gradients, noise and
-highlights of single photos, less blurs (docs/benchmarks/texturing.md)."""
+SHARPNESS_AGREEING, SHARPNESS_DISAGREEING = 6.0, 1.0
+"""Exponents of the weights, how far the best views dominate, where views agree and where they do
+not: there more keeps gradients, noise and highlights of single photos, and where they agree less
+blurs (docs/benchmarks/texturing.md)."""
+DISAGREEMENT = 10.0
+"""Median distance of the views from their median, of 255 levels, half way between the two."""
 OUTLIER_FLOOR = 20.0
 """Views within this many of 255 levels of the median are never outliers."""
 OUTLIER_FACTOR = 2.5
@@ -283,6 +286,7 @@ def _blend(
         for j in range(count):
             share[j] = weights[i, order[j]] / best
         limit = np.inf
+        sharpness = SHARPNESS_AGREEING
         if count >= 3:
             for channel in range(3):
                 for j in range(count):
@@ -299,14 +303,17 @@ def _blend(
                     sorted_distance[rank] = sorted_distance[rank - 1]
                     rank -= 1
                 sorted_distance[rank] = far
-            limit = max(OUTLIER_FLOOR, OUTLIER_FACTOR * sorted_distance[(count - 1) // 2])
+            spread = sorted_distance[(count - 1) // 2]
+            limit = max(OUTLIER_FLOOR, OUTLIER_FACTOR * spread)
+            agreement = 1.0 / (1.0 + (spread / DISAGREEMENT) ** 4)
+            sharpness = agreement * SHARPNESS_AGREEING + (1.0 - agreement) * SHARPNESS_DISAGREEING
         red, green, blue, total = 0.0, 0.0, 0.0, 0.0
         used = 0
         for j in range(count):
             if count >= 3 and distance[j] > limit:
                 rejected[i] += 1
                 continue
-            weight = share[j] ** SHARPNESS
+            weight = share[j] ** sharpness
             red += weight * kept[i, order[j], 0]
             green += weight * kept[i, order[j], 1]
             blue += weight * kept[i, order[j], 2]
