@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -53,6 +53,12 @@ class Scene:
     """Warnings for the user."""
     facts: dict[str, Any] = field(default_factory=dict)
     """Kind of input and counts, for the report."""
+
+    def mask_mode(self, chosen: str) -> Literal["ignore", "background"]:
+        """Return what the masks exclude, for a setting of :class:`~..settings.TrainingSettings`."""
+        if chosen == "auto":
+            return "background" if self.facts.get("photos_masked_as_turning") else "ignore"
+        return "background" if chosen == "background" else "ignore"
 
     @property
     def cameras(self) -> list[Camera]:

@@ -10,7 +10,7 @@ from typing import Any
 from ..errors import UsageError
 from ..export_formats import JOB_FORMATS
 from .checks import Choices, Condition, Range, Subset
-from .choices import PRESETS
+from .choices import PRESETS, TURNTABLE_MODES
 from .declaration import (
     Declaration,
     Item,
@@ -124,6 +124,30 @@ class JobSettings:
             "PLY of a Gaussian splat of the same photos and cameras, made here or elsewhere; "
             "empty starts from the points of the cameras",
             subtype="FILE_PATH",
+            owner="training",
+            panel_name="train_advanced",
+        ),
+    )
+    turntable: str = setting(
+        "auto",
+        help="Whether the camera stood still while the object turned. The background is then left "
+        "out of the search for cameras, and masked. Auto sees it by matches that stay where they "
+        "are; of photos without cameras only.",
+        check=Choices(TURNTABLE_MODES),
+        option=Option(
+            "--turntable",
+            help="the camera stood still while the object turned: mask what stands still",
+            scope="training",
+        ),
+        panel=PanelProperty(
+            "Turntable",
+            "The camera stood still while the object turned: the background is left out of the "
+            "search for cameras, and masked",
+            items=(
+                Item("auto", "Auto", "Where the photos show it"),
+                Item("on", "On", "All photos of one size are from one place"),
+                Item("off", "Off", "Nothing is left out"),
+            ),
             owner="training",
             panel_name="train_advanced",
         ),

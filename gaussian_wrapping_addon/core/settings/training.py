@@ -235,9 +235,10 @@ class TrainingSettings(MethodSettings):
         "trains is made with a region weight; other regions are meshed from the same training.",
     )
     mask_mode: str = setting(
-        "ignore",
+        "auto",
         help="What masks exclude. ignore: these pixels are not trained on, and anything may be "
-        "there; background: the space behind them is empty.",
+        "there; background: the space behind them is empty; auto: background where the masks were "
+        "made of a turntable, else ignore.",
         check=Choices(MASK_MODES),
         option=Option(
             "--mask-mode", help="masked pixels: ignore them, or treat them as empty background"
@@ -246,6 +247,7 @@ class TrainingSettings(MethodSettings):
             "Masks",
             "Meaning of the masked parts of the photos; no effect without masks",
             items=(
+                Item("auto", "Auto", "Background for a turntable, else Ignore"),
                 Item(
                     "ignore",
                     "Ignore",

@@ -143,6 +143,7 @@ class _Trainer:
     ) -> None:
         if start_splat is not None:
             settings = wrapping_settings(settings)
+        settings = dataclasses.replace(settings, mask_mode=scene.mask_mode(settings.mask_mode))
         self.scene, self.settings = scene, settings
         self.posed = PosedPhotos(photos)
         self.photos = CancellablePhotos(self.posed, progress or Progress())

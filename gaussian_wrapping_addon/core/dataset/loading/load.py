@@ -35,6 +35,7 @@ def load_scene(
     *,
     seed: int = 0,
     threads: int = 0,
+    turntable: str = "auto",
 ) -> Scene:
     """Load photos and cameras, solving and undistorting where needed.
 
@@ -49,6 +50,8 @@ def load_scene(
     seed : int
     threads : int
         0 uses every core.
+    turntable : {"auto", "on", "off"}
+        Of photos without poses; see :func:`~..poses.pose_solver.solve_poses`.
 
     Returns
     -------
@@ -68,7 +71,7 @@ def load_scene(
     warnings: list[ReportWarning] = []
     facts: dict[str, Any] = {"kind": kind.kind}
     if kind.kind == "photos":
-        model = _solve(kind, work_folder, progress.span(0.0, 0.8), seed, threads)
+        model = _solve(kind, work_folder, progress.span(0.0, 0.8), seed, threads, turntable)
         prepare_span = progress.span(0.8, 1.0)
     else:
         model = read_poses(kind)
@@ -131,14 +134,20 @@ def check_photo_count(count: int, left_out: Sequence[ReportWarning] = ()) -> Non
 
 
 def _solve(
-    kind: SourceKind, work_folder: Path, progress: Progress, seed: int, threads: int
+    kind: SourceKind,
+    work_folder: Path,
+    progress: Progress,
+    seed: int,
+    threads: int,
+    turntable: str,
 ) -> SourceModel:
     root = photo_root(kind.folder)
     photos = list_photos(root)
     check_photo_count(len(photos))
     return solve_poses(
-        root, photos, kind.mask_roots, work_folder, progress, seed=seed, threads=threads
-    )
+        root, photos, kind.mask_roots, work_folder, progress,
+        seed=seed, threads=threads, turntable=turntable,
+    )  # fmt: skip
 
 
 def _frame(

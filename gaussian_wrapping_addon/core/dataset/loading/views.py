@@ -224,8 +224,10 @@ def _find_mask(
     notes: _Notes,
 ) -> np.ndarray | None:
     """Return the (h, w) bool mask of a photo, of exactly its size, or ``None``."""
-    mask_path = None
-    if posed.mask_name is not None:
+    mask_path = posed.mask_path
+    if mask_path is not None:
+        pass
+    elif posed.mask_name is not None:
         mask_path = resolve_photo(kind.folder, posed.mask_name)
         if mask_path is None or not os.path.isfile(mask_path):
             mask_path = None

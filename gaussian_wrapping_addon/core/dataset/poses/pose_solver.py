@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import DatasetError
-from ...files import write_json
+from ...files import read_json, write_json
 from ...kernels.parallel import default_threads
 from ...limits import MIN_IMAGES
 from ...machine import total_memory_bytes
@@ -27,16 +27,26 @@ from ...progress import Progress
 from ...report_warning import UNREADABLE_HINT, ReportWarning
 from ..camera import Camera
 from ..photos.photo_exif import read_lens_exif
-from ..photos.photo_file import DecodedPhoto, read_mask, read_photo, write_photo
+from ..photos.photo_file import (
+    MASK_THRESHOLD,
+    DecodedPhoto,
+    read_mask,
+    read_photo,
+    write_mask,
+    write_photo,
+)
 from ..photos.photo_finder import find_mask
 from ..readers.colmap_reader import ModelFiles, read_model
 from ..readers.source_model import PosedPhoto, SourceModel
 from .match_pairs import pairs_by_order, pairs_by_pose
+from .pose_solver_helper import TURNING_FOLDER, TURNTABLE_NAME
 
 MAX_SIFT_PX = 1600
 """Long side of the photos that features are extracted from."""
 MAX_UNREADABLE_SHARE = 0.2
 """Largest share of photos that cannot be decoded; with more, loading fails."""
+TURNTABLE_FOLDER = "turntable"
+"""Masks of what turns, of the photos' full size."""
 _HELPER = "dataset.poses.pose_solver_helper"
 _MEMORY_SHARE = 0.9
 _MIN_MEMORY_BYTES = 8 << 30
@@ -67,6 +77,7 @@ def solve_poses(
     *,
     seed: int = 0,
     threads: int = 0,
+    turntable: str = "auto",
 ) -> SourceModel:
     """Solve cameras and sparse points of photos without poses (structure from motion).
 
@@ -78,7 +89,12 @@ def solve_poses(
     mask_roots : list of Path
         Folders of masks; features on black pixels are not used.
     work_folder : Path
-        Temporary files and ``cameras/`` (the COLMAP model) are written here.
+        Temporary files, ``cameras/`` (the COLMAP model) and ``turntable/`` (masks) are written
+        here.
+    turntable : {"auto", "on", "off"}
+        Whether the camera stood still while the object turned; ``"auto"`` sees it by matches that
+        stay in their place. Matches of the background are then left out, and the background is
+        masked, but where the photos have masks.
 
     Returns
     -------
@@ -111,6 +127,7 @@ def solve_poses(
         raise DatasetError(
             f"Only {len(prepared)} photos can be read; {MIN_IMAGES} are needed.", "Add photos."
         )
+    threads = threads or default_threads()
     groups: dict[tuple[Any, ...], list[_SolverPhoto]] = {}
     for photo in prepared:
         key = (photo.full_width, photo.full_height, *photo.lens_key)
@@ -118,7 +135,8 @@ def solve_poses(
     task = {
         "mode": "solve",
         "seed": seed,
-        "threads": threads or default_threads(),
+        "threads": threads,
+        "turntable": turntable,
         "groups": [
             {
                 "width": group[0].width,
@@ -133,8 +151,45 @@ def solve_poses(
     write_json(folder / "task.json", task)
     run_helper(_HELPER, folder, progress.span(0.08, 1.0), memory_bytes=_memory_limit_bytes())
     model = read_model(ModelFiles(folder / "model", ".bin"))
+    model = _with_masks(model, prepared, folder, work_folder / TURNTABLE_FOLDER)
     _save_model(folder, work_folder)
     return _with_source_names(model, prepared, names, bad, len(photos))
+
+
+def _with_masks(
+    model: SourceModel, prepared: Sequence[_SolverPhoto], folder: Path, target: Path
+) -> SourceModel:
+    """Add what the solver found of a turntable: facts, and masks in full size in ``target``."""
+    from PIL import Image
+
+    found = read_json(folder / TURNTABLE_NAME)
+    if not found["photos"]:
+        return model
+    facts = {**model.facts, "turntable_photos": found["photos"]}
+    if found["inside"] is None:  # the photos have masks of their own
+        return dataclasses.replace(model, facts=facts)
+    masks = {path.stem: path for path in (folder / TURNING_FOLDER).glob("*.png")}
+    if not masks:
+        text = (
+            f"The camera stands still in {found['photos']} photos, but what turns cannot be told "
+            f"from what stands still: masks would cut {100 * (1.0 - found['inside']):.0f} % of it "
+            "away, so none are used."
+        )
+        hint = "Give masks, or put a background behind the object that looks different from it."
+        warning = ReportWarning("turntable-not-masked", text, hint)
+        return dataclasses.replace(model, facts=facts, warnings=(*model.warnings, warning))
+    target.mkdir()
+    photos = []
+    for posed in model.photos:
+        path = masks.get(posed.name)
+        if path is not None:
+            (size,) = ((p.full_width, p.full_height) for p in prepared if p.name == posed.name)
+            whole = Image.fromarray(read_mask(path)).resize(size, Image.Resampling.BILINEAR)
+            path = target / path.name
+            write_mask(path, np.asarray(whole) >= MASK_THRESHOLD)
+        photos.append(dataclasses.replace(posed, mask_path=path))
+    facts["photos_masked_as_turning"] = len(masks)
+    return dataclasses.replace(model, photos=tuple(photos), facts=facts)
 
 
 def _with_source_names(
@@ -273,8 +328,9 @@ def _write_solver_photo(
 
 def _fresh_folder(work_folder: Path) -> Path:
     folder = work_folder / "pose_solver"
-    if folder.exists():
-        shutil.rmtree(folder)
+    for earlier in (folder, work_folder / TURNTABLE_FOLDER):
+        if earlier.exists():
+            shutil.rmtree(earlier)
     (folder / "images").mkdir(parents=True)
     (folder / "masks").mkdir()
     return folder

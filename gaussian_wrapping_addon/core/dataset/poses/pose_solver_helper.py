@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Helper process of :mod:`.pose_solver`: feature extraction, matching, mapping, triangulation.
 
-Reads ``task.json``, ``images/`` and ``masks/`` of its folder, writes ``model/`` (COLMAP binary).
+Reads ``task.json``, ``images/`` and ``masks/`` of its folder, writes ``model/`` (COLMAP binary),
+and ``turntable.json`` and ``turning/`` where it solves.
 """
 
 from __future__ import annotations
@@ -12,9 +13,23 @@ from typing import Any
 import numpy as np
 
 from ...errors import DatasetError
-from ...files import read_json
+from ...files import read_json, write_json
 from ...processes.helper_process import emit
+from ..photos.photo_file import write_mask
 from ..pycolmap_import import import_pycolmap
+from .turntable_features import (
+    MIN_MATCHES_INSIDE,
+    drop_still_features,
+    matches_inside,
+    turning_masks,
+    turntable_groups,
+)
+
+TURNTABLE_NAME = "turntable.json"
+"""How many ``photos`` are of a turntable, and which share of their matches is ``inside`` of masks;
+null where no mask was made."""
+TURNING_FOLDER = "turning"
+"""Masks of what turns, named as the photos."""
 
 DEFAULT_FOCAL_FACTORS = (1.2, 0.85, 1.7, 2.5)
 """Focal lengths over the long side to try if EXIF gives none, the most common first."""
@@ -68,6 +83,7 @@ def _solve(folder: Path, task: dict[str, Any]) -> None:
                 guessed.append(camera_id)
     _extract(folder, database, names_of_camera, task["threads"], _MAX_FEATURES)
     _match(folder, database, task)
+    _leave_out_background(folder, database, task)
     best, total = None, sum(len(names) for names in names_of_camera.values())
     factors = DEFAULT_FOCAL_FACTORS if guessed else DEFAULT_FOCAL_FACTORS[:1]
     attempts = [(factor, False) for factor in factors] + [(factors[0], True)]
@@ -139,14 +155,15 @@ def _extract(
             done += len(block)
 
 
-def _match(folder: Path, database: Path, task: dict[str, Any]) -> None:
+def _match(
+    folder: Path, database: Path, task: dict[str, Any], *, is_turntable: bool = False
+) -> None:
     pycolmap = import_pycolmap()
 
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = task["threads"]
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = task["seed"]
+    verification = _verification_options(task, is_turntable=is_turntable)
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = folder / "pairs.txt"
     pairs = task["pairs"]
@@ -165,6 +182,49 @@ def _match(folder: Path, database: Path, task: dict[str, Any]) -> None:
             verification_options=verification,
             device=pycolmap.Device.cpu,
         )
+
+
+def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) -> None:
+    """Find photos of a turntable, and match them again without what stands still.
+
+    Writes how many there are, and masks of what turns into ``turning/`` where they can be made.
+    """
+    pycolmap = import_pycolmap()
+
+    groups = turntable_groups(database, task)
+    found: dict[str, Any] = {"photos": sum(map(len, groups)), "inside": None}
+    if groups:
+        emit(fraction=_MATCH_END, message="separating what turns from what stands still")
+        with pycolmap.Database.open(database) as db:
+            db.clear_two_view_geometries()
+        verifier = pycolmap.GeometricVerifierOptions()
+        verifier.num_threads = task["threads"]
+        pycolmap.geometric_verification(
+            database,
+            verifier_options=verifier,
+            two_view_geometry_options=_verification_options(task, is_turntable=True),
+        )
+    if groups and not any((folder / "masks").iterdir()):
+
+        def step(share: float) -> None:
+            emit(fraction=_MATCH_END, message=f"masking what stands still, {100 * share:.0f} %")
+
+        masks = turning_masks(folder / "images", groups, step, threads=task["threads"])
+        found["inside"] = matches_inside(database, masks)
+        if found["inside"] >= MIN_MATCHES_INSIDE:
+            drop_still_features(database, masks)
+            _match(folder, database, task, is_turntable=True)
+            (folder / TURNING_FOLDER).mkdir()
+            for name, mask in masks.items():
+                write_mask(folder / TURNING_FOLDER / f"{name}.png", mask)
+    write_json(folder / TURNTABLE_NAME, found)
+
+
+def _verification_options(task: dict[str, Any], *, is_turntable: bool) -> Any:
+    options = import_pycolmap().TwoViewGeometryOptions()
+    options.ransac.random_seed = task["seed"]
+    options.filter_stationary_matches = is_turntable
+    return options
 
 
 def _mapping_options(seed: int) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -153,6 +154,8 @@ class PosedPhoto:
     mask_name: str | None = None
     angle_x: float | None = None
     """Horizontal field of view in radians, if the input gives nothing else."""
+    mask_path: Path | None = None
+    """Mask made while the cameras were solved, of the upright photo's size."""
 
 
 @dataclass(frozen=True)

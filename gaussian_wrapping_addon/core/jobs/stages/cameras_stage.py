@@ -43,9 +43,11 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
     from .splat_scene import is_splat, make_splat_scene
 
     source = Path(job.source)
+    turntable = job.settings.turntable
     key = stage_key(
-        STAGE_VERSIONS["cameras"], job.source, source_fingerprint(source), job.settings.seed
-    )
+        STAGE_VERSIONS["cameras"], job.source, source_fingerprint(source), job.settings.seed,
+        *([] if turntable == "auto" else [turntable]),
+    )  # fmt: skip
     if (
         job.command in ("mesh", "more", "bake")
         and read_done(folder.stages / f"cameras-{key}") is None
@@ -64,8 +66,9 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
             scene = make_splat_scene(source, stage_folder, progress, threads=threads)
         else:
             scene = load_scene(
-                source, stage_folder, progress, seed=job.settings.seed, threads=threads
-            )
+                source, stage_folder, progress,
+                seed=job.settings.seed, threads=threads, turntable=turntable,
+            )  # fmt: skip
         save_scene(scene, stage_folder)
         return {
             "views": len(scene.views),

@@ -156,7 +156,7 @@ def region_field(
         "unseen": meshing.unseen,
         "region_bounds": halo_bounds(region),
         "masks": [photos.mask(index) for index in views],
-        "mask_mode": training.mask_mode,
+        "mask_mode": scene.mask_mode(training.mask_mode),
     }
     if device.startswith("cuda"):
         from ...field.vacancy.cuda_vacancy import CudaVacancyField

@@ -33,6 +33,9 @@ DISAGREEMENT = 10.0
 OUTLIER_FLOOR = 20.0
 """Views within this many of 255 levels of the median are never outliers."""
 OUTLIER_FACTOR = 2.5
+OUTLIER_FADE = 0.5
+"""Views fade from this share below the limit to as much above it: a hard limit leaves flakes with
+sharp borders where neighbours reject different views."""
 CLEAR_PX = 2
 """Closer to a silhouette, a pixel's colour is mixed with that of another surface."""
 MEDIAN_POWER = 0.25
@@ -310,10 +313,13 @@ def _blend(
         red, green, blue, total = 0.0, 0.0, 0.0, 0.0
         used = 0
         for j in range(count):
-            if count >= 3 and distance[j] > limit:
-                rejected[i] += 1
-                continue
             weight = share[j] ** sharpness
+            if count >= 3:
+                kept_share = (1.0 + OUTLIER_FADE - distance[j] / limit) / (2.0 * OUTLIER_FADE)
+                if kept_share <= 0.0:
+                    rejected[i] += 1
+                    continue
+                weight *= min(kept_share, 1.0)
             red += weight * kept[i, order[j], 0]
             green += weight * kept[i, order[j], 1]
             blue += weight * kept[i, order[j], 2]

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Find photos of a camera that stands still while the object turns, by their matches.
+
+Between two such photos the background's features stay where they are and the object's move. A
+camera that moves leaves no feature in its place; a pause of it leaves all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+STILL_SHARE, MIN_STILL_PX = 0.002, 1.5
+"""A feature that moves less than this share of the photo's long side, or these pixels, is still."""
+MOVED_SHARE = 0.01
+MIN_STILL_MATCHES, MIN_CELLS = 10, 4
+"""Still matches of a pair, and the cells of a photo that they lie in: a date or a logo in a corner
+stays in its place, too."""
+CELLS = 6
+"""Cells along each side of a photo."""
+MIN_MOVED_MATCHES = 10
+"""Moved matches that a photo of the turning object has with some other photo of its group."""
+MIN_GROUP = 8
+"""Fewer photos from one place give no background."""
+MIN_PARTNERS_SHARE = 0.5
+"""Share of a group's other photos, of those it was matched with, that show a photo's background."""
+
+
+@dataclass(frozen=True)
+class PairMotion:
+    """What the matches of two photos say of the camera between them."""
+
+    first: int
+    second: int
+    is_still: bool
+    """Background stays where it is."""
+    moved: int
+    """Matches that move."""
+
+
+def pair_motion(
+    first: int, second: int, points: np.ndarray, others: np.ndarray, size: tuple[int, int]
+) -> PairMotion:
+    """Judge the matches of photos ``first`` and ``second``, both of ``size`` (width, height).
+
+    Parameters
+    ----------
+    points, others : (n, 2) float
+        Matched positions in the two photos, pixels.
+    """
+    long_side = max(size)
+    distance = np.linalg.norm(np.subtract(points, others), axis=1)
+    still = distance < max(STILL_SHARE * long_side, MIN_STILL_PX)
+    cells = np.floor(points[still] / size * CELLS).astype(int)
+    spread = len(np.unique(cells, axis=0))
+    return PairMotion(
+        first, second,
+        bool(still.sum() >= MIN_STILL_MATCHES and spread >= MIN_CELLS),
+        int((distance > MOVED_SHARE * long_side).sum()),
+    )  # fmt: skip
+
+
+def standing_groups(count: int, motions: Sequence[PairMotion]) -> list[list[int]]:
+    """Return groups of photos, each from a camera that stands still before a turning object.
+
+    Parameters
+    ----------
+    count : int
+        Number of photos.
+    motions : sequence of PairMotion
+        Of all pairs that were matched, also of those without a match.
+
+    Returns
+    -------
+    list of list of int
+        Ascending numbers of photos; photos of no such group are in none.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    still = [motion for motion in motions if motion.is_still]
+    if not still:
+        return []
+    rows = [motion.first for motion in still]
+    columns = [motion.second for motion in still]
+    graph = coo_matrix((np.ones(len(still)), (rows, columns)), (count, count))
+    label = connected_components(graph, directed=False)[1]
+    partners, matched, moved = (np.zeros(count, int) for _ in range(3))
+    for motion in motions:
+        pair = [motion.first, motion.second]
+        if label[motion.first] != label[motion.second]:
+            continue
+        matched[pair] += 1
+        partners[pair] += motion.is_still
+        moved[pair] = np.maximum(moved[pair], motion.moved)
+    groups = []
+    for number in np.unique(label):
+        of_group = label == number
+        group = np.flatnonzero(of_group & (partners >= MIN_PARTNERS_SHARE * matched))
+        # Nothing that turns: the same photo many times, or a camera that waits.
+        if len(group) >= MIN_GROUP and np.median(moved[group]) >= MIN_MOVED_MATCHES:
+            groups.append(group.tolist())
+    return groups

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Masks of what turns before a camera that stands still: what differs from the background."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from ...kernels.compiled import kernel
+from ...kernels.parallel import even_bounds, run_chunks
+
+MAX_BACKGROUND_PHOTOS = 32
+"""Photos, evenly spread, that the background is found from: memory and time stay bounded."""
+SAME_LEVELS = 8.0
+"""Levels of 255 within which two photos show the same thing."""
+MIN_SUPPORT_SHARE = 0.2
+"""Share of the photos that must agree on a pixel's background; else the object is always there."""
+BLUR_PX = 1.0
+MIN_DIFFERENCE = 6.0
+"""Levels of 255 by which the object differs from the background, at least."""
+NOISE_FACTOR = 6.0
+"""Times the difference that the quieter pixels have by noise."""
+QUIET_PERCENTILE = 30.0
+DARKEST = 16
+"""Pixels darker than this tell nothing of a photo's exposure."""
+CLOSED_SHARE = 0.008
+"""Gaps up to this share of the long side are closed: where object and background look alike."""
+SMALLEST_SHARE = 0.02
+"""Parts smaller than this share of the largest are noise, or leaves that the wind moves."""
+
+
+def masks_of_turning(
+    count: int, read: Callable[[int], np.ndarray], step: Callable[[float], None], *, threads: int
+) -> list[np.ndarray]:
+    """Return (h, w) bool masks, true where a photo shows the turning object.
+
+    Parameters
+    ----------
+    count : int
+        Number of photos, all of one size and from one place.
+    read : callable
+        The (h, w, 3) uint8 photo of a number.
+    step : callable
+        Told the share that is done.
+
+    Notes
+    -----
+    The background of a pixel is the colour that most photos agree on (docs/method.md, 10.4): a
+    median would show the object wherever it covers a pixel in more than half of the photos. Where
+    few agree, the object is always there.
+    """
+    chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_BACKGROUND_PHOTOS)).astype(int))
+    stack = []
+    for done, index in enumerate(chosen.tolist()):
+        stack.append(read(index))
+        step(0.3 * done / len(chosen))
+    first = stack[len(stack) // 2]
+    photos = np.stack([np.rint(_evened(photo, first)).astype(np.uint8) for photo in stack])
+    del stack
+    background, support = steady_colors(photos, threads)
+    del photos
+    known = support >= MIN_SUPPORT_SHARE * len(chosen)
+    soft = ndimage.gaussian_filter(background, (BLUR_PX, BLUR_PX, 0))
+    masks = []
+    for index in range(count):
+        step(0.4 + 0.6 * index / count)
+        difference = ndimage.gaussian_filter(
+            _evened(read(index), background), (BLUR_PX, BLUR_PX, 0)
+        )
+        difference = np.abs(difference - soft).max(axis=2)
+        noise = float(np.percentile(difference[known], QUIET_PERCENTILE)) if known.any() else 0.0
+        differs = difference > max(MIN_DIFFERENCE, NOISE_FACTOR * noise)
+        masks.append(whole_parts(differs | ~known))
+    return masks
+
+
+def steady_colors(photos: np.ndarray, threads: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the colour that most of the photos agree on, for each pixel.
+
+    Parameters
+    ----------
+    photos : (n, h, w, 3) uint8
+
+    Returns
+    -------
+    colors : (h, w, 3) float32
+        Mean of those that agree.
+    support : (h, w) int32
+        How many agree.
+    """
+    colors = np.empty(photos.shape[1:], np.float32)
+    support = np.empty(photos.shape[1:3], np.int32)
+
+    def chunk(begin: int, end: int) -> None:
+        _steady(photos, begin, end, SAME_LEVELS, colors, support)
+
+    run_chunks(chunk, even_bounds(photos.shape[1], threads), threads)
+    return colors, support
+
+
+@kernel(fast=False)
+def _steady(
+    photos: Any, begin: int, end: int, same_levels: float, colors: Any, support: Any
+) -> None:
+    count = photos.shape[0]
+    for y in range(begin, end):
+        for x in range(photos.shape[2]):
+            best, leader = 0, 0
+            for i in range(count):
+                agreeing = 0
+                for j in range(count):
+                    far = 0.0
+                    for k in range(3):
+                        far = max(far, abs(float(photos[i, y, x, k]) - float(photos[j, y, x, k])))
+                    agreeing += far <= same_levels
+                if agreeing > best:
+                    best, leader = agreeing, i
+            red, green, blue = 0.0, 0.0, 0.0
+            for j in range(count):
+                far = 0.0
+                for k in range(3):
+                    far = max(far, abs(float(photos[leader, y, x, k]) - float(photos[j, y, x, k])))
+                if far <= same_levels:
+                    red += photos[j, y, x, 0]
+                    green += photos[j, y, x, 1]
+                    blue += photos[j, y, x, 2]
+            colors[y, x, 0], colors[y, x, 1], colors[y, x, 2] = (
+                red / best, green / best, blue / best,
+            )  # fmt: skip
+            support[y, x] = best
+
+
+def _evened(photo: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """Return a photo (h, w, 3) float32 with the exposure and white balance of another one.
+
+    By the commonest ratio of their pixels, that of the background.
+    """
+    evened = photo.astype(np.float32)
+    for channel in range(3):
+        bright = (like[..., channel] > DARKEST) & (photo[..., channel] > DARKEST)
+        if not bright.any():
+            continue
+        ratio = np.log(evened[..., channel][bright] / like[..., channel][bright])
+        counts, edges = np.histogram(ratio, _RATIO_BINS, (-_MAX_RATIO, _MAX_RATIO))
+        at = int(ndimage.gaussian_filter1d(counts.astype(float), 1.0).argmax())
+        low, high = edges[max(at - 1, 0)], edges[min(at + 2, _RATIO_BINS)]
+        near = ratio[(ratio >= low) & (ratio <= high)]
+        evened[..., channel] /= np.exp(float(np.median(near)) if len(near) else 0.0)
+    return evened.clip(0.0, 255.0)
+
+
+_RATIO_BINS, _MAX_RATIO = 200, 1.0
+
+
+def whole_parts(differs: np.ndarray) -> np.ndarray:
+    """Return (h, w) bool with specks taken out, gaps closed and holes filled."""
+    radius = max(1, round(CLOSED_SHARE * max(differs.shape)))
+    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    disc = x * x + y * y <= radius * radius
+    # Pad, so that what the border cuts is closed and filled like the rest.
+    padded = np.pad(ndimage.binary_opening(differs, np.ones((2, 2))), radius, mode="edge")
+    closed = ndimage.binary_closing(padded, disc)[radius:-radius, radius:-radius]
+    filled = ndimage.binary_fill_holes(closed)
+    label, parts = ndimage.label(filled)
+    if parts == 0:
+        return filled
+    areas = np.bincount(label.ravel())
+    areas[0] = 0
+    return (areas >= SMALLEST_SHARE * areas.max())[label] & filled
