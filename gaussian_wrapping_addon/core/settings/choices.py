@@ -8,7 +8,7 @@ SELECTION_MODES = ("auto", "on", "off")
 """Of an optional part of the model; ``"auto"`` selects it by evidence in the photos."""
 SWITCH = ("off", "on")
 
-MASK_MODES = ("auto", "ignore", "background")
+MASK_MODES = ("ignore", "background", "auto")
 """``"auto"``: background where the masks were made of a turntable, else ignore."""
 TURNTABLE_MODES = ("auto", "on", "off")
 CORRELATIONS = ("signed", "squared")

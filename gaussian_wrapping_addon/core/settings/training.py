@@ -247,7 +247,6 @@ class TrainingSettings(MethodSettings):
             "Masks",
             "Meaning of the masked parts of the photos; no effect without masks",
             items=(
-                Item("auto", "Auto", "Background for a turntable, else Ignore"),
                 Item(
                     "ignore",
                     "Ignore",
@@ -258,6 +257,7 @@ class TrainingSettings(MethodSettings):
                     "Background",
                     "Masked pixels show empty space: only the subject is modelled",
                 ),
+                Item("auto", "Auto", "Background for a turntable, else Ignore"),
             ),
         ),
     )

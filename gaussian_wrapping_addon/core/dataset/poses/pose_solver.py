@@ -166,7 +166,7 @@ def _with_masks(
     if not found["photos"]:
         return model
     facts = {**model.facts, "turntable_photos": found["photos"]}
-    if found["inside"] is None:  # the photos have masks of their own
+    if any((folder / "masks").iterdir()):  # of their own
         return dataclasses.replace(model, facts=facts)
     masks = {path.stem: path for path in (folder / TURNING_FOLDER).glob("*.png")}
     if not masks:

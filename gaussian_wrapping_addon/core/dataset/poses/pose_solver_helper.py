@@ -26,8 +26,7 @@ from .turntable_features import (
 )
 
 TURNTABLE_NAME = "turntable.json"
-"""How many ``photos`` are of a turntable, and which share of their matches is ``inside`` of masks;
-null where no mask was made."""
+"""How many ``photos`` are of a turntable, and the share of their matches ``inside`` of masks."""
 TURNING_FOLDER = "turning"
 """Masks of what turns, named as the photos."""
 
@@ -192,7 +191,7 @@ def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) ->
     pycolmap = import_pycolmap()
 
     groups = turntable_groups(database, task)
-    found: dict[str, Any] = {"photos": sum(map(len, groups)), "inside": None}
+    found: dict[str, Any] = {"photos": sum(map(len, groups)), "inside": 1.0}
     if groups:
         emit(fraction=_MATCH_END, message="separating what turns from what stands still")
         with pycolmap.Database.open(database) as db:
@@ -204,7 +203,6 @@ def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) ->
             verifier_options=verifier,
             two_view_geometry_options=_verification_options(task, is_turntable=True),
         )
-    if groups and not any((folder / "masks").iterdir()):
 
         def step(share: float) -> None:
             emit(fraction=_MATCH_END, message=f"masking what stands still, {100 * share:.0f} %")

@@ -23,6 +23,8 @@ MIN_DIFFERENCE = 6.0
 """Levels of 255 by which the object differs from the background, at least."""
 NOISE_FACTOR = 6.0
 """Times the difference that the quieter pixels have by noise."""
+SHARP_FACTOR = 1.5
+"""Times that threshold, for what is not blurred: there is more noise in it."""
 QUIET_PERCENTILE = 30.0
 DARKEST = 16
 """Pixels darker than this tell nothing of a photo's exposure."""
@@ -48,8 +50,8 @@ def masks_of_turning(
 
     Notes
     -----
-    The background of a pixel is the colour that most photos agree on (docs/method.md, 10.4): a
-    median would show the object wherever it covers a pixel in more than half of the photos. Where
+    The background of a pixel is the colour that most photos agree on (docs/method.md, section 12):
+    a median would show the object wherever it covers a pixel in more than half of them. Where
     few agree, the object is always there.
     """
     chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_BACKGROUND_PHOTOS)).astype(int))
@@ -67,13 +69,16 @@ def masks_of_turning(
     masks = []
     for index in range(count):
         step(0.4 + 0.6 * index / count)
-        difference = ndimage.gaussian_filter(
-            _evened(read(index), background), (BLUR_PX, BLUR_PX, 0)
-        )
-        difference = np.abs(difference - soft).max(axis=2)
+        photo = _evened(read(index), background)
+        blurred = ndimage.gaussian_filter(photo, (BLUR_PX, BLUR_PX, 0))
+        difference = np.abs(blurred - soft).max(axis=2)
         noise = float(np.percentile(difference[known], QUIET_PERCENTILE)) if known.any() else 0.0
-        differs = difference > max(MIN_DIFFERENCE, NOISE_FACTOR * noise)
-        masks.append(whole_parts(differs | ~known))
+        threshold = max(MIN_DIFFERENCE, NOISE_FACTOR * noise)
+        mask = whole_parts((difference > threshold) | ~known)
+        # The blur has moved borders outwards, by a pixel where the contrast is high.
+        sharp = np.abs(photo - background).max(axis=2)
+        rim = mask & ~ndimage.binary_erosion(mask, border_value=True)
+        masks.append(mask & ~(rim & known & (sharp <= SHARP_FACTOR * threshold)))
     return masks
 
 

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Photos of a turntable without cameras: solved by what turns, masked, and trained as such."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.turntable.photos import Turntable, turntable, write_photos
+from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
+from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
+from gaussian_wrapping_addon.core.dataset.scene import Scene
+from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene, save_scene
+from gaussian_wrapping_addon.core.evaluation.alignment.pose_error import pose_errors
+from gaussian_wrapping_addon.core.progress import Progress
+
+COUNT, WIDTH, HEIGHT = 20, 400, 300
+
+
+@pytest.fixture(scope="module")
+def made() -> Turntable:
+    return turntable(COUNT, WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def photos(made: Turntable, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("turntable") / "photos"
+    write_photos(made, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def solved(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(photos, tmp_path_factory.mktemp("solved"), Progress(), threads=2)
+
+
+def test_cameras_go_around_what_turns(made: Turntable, solved: Scene) -> None:
+    errors = pose_errors(solved.cameras, made.cameras)
+    assert len(errors.names) == COUNT
+    assert np.median(errors.rotation_degrees) < 1.0
+    assert np.median(errors.center_shares) < 0.02
+    assert solved.facts["turntable_photos"] == COUNT
+
+
+def test_each_photo_has_a_mask_of_what_turns(solved: Scene) -> None:
+    assert solved.facts["photos_masked_as_turning"] == COUNT
+    assert solved.facts["photos_masked"] == COUNT
+    store = PhotoStore(solved, 4096)
+    shares = [float(np.mean(store.mask(i))) for i in range(COUNT)]
+    assert 0.05 < min(shares) <= max(shares) < 0.5
+    # The points are of what turns: every mask contains them.
+    for i in range(0, COUNT, 4):
+        mask = store.mask(i)
+        assert mask is not None
+        pixels, depth = store.camera(i).project(solved.points)
+        visible = (depth > 0) & (pixels >= 0).all(1) & (pixels < mask.shape[::-1]).all(1)
+        column, row = pixels[visible].astype(int).T
+        assert mask[row, column].mean() > 0.9
+
+
+def test_masks_of_a_turntable_show_background(solved: Scene, tmp_path: Path) -> None:
+    modes = {mode: solved.mask_mode(mode) for mode in ("auto", "ignore", "background")}
+    assert modes == {"auto": "background", "ignore": "ignore", "background": "background"}
+    save_scene(solved, tmp_path)
+    assert load_saved_scene(tmp_path).mask_mode("auto") == "background"
+
+
+def test_masks_of_the_user_are_taken_instead(made: Turntable, photos: Path, tmp_path: Path) -> None:
+    """They mean what the user says, not that nothing is there."""
+    source = tmp_path / "own"
+    (source / "masks").mkdir(parents=True)
+    for path in sorted(photos.iterdir()):
+        Image.open(path).save(source / path.name, quality=95, exif=Image.open(path).getexif())
+        Image.new("L", (WIDTH, HEIGHT), 255).save(source / "masks" / f"{path.name}.png")
+    scene = load_scene(source, tmp_path / "work", Progress(), threads=2)
+    assert scene.facts["turntable_photos"] == COUNT
+    assert "photos_masked_as_turning" not in scene.facts
+    assert scene.mask_mode("auto") == "ignore"
+    assert len(scene.views) >= 0.8 * COUNT
+
+
+def test_a_walk_around_an_object_is_no_turntable(tmp_path: Path) -> None:
+    bananas = Path(__file__).parents[4] / "examples" / "bananas"
+    source = tmp_path / "bananas"
+    source.mkdir()
+    for path in sorted(bananas.glob("*.JPG"))[:5]:
+        with Image.open(path) as image:
+            image.resize((400, 266)).save(source / path.name, quality=95, exif=image.getexif())
+    scene = load_scene(source, tmp_path / "work", Progress(), threads=2)
+    assert "turntable_photos" not in scene.facts
+    assert all(view.mask_path is None for view in scene.views)
