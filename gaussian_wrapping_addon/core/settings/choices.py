@@ -10,6 +10,7 @@ SWITCH = ("off", "on")
 
 MASK_MODES = ("ignore", "background", "auto")
 """``"auto"``: background where the masks were made of a turntable, else ignore."""
+MAX_MASK_GROW_PX = 200
 TURNTABLE_MODES = ("auto", "on", "off")
 CORRELATIONS = ("signed", "squared")
 SPACINGS = ("adaptive", "uniform")

@@ -10,7 +10,7 @@ from typing import Any
 from ..errors import UsageError
 from ..export_formats import JOB_FORMATS
 from .checks import Choices, Condition, Range, Subset
-from .choices import PRESETS, TURNTABLE_MODES
+from .choices import MAX_MASK_GROW_PX, PRESETS, SWITCH, TURNTABLE_MODES
 from .declaration import (
     Declaration,
     Item,
@@ -148,6 +148,41 @@ class JobSettings:
                 Item("on", "On", "All photos of one size are from one place"),
                 Item("off", "Off", "Nothing is left out"),
             ),
+            owner="training",
+            panel_name="train_advanced",
+        ),
+    )
+    mask_invert: str = setting(
+        "off",
+        help="Masks are white where photos are left out.",
+        check=Choices(SWITCH),
+        option=Option(
+            "--mask-invert",
+            help="masks are white where photos are left out",
+            flag="on",
+            scope="training",
+        ),
+        panel=PanelProperty(
+            "Invert Masks",
+            "Mask files are white where the photos are left out",
+            owner="training",
+            panel_name="train_advanced",
+        ),
+    )
+    mask_grow_px: int = setting(
+        0,
+        help="Border that is kept around what masks keep, or taken away where negative, in pixels "
+        "of the photos.",
+        check=Range(-MAX_MASK_GROW_PX, MAX_MASK_GROW_PX),
+        unit="pixels",
+        option=Option(
+            "--mask-grow",
+            help="pixels by which what masks keep grows, or shrinks where negative",
+            scope="training",
+        ),
+        panel=PanelProperty(
+            "Grow Masks",
+            "Pixels by which what the mask files keep grows; negative shrinks it",
             owner="training",
             panel_name="train_advanced",
         ),

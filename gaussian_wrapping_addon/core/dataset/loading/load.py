@@ -17,6 +17,7 @@ from ...report_warning import ReportWarning
 from ..camera import Camera
 from ..frames.normalisation import find_scene_frame
 from ..frames.scene_grid import snapped_camera
+from ..photos.mask_reading import AS_WRITTEN, MaskReading
 from ..photos.photo_finder import list_photos, photo_root
 from ..poses.pose_solver import solve_poses
 from ..readers.source_kind import SourceKind, read_poses, source_kind
@@ -36,6 +37,7 @@ def load_scene(
     seed: int = 0,
     threads: int = 0,
     turntable: str = "auto",
+    reading: MaskReading = AS_WRITTEN,
 ) -> Scene:
     """Load photos and cameras, solving and undistorting where needed.
 
@@ -52,6 +54,8 @@ def load_scene(
         0 uses every core.
     turntable : {"auto", "on", "off"}
         Of photos without poses; see :func:`~..poses.pose_solver.solve_poses`.
+    reading : MaskReading
+        How mask files are understood.
 
     Returns
     -------
@@ -71,7 +75,9 @@ def load_scene(
     warnings: list[ReportWarning] = []
     facts: dict[str, Any] = {"kind": kind.kind}
     if kind.kind == "photos":
-        model = _solve(kind, work_folder, progress.span(0.0, 0.8), seed, threads, turntable)
+        model = _solve(
+            kind, work_folder, progress.span(0.0, 0.8), seed, threads, turntable, reading
+        )
         prepare_span = progress.span(0.8, 1.0)
     else:
         model = read_poses(kind)
@@ -81,7 +87,9 @@ def load_scene(
     warnings.extend(model.warnings)
     facts.update(model.facts)
     check_photo_count(len(model.photos))
-    views, notes, counts = prepare_views(model, kind, work_folder, prepare_span, threads=threads)
+    views, notes, counts = prepare_views(
+        model, kind, work_folder, prepare_span, threads=threads, reading=reading
+    )
     warnings.extend(notes)
     facts.update(counts)
     check_photo_count(len(views), notes)
@@ -140,13 +148,14 @@ def _solve(
     seed: int,
     threads: int,
     turntable: str,
+    reading: MaskReading,
 ) -> SourceModel:
     root = photo_root(kind.folder)
     photos = list_photos(root)
     check_photo_count(len(photos))
     return solve_poses(
         root, photos, kind.mask_roots, work_folder, progress,
-        seed=seed, threads=threads, turntable=turntable,
+        seed=seed, threads=threads, turntable=turntable, reading=reading,
     )  # fmt: skip
 
 

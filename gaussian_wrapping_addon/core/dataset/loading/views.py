@@ -16,6 +16,7 @@ from ...imaging.bicubic import sample_bicubic
 from ...kernels.parallel import default_threads
 from ...progress import Progress
 from ...report_warning import UNREADABLE_HINT, ReportWarning
+from ..photos.mask_reading import AS_WRITTEN, MaskReading
 from ..photos.photo_file import (
     MASK_THRESHOLD,
     DecodedPhoto,
@@ -77,6 +78,7 @@ def prepare_views(
     progress: Progress,
     *,
     threads: int = 0,
+    reading: MaskReading = AS_WRITTEN,
 ) -> tuple[list[PreparedView], list[ReportWarning], dict[str, int]]:
     """Convert every posed photo to a pinhole view; photos that fit already are used in place.
 
@@ -121,7 +123,7 @@ def prepare_views(
 
     def prepare(i: int) -> PreparedView | None:
         posed, path = found[i]
-        return _prepare(i, posed, path, model, kind, work_folder, maps, notes)
+        return _prepare(i, posed, path, model, kind, reading, work_folder, maps, notes)
 
     with ThreadPoolExecutor(threads) as pool:
         try:
@@ -142,6 +144,7 @@ def _prepare(
     path: Path,
     model: SourceModel,
     kind: SourceKind,
+    reading: MaskReading,
     work_folder: Path,
     maps: _MapCache,
     notes: _Notes,
@@ -167,7 +170,7 @@ def _prepare(
     if upright:
         color = apply_orientation(color, header.orientation)
         alpha = None if alpha is None else apply_orientation(alpha, header.orientation)
-    mask = _find_mask(posed, path, kind, color.shape[:2], alpha, header, upright, notes)
+    mask = _find_mask(posed, path, kind, reading, color.shape[:2], alpha, header, upright, notes)
     if mask is None and _is_one_colour(color):  # a mask's outline tells about shape
         with notes.lock:
             notes.one_colour.append(posed.name)
@@ -217,6 +220,7 @@ def _find_mask(
     posed: PosedPhoto,
     path: Path,
     kind: SourceKind,
+    reading: MaskReading,
     shape: tuple[int, ...],
     alpha: np.ndarray | None,
     header: PhotoHeader,
@@ -248,7 +252,8 @@ def _find_mask(
         with notes.lock:
             notes.wrong_masks.append(f"Mask {error.message}")
         return mask
-    from_file = stored >= MASK_THRESHOLD
+    made = posed.mask_path is not None
+    from_file = (AS_WRITTEN if made else reading).kept(stored)
     combined = from_file if mask is None else from_file & mask
     return None if combined.all() else combined
 

@@ -16,6 +16,9 @@ from .photo_header import PHOTO_SUFFIXES
 
 PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
 MASK_FOLDERS = ("masks", "mask")
+MASK_ENDINGS = ("_mask", "-mask", ".mask")
+"""Of the stem of a mask's name, as other programs write it beside the photo or in a folder."""
+MASK_SUFFIXES = (".png", ".jpg", ".tif")
 RAW_SUFFIXES = (
     ".heic", ".heif", ".avif",
     ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2",
@@ -25,6 +28,8 @@ _MAX_DEPTH = 8
 
 def list_photos(root: Path) -> list[Path]:
     """List photo files under ``root``, sorted by name, without masks and hidden folders.
+
+    ``x_mask.png`` is a mask where ``x.jpg`` lies beside it, else a photo.
 
     Links to files are followed, links to folders are not (they could form a loop).
 
@@ -45,16 +50,31 @@ def list_photos(root: Path) -> list[Path]:
                 s for s in subfolders if not s.startswith(".") and s.lower() not in MASK_FOLDERS
             )
         )
-        found += [
-            here / name
+        shown = [
+            name
             for name in names
             if not name.startswith(".") and PurePosixPath(name).suffix.lower() in PHOTO_SUFFIXES
         ]
+        masked = _masked_by(shown)
+        found += [here / name for name in shown if name not in masked]
         if len(found) > limits.MAX_IMAGES:
             raise DatasetError(
                 f"{root.name} holds more than {limits.MAX_IMAGES} photos.", "Choose a subfolder."
             )
     return sorted(found, key=lambda p: p.relative_to(root).as_posix())
+
+
+def _masked_by(names: list[str]) -> set[str]:
+    """Return which of the names of one folder are masks of others."""
+    known = {name.casefold() for name in names}
+    known |= {PurePosixPath(name).stem for name in known}
+    masks = set()
+    for name in names:
+        stem = PurePosixPath(name).stem.casefold()
+        for ending in MASK_ENDINGS:
+            if stem.endswith(ending) and stem.removesuffix(ending) in known:
+                masks.add(name)
+    return masks
 
 
 def count_raw_photos(root: Path) -> int:
@@ -152,13 +172,27 @@ def _keys(name: str) -> list[tuple[str, str]]:
 def mask_candidates(name: str) -> list[str]:
     """Return the names a photo's mask may have in a mask folder, most specific first."""
     pure = PurePosixPath(name.replace("\\", "/"))
-    return [f"{pure}.png", str(pure.with_suffix(".png")), str(pure)]
+    return [f"{pure}.png", str(pure.with_suffix(".png")), str(pure), *_marked_masks(name)]
+
+
+def _marked_masks(name: str) -> list[str]:
+    """Return the names of a photo's mask that say so, for any folder."""
+    pure = PurePosixPath(name.replace("\\", "/"))
+    bases = (str(pure), str(pure.with_suffix("")))
+    return [f"{b}{ending}{s}" for b in bases for ending in MASK_ENDINGS for s in MASK_SUFFIXES]
 
 
 def find_mask(mask_roots: list[Path], name: str) -> Path | None:
-    """Return the mask of photo ``name``: ``x.jpg.png``, ``x.png`` or the same name."""
+    """Return the mask of photo ``name``, or ``None``.
+
+    In a folder of masks ``x.jpg.png``, ``x.png`` or the same name; there and beside the photo
+    ``x_mask.png`` and the like (``MASK_ENDINGS``, ``MASK_SUFFIXES``).
+    """
     for root in mask_roots:
-        for candidate in mask_candidates(name):
+        of_masks = root.name.lower() in MASK_FOLDERS
+        for candidate in mask_candidates(name) if of_masks else _marked_masks(name):
+            if "\0" in candidate or not os.path.lexists(os.path.join(root, candidate)):
+                continue  # most are not there, and looking is faster than resolving
             path = resolve_photo(root, candidate)
             if path is not None and os.path.isfile(path):
                 return path

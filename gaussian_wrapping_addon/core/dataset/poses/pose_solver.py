@@ -26,6 +26,7 @@ from ...processes.helper_process import run_helper
 from ...progress import Progress
 from ...report_warning import UNREADABLE_HINT, ReportWarning
 from ..camera import Camera
+from ..photos.mask_reading import AS_WRITTEN, MaskReading
 from ..photos.photo_exif import read_lens_exif
 from ..photos.photo_file import (
     MASK_THRESHOLD,
@@ -39,7 +40,7 @@ from ..photos.photo_finder import find_mask
 from ..readers.colmap_reader import ModelFiles, read_model
 from ..readers.source_model import PosedPhoto, SourceModel
 from .match_pairs import pairs_by_order, pairs_by_pose
-from .pose_solver_helper import TURNING_FOLDER, TURNTABLE_NAME
+from .standing_still import TURNING_FOLDER, TURNTABLE_NAME
 
 MAX_SIFT_PX = 1600
 """Long side of the photos that features are extracted from."""
@@ -78,6 +79,7 @@ def solve_poses(
     seed: int = 0,
     threads: int = 0,
     turntable: str = "auto",
+    reading: MaskReading = AS_WRITTEN,
 ) -> SourceModel:
     """Solve cameras and sparse points of photos without poses (structure from motion).
 
@@ -95,6 +97,8 @@ def solve_poses(
         Whether the camera stood still while the object turned; ``"auto"`` sees it by matches that
         stay in their place. Matches of the background are then left out, and the background is
         masked, but where the photos have masks.
+    reading : MaskReading
+        How mask files are understood.
 
     Returns
     -------
@@ -120,7 +124,8 @@ def solve_poses(
             bad.append(error.message)
             check_unreadable_share(bad, len(photos))
             continue
-        prepared.append(_write_solver_photo(folder, i, decoded, path, find_mask(mask_roots, name)))
+        mask = find_mask(mask_roots, name)
+        prepared.append(_write_solver_photo(folder, i, decoded, path, mask, reading))
         names.append(name)
         progress.update(0.08 * (i + 1) / len(photos), f"reading photo {i + 1} of {len(photos)}")
     if len(prepared) < MIN_IMAGES:
@@ -300,7 +305,12 @@ def check_unreadable_share(bad: Sequence[str], offered: int) -> None:
 
 
 def _write_solver_photo(
-    folder: Path, index: int, decoded: DecodedPhoto, source: Path | None, mask: Path | None
+    folder: Path,
+    index: int,
+    decoded: DecodedPhoto,
+    source: Path | None,
+    mask: Path | None,
+    reading: MaskReading = AS_WRITTEN,
 ) -> _SolverPhoto:
     """Write one upright photo of limited size; the lens is read from the EXIF of ``source``."""
     from PIL import Image
@@ -313,7 +323,9 @@ def _write_solver_photo(
         color = np.asarray(Image.fromarray(color).resize(size, Image.Resampling.LANCZOS))
     name = f"{index:06d}.jpg"
     write_photo(folder / "images" / name, color)
-    visible = decoded.alpha if mask is None else read_mask(mask)
+    visible = decoded.alpha
+    if mask is not None:
+        visible = np.where(reading.kept(read_mask(mask)), 255, 0).astype(np.uint8)
     if visible is not None:
         resized = Image.fromarray(visible).resize(size, Image.Resampling.NEAREST)
         resized.save(folder / "masks" / f"{name}.png")

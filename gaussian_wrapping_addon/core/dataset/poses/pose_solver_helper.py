@@ -17,6 +17,7 @@ from ...files import read_json, write_json
 from ...processes.helper_process import emit
 from ..photos.photo_file import write_mask
 from ..pycolmap_import import import_pycolmap
+from .standing_still import TURNING_FOLDER, TURNTABLE_NAME
 from .turntable_features import (
     MIN_MATCHES_INSIDE,
     drop_still_features,
@@ -24,11 +25,6 @@ from .turntable_features import (
     turning_masks,
     turntable_groups,
 )
-
-TURNTABLE_NAME = "turntable.json"
-"""How many ``photos`` are of a turntable, and the share of their matches ``inside`` of masks."""
-TURNING_FOLDER = "turning"
-"""Masks of what turns, named as the photos."""
 
 DEFAULT_FOCAL_FACTORS = (1.2, 0.85, 1.7, 2.5)
 """Focal lengths over the long side to try if EXIF gives none, the most common first."""

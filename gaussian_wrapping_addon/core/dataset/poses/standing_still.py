@@ -12,6 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+TURNTABLE_NAME = "turntable.json"
+"""How many ``photos`` are of a turntable, and the share of their matches ``inside`` of masks."""
+TURNING_FOLDER = "turning"
+"""Masks of what turns, named as the photos."""
 STILL_SHARE, MIN_STILL_PX = 0.002, 1.5
 """A feature that moves less than this share of the photo's long side, or these pixels, is still."""
 MOVED_SHARE = 0.01

@@ -54,7 +54,8 @@ class SourceKind:
     @property
     def mask_roots(self) -> list[Path]:
         """Folders that may hold masks."""
-        return [m for root in self.photo_roots for m in mask_roots_of(root)]
+        folders = [m for root in self.photo_roots for m in mask_roots_of(root)]
+        return [*folders, *self.photo_roots]
 
 
 def source_kind(source: Path) -> SourceKind:

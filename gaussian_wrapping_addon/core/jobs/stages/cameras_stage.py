@@ -39,14 +39,17 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
     """
     from ...array_file import is_whole
     from ...dataset.loading.load import load_scene
+    from ...dataset.photos.mask_reading import AS_WRITTEN, MaskReading
     from ...dataset.scene_file import MOST_POINTS_BYTES, POINTS_NAME, SCENE_NAME, save_scene
     from .splat_scene import is_splat, make_splat_scene
 
     source = Path(job.source)
     turntable = job.settings.turntable
+    reading = MaskReading(job.settings.mask_invert == "on", job.settings.mask_grow_px)
     key = stage_key(
         STAGE_VERSIONS["cameras"], job.source, source_fingerprint(source), job.settings.seed,
         *([] if turntable == "auto" else [turntable]),
+        *([] if reading == AS_WRITTEN else [reading.invert, reading.grow_px]),
     )  # fmt: skip
     if (
         job.command in ("mesh", "more", "bake")
@@ -67,7 +70,7 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
         else:
             scene = load_scene(
                 source, stage_folder, progress,
-                seed=job.settings.seed, threads=threads, turntable=turntable,
+                seed=job.settings.seed, threads=threads, turntable=turntable, reading=reading,
             )  # fmt: skip
         save_scene(scene, stage_folder)
         return {

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How mask files are to be understood."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .photo_file import MASK_THRESHOLD
+
+
+@dataclass(frozen=True)
+class MaskReading:
+    """Choices for the mask files of an input; alpha channels are left as they are."""
+
+    invert: bool = False
+    """White is left out, not kept."""
+    grow_px: int = 0
+    """Border added to what is kept, or taken away where negative, pixels of the photo."""
+
+    def kept(self, grey: np.ndarray) -> np.ndarray:
+        """Return (h, w) bool, true where the photo counts, of a mask file's (h, w) uint8."""
+        kept = grey >= MASK_THRESHOLD
+        if self.invert:
+            kept = ~kept
+        if not self.grow_px:
+            return kept
+        from scipy.ndimage import distance_transform_edt
+
+        if self.grow_px > 0:
+            if not kept.any():
+                return kept
+            return np.asarray(distance_transform_edt(~kept) <= self.grow_px)
+        if kept.all():
+            return kept
+        return np.asarray(distance_transform_edt(kept) > -self.grow_px)
+
+
+AS_WRITTEN = MaskReading()
