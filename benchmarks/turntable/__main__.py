@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--again", action="store_true", help="make runs that have a record, too")
-    parser.add_argument("--kept", type=Path, help="folder for the runs (default: a temporary one)")
+    parser.add_argument("--kept", type=Path, help="folder of kept runs, used again where they are")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     for photos, places, mode in CASES:
@@ -63,7 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         with tempfile.TemporaryDirectory() as folder:
             kept = options.kept or Path(folder)
-            values = _run(photos, places, mode, options.preset, options.threads, kept)
+            values = _run(
+                photos, places, mode, options.preset, options.threads, kept,
+                reuse=options.kept is not None,
+            )  # fmt: skip
         record.parent.mkdir(parents=True, exist_ok=True)
         write_json(record, values)
         _logger.info("%s: %s", record.stem, values)
@@ -72,13 +75,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(
-    photos: int, places: int, mode: str, preset: str, threads: int, kept: Path
+    photos: int, places: int, mode: str, preset: str, threads: int, kept: Path, *, reuse: bool
 ) -> dict[str, Any]:
     made = turntable(photos, WIDTH_PX, HEIGHT_PX, elevations=places)
     source = kept / f"photos-{photos}-{places}"
     if not source.is_dir():
         write_photos(made, source)
-    settings = Settings(kept, threads, False)
+    settings = Settings(kept, threads, reuse)
     values: dict[str, Any] = {
         "photos": photos, "places": places, "turntable": mode, "preset": preset,
         "code": code_state(), "date": datetime.date.today().isoformat(),
@@ -95,6 +98,7 @@ def _run(
     seconds = [stage.get("processor_seconds") or 0.0 for stage in report["stages"]]
     return {
         **values,
+        "code": measured(done)["code"],
         "processor_s": sum(seconds),
         "held_out_psnr": report["training"].get("held_out_psnr"),
         **_judge(made, done, threads),

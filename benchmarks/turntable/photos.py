@@ -106,7 +106,7 @@ def write_photos(made: Turntable, folder: Path) -> None:
 def truth_of(made: Turntable) -> Truth:
     """Return the true surface, and how many photos show each of its samples."""
     rays = RayScene(made.mesh.vertices, made.mesh.faces)
-    samples = sample_uniformly(made.mesh.vertices, made.mesh.faces, TRUTH_SAMPLES, 0)
+    samples = sample_uniformly(made.mesh.vertices, made.mesh.faces, TRUTH_SAMPLES, seed=0)
     seen = count_views(rays, made.cameras, samples.points, samples.normals)
     return Truth(samples, made.mesh.vertices, made.mesh.faces, seen=seen)
 
