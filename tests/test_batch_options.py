@@ -97,6 +97,7 @@ def test_clean_up_options_become_meshing_settings(command: str) -> None:
     assert meshing("--unseen", "occupied") == MeshingSettings(unseen="occupied")
     assert meshing("--faces", "5000") == MeshingSettings(target_faces=5000)
     assert meshing("--smooth", "3") == MeshingSettings(smooth_steps=3)
+    assert meshing("--parts", "2") == MeshingSettings(most_parts=2)
     assert meshing("--min-part", "0.2") == MeshingSettings(min_component_share=0.2)
 
 

@@ -26,6 +26,7 @@ STORED = {
     "pivots": ["2", "3", "9"],
     "boundary": ["CLOSED", "OPEN"],
     "unseen": ["EMPTY", "OCCUPIED"],
+    "most_parts": None,
     "decimate": None,
     "target_faces": None,
     "smooth_steps": None,
@@ -79,6 +80,7 @@ def test_numbers_have_the_limits_of_their_checks() -> None:
     assert limits == {
         "points": (50_000, 100, 5_000_000, 500_000),
         "target_faces": (20_000, 4, 20_000_000, 1_000_000),
+        "most_parts": (0, 0, 10_000, 20),
         "smooth_steps": (0, 0, 1000, 20),
         "lods": (0, 0, 8, 8),
         "max_atlases": (0, 0, 16, 16),

@@ -78,13 +78,17 @@ def extents(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: in
     return np.asarray(np.linalg.norm(np.maximum(high - low, 0.0), axis=1))
 
 
-def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> FloaterRemoval:
+def without_floaters(
+    vertices: np.ndarray, faces: np.ndarray, min_share: float, most: int = 0
+) -> FloaterRemoval:
     """Remove components that are small both in area and in length.
 
     A component is removed if its area is below ``min_share`` of the largest one's, and its length
     is below :data:`LONG_FACTOR` times that share of the longest one's or it has fewer than
     :data:`LONG_FACES` faces. Small cavities are removed as well, which fills them; a cavity of a
     removed solid is always small.
+
+    Of what is left the ``most`` solids of the largest area stay, with their cavities; 0 for all.
     """
     count, part = face_components(len(vertices), faces)
     volume, area = volumes_and_areas(vertices, faces, part, count)
@@ -92,6 +96,8 @@ def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) 
     keep = area >= min_share * area.max(initial=0.0)
     long = length >= LONG_FACTOR * min_share * length.max(initial=0.0)
     keep |= long & (np.bincount(part, minlength=count) >= LONG_FACES)
+    if most:
+        keep &= _largest(vertices, faces, part, np.where(keep, volume, np.nan), area, most)
     removed = float(area[~keep].sum() / max(area.sum(), 1e-300))
     return FloaterRemoval(
         faces[keep[part]],
@@ -100,6 +106,42 @@ def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) 
         int((~keep & (volume < 0)).sum()),
         removed,
     )
+
+
+def _largest(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    part: np.ndarray,
+    volume: np.ndarray,
+    area: np.ndarray,
+    most: int,
+) -> np.ndarray:
+    """Return (count,) bool: the largest solids, and the cavities inside of them.
+
+    ``volume`` is NaN for components that do not count.
+    """
+    solids = np.flatnonzero(volume >= 0)
+    kept = np.zeros(len(volume), bool)
+    kept[solids[np.argsort(-area[solids], kind="stable")[:most]]] = True
+    of_kept = faces[kept[part]]
+    for cavity in np.flatnonzero(volume < 0):
+        corner = vertices[faces[np.argmax(part == cavity), 0]]
+        kept[cavity] = winding_number(corner, vertices, of_kept) > 0.5
+    return kept
+
+
+def winding_number(point: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Return how often closed, outward faces wind around a point: 1 inside, 0 outside.
+
+    By solid angles (Van Oosterom and Strackee, "The solid angle of a plane triangle", 1983).
+    """
+    a, b, c = (vertices[faces[:, k]] - point for k in range(3))
+    la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+    numerator = np.einsum("ij,ij->i", a, np.cross(b, c))
+    denominator = la * lb * lc
+    for x, y, length in ((a, b, lc), (b, c, la), (c, a, lb)):
+        denominator += np.einsum("ij,ij->i", x, y) * length
+    return float(np.arctan2(numerator, denominator).sum() / (2.0 * np.pi))
 
 
 def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -111,7 +111,7 @@ def mesh_by_pivots(
     ends = bisect(begin, end, vacancy.is_empty, BRACKET_SHARE * limit, progress.span(0.5, 0.9))
     vertices = (ends[0] + ends[1]) / 2
     progress.update(0.9, "repairing")
-    floaters = without_floaters(vertices, faces, settings.min_component_share)
+    floaters = without_floaters(vertices, faces, settings.min_component_share, settings.most_parts)
     height = DEGENERATE_SHARE * float(np.median(edge_lengths(vertices, faces)))
     kept, degenerate = remove_degenerate(vertices, floaters.faces, height, region)
     vertices, kept, _ = compacted(vertices, kept)

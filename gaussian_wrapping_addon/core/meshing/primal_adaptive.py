@@ -219,7 +219,9 @@ def made_manifold(
         raise MeshingError(f"Region {region.name!r} holds no solid.", hint)
     progress.update(0.9, "repairing")
     repaired = split_nonmanifold(points, faces)
-    floaters = without_floaters(repaired.vertices, repaired.faces, settings.min_component_share)
+    floaters = without_floaters(
+        repaired.vertices, repaired.faces, settings.min_component_share, settings.most_parts
+    )
     kept, degenerate = remove_degenerate(
         repaired.vertices, floaters.faces, DEGENERATE_SHARE * float(cloud.radii.min()), region
     )

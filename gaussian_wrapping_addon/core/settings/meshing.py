@@ -274,6 +274,21 @@ class MeshingSettings:
             "0 for none",
         ),
     )
+    most_parts: int = setting(
+        0,
+        help="Of the components that are left, so many of the largest area stay; 0 keeps all. An "
+        "open boundary is cut afterwards, and may cut one into several.",
+        check=Range(1, 10_000, zero="all"),
+        since="0.2.0",
+        unit="parts",
+        option=Option("--parts", "N", "keep the N largest parts; 0 keeps all"),
+        panel=PanelProperty(
+            "Largest Parts",
+            "Number of parts that stay, by area; 0 keeps all but tiny ones",
+            soft_high=20,
+            order=5,
+        ),
+    )
     target_faces: int = setting(
         0,
         help="The mesh is decimated to this number of faces; 0 keeps all.",

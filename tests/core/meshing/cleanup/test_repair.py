@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import MeshingError
-from gaussian_wrapping_addon.core.mesh.components import without_floaters
+from gaussian_wrapping_addon.core.mesh.components import winding_number, without_floaters
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing.checks.mesh_statistics import mesh_statistics
 from gaussian_wrapping_addon.core.meshing.cleanup.degenerate import narrow_faces, remove_degenerate
@@ -191,6 +191,43 @@ def test_floaters_and_cavities_are_counted() -> None:
     assert (result.kept, result.removed_solids, result.removed_cavities) == (2, 1, 1)
     assert result.removed_area_share == pytest.approx(12 / 76)
     assert len(without_floaters(vertices, faces, 0.0).faces) == len(faces)
+
+
+def test_the_largest_parts_stay_with_their_cavities() -> None:
+    shell = [(x, y, z) for x in range(3) for y in range(3) for z in range(3)]
+    shell.remove((1, 1, 1))
+    vertices, faces = cubes(*shell, (5, 0, 0), (7, 0, 0), (8, 0, 0))
+    one = without_floaters(vertices, faces, 0.0, 1)
+    assert (one.kept, one.removed_solids, one.removed_cavities) == (2, 2, 0)
+    assert mesh_statistics(as_mesh(vertices, one.faces)).volume == pytest.approx(26)
+    assert one.removed_area_share == pytest.approx(16 / 76)
+    two = without_floaters(
+        vertices, faces, 0.0, 2
+    )  # the one of two cubes is larger than that of one
+    assert mesh_statistics(as_mesh(vertices, two.faces)).volume == pytest.approx(28)
+    assert len(without_floaters(vertices, faces, 0.0, 9).faces) == len(faces)
+
+
+def test_a_cavity_goes_with_its_solid() -> None:
+    """Its box lies inside that of a larger solid, a ring around both."""
+    shell = [(x, y, z) for x in range(3) for y in range(3) for z in range(3)]
+    shell.remove((1, 1, 1))
+    ring = [
+        (x, y, 1) for x in range(-3, 6) for y in range(-3, 6) if max(abs(x - 1), abs(y - 1)) == 4
+    ]
+    vertices, faces = cubes(*shell, *ring)
+    result = without_floaters(vertices, faces, 0.0, 1)
+    assert (result.kept, result.removed_solids, result.removed_cavities) == (1, 1, 1)
+    assert mesh_statistics(as_mesh(vertices, result.faces)).volume == pytest.approx(len(ring))
+
+
+@pytest.mark.parametrize(
+    ("point", "wanted"), [((0.3, 0.4, 0.5), 1.0), ((1.5, 0.5, 0.5), 0.0), ((9.0, 0.0, 0.0), 0.0)]
+)
+def test_winding_numbers(point: tuple[float, float, float], wanted: float) -> None:
+    vertices, faces = cubes((0, 0, 0))
+    at = vertices.min(0) + np.array(point)
+    assert winding_number(at, vertices, faces) == pytest.approx(wanted, abs=1e-12)
 
 
 def test_statistics_of_broken_meshes() -> None:
