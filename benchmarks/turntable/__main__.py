@@ -43,7 +43,7 @@ _logger = logging.getLogger("benchmarks")
 RECORDS = ROOT / "benchmarks" / "records" / "turntable"
 PAGE = ROOT / "docs" / "benchmarks" / "turntable.md"
 WIDTH_PX, HEIGHT_PX = 640, 480
-CASES = ((48, 1, "auto"), (48, 1, "off"), (48, 2, "auto"))
+CASES = ((48, 1, "auto"), (48, 2, "auto"), (24, 1, "auto"), (24, 1, "off"))
 """Photos, places of the camera, ``--turntable``."""
 SCAN = "scan"
 
