@@ -24,6 +24,10 @@ def usable_points(points: np.ndarray) -> np.ndarray:
         return np.linalg.norm(points, axis=1) <= POINT_REACH
 
 
+BACKGROUND_SHARE = 0.75
+"""Share of the photos that must be masked to what turns for masks to mean background."""
+
+
 @dataclass(frozen=True)
 class View:
     """One photo that matches its pinhole camera pixel for pixel."""
@@ -57,7 +61,8 @@ class Scene:
     def mask_mode(self, chosen: str) -> Literal["ignore", "background"]:
         """Return what the masks exclude, for a setting of :class:`~..settings.TrainingSettings`."""
         if chosen == "auto":
-            return "background" if self.facts.get("photos_masked_as_turning") else "ignore"
+            masked = self.facts.get("photos_masked_as_turning") or 0
+            return "background" if masked > BACKGROUND_SHARE * len(self.views) else "ignore"
         return "background" if chosen == "background" else "ignore"
 
     @property

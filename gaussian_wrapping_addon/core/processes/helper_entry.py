@@ -45,13 +45,10 @@ def main(arguments: list[str]) -> int:
 
 
 def _tell(error: WrapError) -> int:
-    kind = next((name for name in map(_name, type(error).__mro__) if name in FAILURES), "")
+    names = (kind.__name__ for kind in type(error).__mro__)
+    kind = next((name for name in names if name in FAILURES), "")
     emit(error=error.message, hint=error.hint, kind=kind)
     return error.exit_code
-
-
-def _name(kind: type) -> str:
-    return kind.__name__
 
 
 def _request_parent_death_signal() -> None:

@@ -241,7 +241,9 @@ class TrainingSettings(MethodSettings):
         "made of a turntable, else ignore.",
         check=Choices(MASK_MODES),
         option=Option(
-            "--mask-mode", help="masked pixels: ignore them, or treat them as empty background"
+            "--mask-mode",
+            help="masked pixels: ignore them, or treat them as empty background; auto: background "
+            "where the masks were made of a turntable",
         ),
         panel=PanelProperty(
             "Masks",

@@ -216,6 +216,6 @@ def _check_files(
     message = f"{good} photos: {listed or 'sizes not known yet'}."
     # In front of the kind: "80 photos, COLMAP model".
     findings.insert(0, Finding("fact", message, short=f"{good} photos"))
-    masked = sum(find_mask(kind.mask_roots, name) is not None for name in names)
+    masked = sum(find_mask(kind.mask_roots, name, kind.photo_roots) is not None for name in names)
     if masked:
         findings.append(Finding("fact", f"{masked} of {len(names)} photos have a mask."))

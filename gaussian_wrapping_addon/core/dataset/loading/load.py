@@ -28,6 +28,12 @@ from .sparse_points import MIN_POINTS, nothing_in_common, points_in_scene
 from .start_points import make_start_points
 from .views import PreparedView, prepare_views
 
+_CAMERAS_ARE_GIVEN = ReportWarning(
+    "no-turntable",
+    "The input has cameras: a turntable is looked for where they are solved.",
+    "Give the photos alone, or masks.",
+)
+
 
 def load_scene(
     source: Path,
@@ -81,6 +87,8 @@ def load_scene(
         prepare_span = progress.span(0.8, 1.0)
     else:
         model = read_poses(kind)
+        if turntable == "on":
+            warnings.append(_CAMERAS_ARE_GIVEN)
         prepare_span = progress.span(0.0, 1.0 if len(model.points) >= MIN_POINTS else 0.3)
         if kind.kind == "COLMAP model" and kind.transforms is not None:
             facts["also_present"] = f"{kind.transforms.name} (not used: the COLMAP model is)"

@@ -238,7 +238,8 @@ def _find_mask(
             with notes.lock:
                 notes.wrong_masks.append(f"{posed.mask_name} is missing")
     else:
-        mask_path = find_mask(kind.mask_roots, posed.name) or find_mask(kind.mask_roots, path.name)
+        mask_path = find_mask(kind.mask_roots, posed.name, kind.photo_roots)
+        mask_path = mask_path or find_mask(kind.mask_roots, path.name)
     mask = None if alpha is None else alpha >= MASK_THRESHOLD
     if mask_path is None:
         return mask

@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import os
 import unicodedata
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -18,7 +19,6 @@ PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
 MASK_FOLDERS = ("masks", "mask")
 MASK_ENDINGS = ("_mask", "-mask", ".mask")
 """Of the stem of a mask's name, as other programs write it beside the photo or in a folder."""
-MASK_SUFFIXES = (".png", ".jpg", ".tif")
 RAW_SUFFIXES = (
     ".heic", ".heif", ".avif",
     ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2",
@@ -55,8 +55,8 @@ def list_photos(root: Path) -> list[Path]:
             for name in names
             if not name.startswith(".") and PurePosixPath(name).suffix.lower() in PHOTO_SUFFIXES
         ]
-        masked = _masked_by(shown)
-        found += [here / name for name in shown if name not in masked]
+        masks = set(masks_among(shown).values())
+        found += [here / name for name in shown if name not in masks]
         if len(found) > limits.MAX_IMAGES:
             raise DatasetError(
                 f"{root.name} holds more than {limits.MAX_IMAGES} photos.", "Choose a subfolder."
@@ -64,17 +64,26 @@ def list_photos(root: Path) -> list[Path]:
     return sorted(found, key=lambda p: p.relative_to(root).as_posix())
 
 
-def _masked_by(names: list[str]) -> set[str]:
-    """Return which of the names of one folder are masks of others."""
-    known = {name.casefold() for name in names}
-    known |= {PurePosixPath(name).stem for name in known}
-    masks = set()
-    for name in names:
-        stem = PurePosixPath(name).stem.casefold()
-        for ending in MASK_ENDINGS:
-            if stem.endswith(ending) and stem.removesuffix(ending) in known:
-                masks.add(name)
-    return masks
+def masks_among(names: Iterable[str]) -> dict[str, str]:
+    """Return the masks that lie beside their photos: the mask's name of each photo's.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Of the files of one folder. ``x_mask.png``, ``x.jpg.mask.png`` and the like
+        (``MASK_ENDINGS``), in upper or lower case, belong to ``x.jpg`` if that is there.
+    """
+    photos: dict[str, list[str]] = {}
+    marked: list[tuple[str, str]] = []
+    for name in sorted(names):
+        if PurePosixPath(name).suffix.lower() not in PHOTO_SUFFIXES or name.startswith("."):
+            continue
+        key = name.casefold()
+        stem = PurePosixPath(key).stem
+        for base in {key, stem}:
+            photos.setdefault(base, []).append(name)
+        marked += [(name, stem.removesuffix(e)) for e in MASK_ENDINGS if stem.endswith(e)]
+    return {photo: mask for mask, base in marked for photo in photos.get(base, ())}
 
 
 def count_raw_photos(root: Path) -> int:
@@ -172,31 +181,44 @@ def _keys(name: str) -> list[tuple[str, str]]:
 def mask_candidates(name: str) -> list[str]:
     """Return the names a photo's mask may have in a mask folder, most specific first."""
     pure = PurePosixPath(name.replace("\\", "/"))
-    return [f"{pure}.png", str(pure.with_suffix(".png")), str(pure), *_marked_masks(name)]
-
-
-def _marked_masks(name: str) -> list[str]:
-    """Return the names of a photo's mask that say so, for any folder."""
-    pure = PurePosixPath(name.replace("\\", "/"))
     bases = (str(pure), str(pure.with_suffix("")))
-    return [f"{b}{ending}{s}" for b in bases for ending in MASK_ENDINGS for s in MASK_SUFFIXES]
+    marked = [f"{base}{ending}.png" for base in bases for ending in MASK_ENDINGS]
+    return [f"{pure}.png", str(pure.with_suffix(".png")), str(pure), *marked]
 
 
-def find_mask(mask_roots: list[Path], name: str) -> Path | None:
+def find_mask(mask_roots: list[Path], name: str, beside: Sequence[Path] = ()) -> Path | None:
     """Return the mask of photo ``name``, or ``None``.
 
-    In a folder of masks ``x.jpg.png``, ``x.png`` or the same name; there and beside the photo
-    ``x_mask.png`` and the like (``MASK_ENDINGS``, ``MASK_SUFFIXES``).
+    Parameters
+    ----------
+    mask_roots : list of Path
+        Folders of masks: ``x.jpg.png``, ``x.png``, the same name, or a name that says so
+        (``MASK_ENDINGS``).
+    beside : sequence of Path
+        Folders of photos: the mask lies beside the photo (:func:`masks_among`).
     """
     for root in mask_roots:
-        of_masks = root.name.lower() in MASK_FOLDERS
-        for candidate in mask_candidates(name) if of_masks else _marked_masks(name):
-            if "\0" in candidate or not os.path.lexists(os.path.join(root, candidate)):
-                continue  # most are not there, and looking is faster than resolving
+        for candidate in mask_candidates(name):
             path = resolve_photo(root, candidate)
             if path is not None and os.path.isfile(path):
                 return path
+    for root in beside:
+        photo = resolve_photo(root, name)
+        if photo is None or not os.path.isfile(photo):
+            continue
+        mask = _masks_beside(str(photo.parent), os.stat(photo.parent).st_mtime_ns).get(photo.name)
+        if mask is not None:
+            here = PurePosixPath(name.replace("\\", "/")).parent
+            path = resolve_photo(root, str(here / mask))
+            if path is not None and os.path.isfile(path):
+                return path
     return None
+
+
+@functools.lru_cache(maxsize=16)
+def _masks_beside(folder: str, changed_ns: int) -> dict[str, str]:
+    """List a folder once while its photos are looked up; ``changed_ns`` makes a new entry."""
+    return masks_among(os.listdir(folder))
 
 
 def mask_roots_of(source: Path) -> list[Path]:

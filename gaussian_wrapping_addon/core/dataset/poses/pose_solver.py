@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import DatasetError
-from ...files import read_json, write_json
+from ...files import write_json
 from ...kernels.parallel import default_threads
 from ...limits import MIN_IMAGES
 from ...machine import total_memory_bytes
@@ -29,18 +29,16 @@ from ..camera import Camera
 from ..photos.mask_reading import AS_WRITTEN, MaskReading
 from ..photos.photo_exif import read_lens_exif
 from ..photos.photo_file import (
-    MASK_THRESHOLD,
     DecodedPhoto,
     read_mask,
     read_photo,
-    write_mask,
     write_photo,
 )
 from ..photos.photo_finder import find_mask
 from ..readers.colmap_reader import ModelFiles, read_model
 from ..readers.source_model import PosedPhoto, SourceModel
 from .match_pairs import pairs_by_order, pairs_by_pose
-from .standing_still import TURNING_FOLDER, TURNTABLE_NAME
+from .turntable_result import with_turntable
 
 MAX_SIFT_PX = 1600
 """Long side of the photos that features are extracted from."""
@@ -96,7 +94,7 @@ def solve_poses(
     turntable : {"auto", "on", "off"}
         Whether the camera stood still while the object turned; ``"auto"`` sees it by matches that
         stay in their place. Matches of the background are then left out, and the background is
-        masked, but where the photos have masks.
+        masked, unless a photo has a mask.
     reading : MaskReading
         How mask files are understood.
 
@@ -124,7 +122,7 @@ def solve_poses(
             bad.append(error.message)
             check_unreadable_share(bad, len(photos))
             continue
-        mask = find_mask(mask_roots, name)
+        mask = find_mask(mask_roots, name, [root])
         prepared.append(_write_solver_photo(folder, i, decoded, path, mask, reading))
         names.append(name)
         progress.update(0.08 * (i + 1) / len(photos), f"reading photo {i + 1} of {len(photos)}")
@@ -156,45 +154,11 @@ def solve_poses(
     write_json(folder / "task.json", task)
     run_helper(_HELPER, folder, progress.span(0.08, 1.0), memory_bytes=_memory_limit_bytes())
     model = read_model(ModelFiles(folder / "model", ".bin"))
-    model = _with_masks(model, prepared, folder, work_folder / TURNTABLE_FOLDER)
+    sizes = {p.name: (p.full_width, p.full_height) for p in prepared}
+    target = work_folder / TURNTABLE_FOLDER
+    model = with_turntable(model, folder, sizes, target, wanted=turntable == "on")
     _save_model(folder, work_folder)
     return _with_source_names(model, prepared, names, bad, len(photos))
-
-
-def _with_masks(
-    model: SourceModel, prepared: Sequence[_SolverPhoto], folder: Path, target: Path
-) -> SourceModel:
-    """Add what the solver found of a turntable: facts, and masks in full size in ``target``."""
-    from PIL import Image
-
-    found = read_json(folder / TURNTABLE_NAME)
-    if not found["photos"]:
-        return model
-    facts = {**model.facts, "turntable_photos": found["photos"]}
-    if any((folder / "masks").iterdir()):  # of their own
-        return dataclasses.replace(model, facts=facts)
-    masks = {path.stem: path for path in (folder / TURNING_FOLDER).glob("*.png")}
-    if not masks:
-        text = (
-            f"The camera stands still in {found['photos']} photos, but what turns cannot be told "
-            f"from what stands still: masks would cut {100 * (1.0 - found['inside']):.0f} % of it "
-            "away, so none are used."
-        )
-        hint = "Give masks, or put a background behind the object that looks different from it."
-        warning = ReportWarning("turntable-not-masked", text, hint)
-        return dataclasses.replace(model, facts=facts, warnings=(*model.warnings, warning))
-    target.mkdir()
-    photos = []
-    for posed in model.photos:
-        path = masks.get(posed.name)
-        if path is not None:
-            (size,) = ((p.full_width, p.full_height) for p in prepared if p.name == posed.name)
-            whole = Image.fromarray(read_mask(path)).resize(size, Image.Resampling.BILINEAR)
-            path = target / path.name
-            write_mask(path, np.asarray(whole) >= MASK_THRESHOLD)
-        photos.append(dataclasses.replace(posed, mask_path=path))
-    facts["photos_masked_as_turning"] = len(masks)
-    return dataclasses.replace(model, photos=tuple(photos), facts=facts)
 
 
 def _with_source_names(

@@ -17,11 +17,12 @@ from ...files import read_json, write_json
 from ...processes.helper_process import emit
 from ..photos.photo_file import write_mask
 from ..pycolmap_import import import_pycolmap
-from .standing_still import TURNING_FOLDER, TURNTABLE_NAME
+from .standing_still import TURNING_FOLDER, TURNTABLE_NAME, are_turning
 from .turntable_features import (
-    MIN_MATCHES_INSIDE,
+    are_usable,
     drop_still_features,
     matches_inside,
+    most_inliers,
     turning_masks,
     turntable_groups,
 )
@@ -164,8 +165,9 @@ def _match(
     pairs = task["pairs"]
     step = max(1, min(-(-len(pairs) // _MATCHING_BLOCKS), _MATCHING_BLOCK_PAIRS))
     for begin in range(0, len(pairs), step):
+        begun = _MATCH_END if is_turntable else _EXTRACT_END
         emit(
-            fraction=_EXTRACT_END + (_MATCH_END - _EXTRACT_END) * begin / len(pairs),
+            fraction=begun + (_MATCH_END - begun) * begin / len(pairs),
             message=f"matching photos, pair {begin + 1} of {len(pairs)}",
         )
         block = pairs[begin : begin + step]
@@ -184,34 +186,44 @@ def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) ->
 
     Writes how many there are, and masks of what turns into ``turning/`` where they can be made.
     """
-    pycolmap = import_pycolmap()
-
     groups = turntable_groups(database, task)
-    found: dict[str, Any] = {"photos": sum(map(len, groups)), "inside": 1.0}
+    names = [name for group in groups for name in group]
     if groups:
         emit(fraction=_MATCH_END, message="separating what turns from what stands still")
-        with pycolmap.Database.open(database) as db:
-            db.clear_two_view_geometries()
-        verifier = pycolmap.GeometricVerifierOptions()
-        verifier.num_threads = task["threads"]
-        pycolmap.geometric_verification(
-            database,
-            verifier_options=verifier,
-            two_view_geometry_options=_verification_options(task, is_turntable=True),
-        )
+        _verify_again(database, task, is_turntable=True)
+        turn = are_turning(most_inliers(database, names, task["pairs"]))
+        if task["turntable"] == "auto" and not turn:
+            _verify_again(database, task, is_turntable=False)
+            groups, names = [], []
+    found: dict[str, Any] = {"photos": len(names), "is_masked": False}
+    if groups:
 
         def step(share: float) -> None:
             emit(fraction=_MATCH_END, message=f"masking what stands still, {100 * share:.0f} %")
 
         masks = turning_masks(folder / "images", groups, step, threads=task["threads"])
-        found["inside"] = matches_inside(database, masks)
-        if found["inside"] >= MIN_MATCHES_INSIDE:
+        if are_usable(masks, matches_inside(database, masks, task["pairs"])):
+            found["is_masked"] = True
             drop_still_features(database, masks)
             _match(folder, database, task, is_turntable=True)
             (folder / TURNING_FOLDER).mkdir()
             for name, mask in masks.items():
                 write_mask(folder / TURNING_FOLDER / f"{name}.png", mask)
     write_json(folder / TURNTABLE_NAME, found)
+
+
+def _verify_again(database: Path, task: dict[str, Any], *, is_turntable: bool) -> None:
+    pycolmap = import_pycolmap()
+
+    with pycolmap.Database.open(database) as db:
+        db.clear_two_view_geometries()
+    verifier = pycolmap.GeometricVerifierOptions()
+    verifier.num_threads = task["threads"]
+    pycolmap.geometric_verification(
+        database,
+        verifier_options=verifier,
+        two_view_geometry_options=_verification_options(task, is_turntable=is_turntable),
+    )
 
 
 def _verification_options(task: dict[str, Any], *, is_turntable: bool) -> Any:

@@ -6,8 +6,7 @@ Runs in the helper process of :mod:`.pose_solver`.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,8 @@ from .turntable_masks import masks_of_turning
 MIN_MATCHES_INSIDE = 0.8
 """Share of the matches that turn which masks must contain; else something that turns looks the same
 from all sides, and the masks would cut it away."""
+MIN_MASK_SHARE, MAX_MASK_SHARE = 0.002, 0.75
+"""Of a photo's area, median over the photos."""
 MARGIN_SHARE = 0.01
 """Features this share of the long side outside of a mask count as inside: they look at more than a
 pixel."""
@@ -87,10 +88,26 @@ def turning_masks(
     return masks
 
 
-def matches_inside(database: Path, masks: Mapping[str, np.ndarray]) -> float:
+def most_inliers(
+    database: Path, names: Collection[str], pairs: Iterable[Sequence[str]]
+) -> list[int]:
+    """Return for each of the photos how many verified matches it has with another one, at most."""
+    pycolmap = import_pycolmap()
+
+    most = dict.fromkeys(names, 0)
+    with pycolmap.Database.open(database) as db:
+        for first, second, matches in _verified(db, most, pairs):
+            for name in (first, second):
+                most[name] = max(most[name], len(matches))
+    return list(most.values())
+
+
+def matches_inside(
+    database: Path, masks: Mapping[str, np.ndarray], pairs: Iterable[Sequence[str]]
+) -> float:
     """Return the share of the verified matches between masked photos that masks contain.
 
-    1 where there are none.
+    0 where there are none.
     """
     pycolmap = import_pycolmap()
 
@@ -101,13 +118,31 @@ def matches_inside(database: Path, masks: Mapping[str, np.ndarray]) -> float:
             name: _inside(db.read_keypoints(images[name]), _grown(mask))
             for name, mask in masks.items()
         }
-        for first, second in itertools.combinations(masks, 2):
-            if not db.exists_two_view_geometry(images[first], images[second]):
-                continue
-            pair = db.read_two_view_geometry(images[first], images[second]).inlier_matches
-            both = kept[first][pair[:, 0]] & kept[second][pair[:, 1]]
+        for first, second, matches in _verified(db, masks, pairs):
+            both = kept[first][matches[:, 0]] & kept[second][matches[:, 1]]
             inside, total = inside + int(both.sum()), total + len(both)
-    return inside / total if total else 1.0
+    return inside / total if total else 0.0
+
+
+def are_usable(masks: Mapping[str, np.ndarray], inside: float) -> bool:
+    """Tell whether masks show what turns: they contain its matches, and a fair part of the photos.
+
+    Almost nothing differs where nothing turns, almost everything where the camera moves.
+    """
+    share = float(np.median([mask.mean() for mask in masks.values()]))
+    return inside >= MIN_MATCHES_INSIDE and MIN_MASK_SHARE <= share <= MAX_MASK_SHARE
+
+
+def _verified(
+    db: Any, names: Collection[str], pairs: Iterable[Sequence[str]]
+) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Yield the verified matches (n, 2) of the pairs of these photos."""
+    images = {image.name: image.image_id for image in db.read_all_images()}
+    for first, second in pairs:
+        if first in names and second in names:
+            ids = images[first], images[second]
+            if db.exists_two_view_geometry(*ids):
+                yield first, second, db.read_two_view_geometry(*ids).inlier_matches
 
 
 def drop_still_features(database: Path, masks: Mapping[str, np.ndarray]) -> None:

@@ -29,7 +29,13 @@ QUIET_PERCENTILE = 30.0
 DARKEST = 16
 """Pixels darker than this tell nothing of a photo's exposure."""
 CLOSED_SHARE = 0.008
-"""Gaps up to this share of the long side are closed: where object and background look alike."""
+"""Gaps up to twice this share of the long side are closed: where object and background look
+alike."""
+OFTEN = 0.05
+"""Share of the photos in which the object is seen at a pixel where another one shows a hole in it:
+a handle turns past. Where nothing is ever seen to differ, the object looks the same all around."""
+SMALL_HOLE_SHARE = 0.0005
+"""Holes up to this share of the photo's area are filled in any case."""
 SMALLEST_SHARE = 0.02
 """Parts smaller than this share of the largest are noise, or leaves that the wind moves."""
 
@@ -79,7 +85,8 @@ def masks_of_turning(
         sharp = np.abs(photo - background).max(axis=2)
         rim = mask & ~ndimage.binary_erosion(mask, border_value=True)
         masks.append(mask & ~(rim & known & (sharp <= SHARP_FACTOR * threshold)))
-    return masks
+    often = np.mean(masks, axis=0, dtype=np.float32) >= OFTEN
+    return [without_holes(mask, often) for mask in masks]
 
 
 def steady_colors(photos: np.ndarray, threads: int) -> tuple[np.ndarray, np.ndarray]:
@@ -161,17 +168,26 @@ _RATIO_BINS, _MAX_RATIO = 200, 1.0
 
 
 def whole_parts(differs: np.ndarray) -> np.ndarray:
-    """Return (h, w) bool with specks taken out, gaps closed and holes filled."""
+    """Return (h, w) bool with specks taken out and gaps closed."""
     radius = max(1, round(CLOSED_SHARE * max(differs.shape)))
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     disc = x * x + y * y <= radius * radius
-    # Pad, so that what the border cuts is closed and filled like the rest.
+    # Pad, so that what the border cuts is closed like the rest.
     padded = np.pad(ndimage.binary_opening(differs, np.ones((2, 2))), radius, mode="edge")
     closed = ndimage.binary_closing(padded, disc)[radius:-radius, radius:-radius]
-    filled = ndimage.binary_fill_holes(closed)
-    label, parts = ndimage.label(filled)
+    label, parts = ndimage.label(closed)
     if parts == 0:
-        return filled
+        return np.asarray(closed)
     areas = np.bincount(label.ravel())
     areas[0] = 0
-    return (areas >= SMALLEST_SHARE * areas.max())[label] & filled
+    return (areas >= SMALLEST_SHARE * areas.max())[label] & closed
+
+
+def without_holes(mask: np.ndarray, often: np.ndarray) -> np.ndarray:
+    """Fill the holes of a (h, w) bool mask, but large ones where ``often`` the object is seen."""
+    holes = ndimage.binary_fill_holes(mask) & ~mask
+    label, count = ndimage.label(holes)
+    if count == 0:
+        return mask
+    small = np.bincount(label.ravel()) <= SMALL_HOLE_SHARE * mask.size
+    return mask | (holes & (small[label] | ~often))

@@ -54,8 +54,7 @@ class SourceKind:
     @property
     def mask_roots(self) -> list[Path]:
         """Folders that may hold masks."""
-        folders = [m for root in self.photo_roots for m in mask_roots_of(root)]
-        return [*folders, *self.photo_roots]
+        return [m for root in self.photo_roots for m in mask_roots_of(root)]
 
 
 def source_kind(source: Path) -> SourceKind:

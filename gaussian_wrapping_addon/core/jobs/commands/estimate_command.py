@@ -109,5 +109,5 @@ def input_facts(source: Path) -> SceneFacts:
         sum(width * height for width, height in sizes) / len(sizes),
         max(max(size) for size in sizes),
         points,
-        any(find_mask(kind.mask_roots, name) is not None for name in named),
+        any(find_mask(kind.mask_roots, name, kind.photo_roots) is not None for name in named),
     )

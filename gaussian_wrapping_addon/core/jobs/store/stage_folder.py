@@ -25,7 +25,7 @@ _logger = logging.getLogger(__name__)
 # Keys of later stages hold those of earlier ones. Finished trainings can be meshed and trained on
 # whatever the number of their cameras; with another number of their own they cannot: a training
 # that comes out better now keeps its number.
-STAGE_VERSIONS = {"cameras": 2, "train": 6, "mesh": 11, "texture": 13, "bake": 3}
+STAGE_VERSIONS = {"cameras": 3, "train": 6, "mesh": 11, "texture": 13, "bake": 3}
 
 DONE_NAME = "done.json"
 HASH_CHARACTERS = 12

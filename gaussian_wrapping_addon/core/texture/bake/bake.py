@@ -25,17 +25,17 @@ KEPT_VIEWS = 15
 """Odd, so that the median of the views is one of them. With five, the median changed wherever one
 view replaced another: flakes along the rim of a pot whose photos differ in exposure."""
 SHARPNESS_AGREEING, SHARPNESS_DISAGREEING = 6.0, 1.0
-"""Exponents of the weights, how far the best views dominate, where views agree and where they do
-not: there more keeps gradients, noise and highlights of single photos, and where they agree less
-blurs (docs/benchmarks/texturing.md)."""
+"""Exponents of the weights, how far the best views dominate: where views agree, or are one or two,
+and where they do not. A high one keeps gradients, noise and highlights of single photos where they
+disagree, a low one blurs where they agree (docs/benchmarks/texturing.md)."""
 DISAGREEMENT = 10.0
 """Median distance of the views from their median, of 255 levels, half way between the two."""
 OUTLIER_FLOOR = 20.0
 """Views within this many of 255 levels of the median are never outliers."""
 OUTLIER_FACTOR = 2.5
 OUTLIER_FADE = 0.5
-"""Views fade from this share below the limit to as much above it: a hard limit leaves flakes with
-sharp borders where neighbours reject different views."""
+"""Views fade from this share of the limit on, and are gone at it: a hard limit leaves flakes with
+sharp borders where neighbouring texels reject different views."""
 CLEAR_PX = 2
 """Closer to a silhouette, a pixel's colour is mixed with that of another surface."""
 MEDIAN_POWER = 0.25
@@ -315,7 +315,7 @@ def _blend(
         for j in range(count):
             weight = share[j] ** sharpness
             if count >= 3:
-                kept_share = (1.0 + OUTLIER_FADE - distance[j] / limit) / (2.0 * OUTLIER_FADE)
+                kept_share = (1.0 - distance[j] / limit) / (1.0 - OUTLIER_FADE)
                 if kept_share <= 0.0:
                     rejected[i] += 1
                     continue

@@ -11,6 +11,7 @@ import pytest
 from gaussian_wrapping_addon.core.dataset.poses.standing_still import (
     MIN_GROUP,
     PairMotion,
+    are_turning,
     pair_motion,
     standing_groups,
 )
@@ -46,6 +47,26 @@ def test_a_date_in_the_corner_is_no_background() -> None:
     assert not pair_motion(0, 1, points, others, SIZE).is_still
 
 
+def test_a_bonnet_along_the_lower_edge_is_no_background() -> None:
+    bonnet = np.random.default_rng(0).uniform([10, 430], [630, 475], (200, 2))
+    world = spread(400)
+    points, others = np.concatenate([bonnet, world]), np.concatenate([bonnet, world + 20.0])
+    assert not pair_motion(0, 1, points, others, SIZE).is_still
+
+
+def test_a_display_over_a_moving_picture_is_no_background() -> None:
+    """Marks all over the picture stand still, between them everything moves."""
+    marks, world = spread(40), spread(900, 1)
+    points, others = np.concatenate([marks, world]), np.concatenate([marks, world + 20.0])
+    assert not pair_motion(0, 1, points, others, SIZE).is_still
+
+
+def test_what_moves_must_move_as_one() -> None:
+    assert are_turning([30, 14, 12, 60])
+    assert not are_turning([3, 0, 0, 40])
+    assert not are_turning([])
+
+
 def test_no_match_is_no_evidence() -> None:
     nothing = np.zeros((0, 2))
     assert pair_motion(0, 1, nothing, nothing, SIZE) == PairMotion(0, 1, False, 0)
@@ -74,7 +95,12 @@ def test_slow_steps_are_not_chained_to_one_place() -> None:
     assert standing_groups(30, motions) == []
 
 
-@pytest.mark.parametrize("strays", [0, 5])
+def test_waiting_on_the_way_while_somebody_walks_by_is_no_turntable() -> None:
+    motions = [PairMotion(a, b, b < 10, 40) for a, b in itertools.combinations(range(21), 2)]
+    assert standing_groups(21, motions) == []
+
+
+@pytest.mark.parametrize("strays", [0, 4])
 def test_two_places_are_two_groups(strays: int) -> None:
     count = 20 + strays
     motions = [

@@ -14,6 +14,7 @@ from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
 from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene, save_scene
+from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.evaluation.alignment.pose_error import pose_errors
 from gaussian_wrapping_addon.core.progress import Progress
 
@@ -80,6 +81,24 @@ def test_masks_of_the_user_are_taken_instead(made: Turntable, photos: Path, tmp_
     assert "photos_masked_as_turning" not in scene.facts
     assert scene.mask_mode("auto") == "ignore"
     assert len(scene.views) >= 0.8 * COUNT
+    assert [w.code for w in scene.warnings if "turntable" in w.code] == ["turntable-with-masks"]
+
+
+def test_a_pause_over_a_repeated_pattern_is_no_turntable(tmp_path: Path) -> None:
+    """Wrong matches among tiles move as one body; nothing differs in the photos."""
+    random = np.random.default_rng(0)
+    tile = random.integers(0, 255, (24, 24, 3))
+    photo = random.integers(0, 255, (30, 40, 3)).repeat(8, 0).repeat(8, 1)[:240, :320]
+    photo[:, 160:] = np.tile(tile, (10, 7, 1))[:, :160]
+    source = tmp_path / "pause"
+    source.mkdir()
+    for k in range(9):
+        noisy = (photo + random.normal(size=photo.shape) * 2).clip(0, 255).astype(np.uint8)
+        Image.fromarray(noisy).save(source / f"{k}.png")
+    with pytest.raises(DatasetError) as caught:  # nothing has parallax
+        load_scene(source, tmp_path / "work", Progress(), threads=2)
+    assert "placed" in caught.value.message
+    assert not (tmp_path / "work" / "turntable").exists()
 
 
 def test_a_walk_around_an_object_is_no_turntable(tmp_path: Path) -> None:
