@@ -211,6 +211,24 @@ def test_a_constant_colour_stays_constant_everywhere(tmp_path: Path) -> None:
     assert np.abs(textured.albedo.astype(int) - [200, 100, 50]).max() <= 1
 
 
+@pytest.mark.parametrize("brighter", [21, 30, 90])
+def test_a_highlight_in_the_best_photo_is_outvoted(tmp_path: Path, brighter: int) -> None:
+    """The others agree exactly: that must not let the best one win by its weight."""
+    low, high = [-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]
+    frontal = look_at((0.0, -2.6, 0.0))
+    aside = [look_at((x, -3.2, z)) for x in (-2.2, 2.2) for z in (-1.6, 1.6)]
+    things = [(lambda o, r: box_hit(o, r, low, high), plain((100, 100, 100)))]
+    photos = photograph([frontal, *aside], things)
+    shine = photos.images[0] = photos.images[0].copy()
+    height, width = shine.shape[:2]
+    middle = (slice(height * 4 // 9, height * 5 // 9), slice(width * 4 // 9, width * 5 // 9))
+    shine[middle] += np.uint8(brighter)
+    positions, colors, normals = texels(run(box(low, high), photos, tmp_path))
+    centre = (normals[:, 1] < -0.9) & (np.abs(positions[:, [0, 2]]) < 0.05).all(1)
+    assert centre.sum() > 10
+    assert np.abs(colors[centre] - 100).max() <= 2
+
+
 def test_masked_photos_give_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     photos = photograph(ring(3, 3.0, 0.5), [(sphere_hit, waves)])
     photos.masks = [np.zeros(i.shape[:2], bool) for i in photos.images]
