@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -72,9 +73,8 @@ def masks_of_turning(
     del photos
     known = support >= MIN_SUPPORT_SHARE * len(chosen)
     soft = ndimage.gaussian_filter(background, (BLUR_PX, BLUR_PX, 0))
-    masks = []
-    for index in range(count):
-        step(0.4 + 0.6 * index / count)
+
+    def turning(index: int) -> np.ndarray:
         photo = _evened(read(index), background)
         blurred = ndimage.gaussian_filter(photo, (BLUR_PX, BLUR_PX, 0))
         difference = np.abs(blurred - soft).max(axis=2)
@@ -84,7 +84,13 @@ def masks_of_turning(
         # The blur has moved borders outwards, by a pixel where the contrast is high.
         sharp = np.abs(photo - background).max(axis=2)
         rim = mask & ~ndimage.binary_erosion(mask, border_value=True)
-        masks.append(mask & ~(rim & known & (sharp <= SHARP_FACTOR * threshold)))
+        return mask & ~(rim & known & (sharp <= SHARP_FACTOR * threshold))
+
+    masks = []
+    with ThreadPoolExecutor(threads) as pool:
+        for index, mask in enumerate(pool.map(turning, range(count))):
+            masks.append(mask)
+            step(0.4 + 0.6 * index / count)
     often = np.mean(masks, axis=0, dtype=np.float32) >= OFTEN
     return [without_holes(mask, often) for mask in masks]
 
