@@ -88,7 +88,7 @@ _COUNTS = frozenset(
         "field_evaluations",
         "frames", "gaussians", "gaussians_in_region", "holdout_every", "images_in_model",
         "inconsistent_edges", "interior_samples", "iterations", "jump_points", "left_out", "lods",
-        "max_atlases", "max_gaussians",
+        "max_atlases", "max_gaussians", "most_parts",
         "nonmanifold_edges", "nonmanifold_vertices", "not_finite_vertices",
         "open_at_region", "open_edges", "part_count", "photos", "photos_masked",
         "photos_masked_as_turning", "photos_placed",
