@@ -106,7 +106,9 @@ def test_advanced_panel_asks_for_what_counts_by_the_method(method: str) -> None:
     log = draw(mesh_panel.GWRAP_PT_mesh_advanced).log
     properties = {a[1] for name, a, _ in log if name == "prop"}
     own = {"PAM": {"spacing"}, "PIVOTS": {"pivots", "pivot_box", "pivot_samples"}}[method]
-    shared = {"decimate", "smooth_steps", "method", "boundary", "unseen", "mesh_cameras"}
+    shared = {
+        "most_parts", "decimate", "smooth_steps", "method", "boundary", "unseen", "mesh_cameras",
+    }  # fmt: skip
     assert properties == shared | own
 
 
