@@ -58,8 +58,9 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
         earlier = _cameras_of_finished_training(folder, job)
         if earlier is not None:
             _logger.warning(
-                "%s has changed since the training, its files have new dates, or an earlier "
-                "version loaded it: the mesh is of the training as it is. To train anew, run wrap.",
+                "%s has changed since the training, its files have new dates, or it was loaded by "
+                "an earlier version or with other masks: the mesh is of the training as it is. To "
+                "train anew, run wrap.",
                 source,
             )  # fmt: skip
             return earlier
