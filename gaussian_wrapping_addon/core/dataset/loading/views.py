@@ -228,18 +228,7 @@ def _find_mask(
     notes: _Notes,
 ) -> np.ndarray | None:
     """Return the (h, w) bool mask of a photo, of exactly its size, or ``None``."""
-    mask_path = posed.mask_path
-    if mask_path is not None:
-        pass
-    elif posed.mask_name is not None:
-        mask_path = resolve_photo(kind.folder, posed.mask_name)
-        if mask_path is None or not os.path.isfile(mask_path):
-            mask_path = None
-            with notes.lock:
-                notes.wrong_masks.append(f"{posed.mask_name} is missing")
-    else:
-        mask_path = find_mask(kind.mask_roots, posed.name, kind.photo_roots)
-        mask_path = mask_path or find_mask(kind.mask_roots, path.name)
+    mask_path = posed.mask_path or _mask_file(posed, path, kind, notes)
     mask = None if alpha is None else alpha >= MASK_THRESHOLD
     if mask_path is None:
         return mask
@@ -257,6 +246,19 @@ def _find_mask(
     from_file = (AS_WRITTEN if made else reading).kept(stored)
     combined = from_file if mask is None else from_file & mask
     return None if combined.all() else combined
+
+
+def _mask_file(posed: PosedPhoto, path: Path, kind: SourceKind, notes: _Notes) -> Path | None:
+    """Return the mask that the input names for a photo, or that is found for it."""
+    if posed.mask_name is None:
+        named = find_mask(kind.mask_roots, posed.name, kind.photo_roots)
+        return named or find_mask(kind.mask_roots, path.name)
+    found = resolve_photo(kind.folder, posed.mask_name)
+    if found is not None and os.path.isfile(found):
+        return found
+    with notes.lock:
+        notes.wrong_masks.append(f"{posed.mask_name} is missing")
+    return None
 
 
 def _resized_mask(mask: np.ndarray, shape: tuple[int, ...], path: Path) -> np.ndarray:
