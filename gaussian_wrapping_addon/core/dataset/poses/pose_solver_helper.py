@@ -188,10 +188,13 @@ def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) ->
     """
     groups = turntable_groups(database, task)
     names = [name for group in groups for name in group]
+    # Between two places the background moves as one body, too.
+    place = {name: number for number, group in enumerate(groups) for name in group}
+    pairs = [(a, b) for a, b in task["pairs"] if a in place and place[a] == place.get(b)]
     if groups:
         emit(fraction=_MATCH_END, message="separating what turns from what stands still")
         _verify_again(database, task, is_turntable=True)
-        turn = are_turning(most_inliers(database, names, task["pairs"]))
+        turn = are_turning(most_inliers(database, names, pairs))
         if task["turntable"] == "auto" and not turn:
             _verify_again(database, task, is_turntable=False)
             groups, names = [], []
@@ -202,7 +205,7 @@ def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) ->
             emit(fraction=_MATCH_END, message=f"masking what stands still, {100 * share:.0f} %")
 
         masks = turning_masks(folder / "images", groups, step, threads=task["threads"])
-        if are_usable(masks, matches_inside(database, masks, task["pairs"])):
+        if are_usable(masks, matches_inside(database, masks, pairs)):
             found["is_masked"] = True
             drop_still_features(database, masks)
             _match(folder, database, task, is_turntable=True)

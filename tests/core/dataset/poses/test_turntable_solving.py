@@ -84,6 +84,15 @@ def test_masks_of_the_user_are_taken_instead(made: Turntable, photos: Path, tmp_
     assert [w.code for w in scene.warnings if "turntable" in w.code] == ["turntable-with-masks"]
 
 
+def test_the_camera_may_stand_in_two_places(tmp_path: Path) -> None:
+    """Between both the background moves as one body, which masks need not contain."""
+    made = turntable(36, 480, 360, elevations=2)
+    write_photos(made, tmp_path / "photos")
+    scene = load_scene(tmp_path / "photos", tmp_path / "work", Progress(), threads=2)
+    assert scene.facts["photos_masked_as_turning"] == len(scene.views) == 36
+    assert np.median(pose_errors(scene.cameras, made.cameras).rotation_degrees) < 1.0
+
+
 def test_a_pause_over_a_repeated_pattern_is_no_turntable(tmp_path: Path) -> None:
     """Wrong matches among tiles move as one body; nothing differs in the photos."""
     random = np.random.default_rng(0)
