@@ -45,7 +45,7 @@ def test_a_new_setting_needs_its_declaration_only(tmp_path: Path, group: str) ->
     assert found["refused"] == "--fake-number is out of range. Give from 1 to 9."
     assert (found["stored"], found["read"]) == (7, 7)
     (row,) = found["table"]
-    for cell in ("`--fake-number N`", "Fake Number", "3 / 3 / 5 / 3", "from 1 to 9", "bananas"):
+    for cell in ("`--fake-number N`", "Fake Number", "3 / 3 / 5 / 3 / 3", "from 1 to 9", "bananas"):
         assert f"{cell} |" in row
     assert found["outdated"], "the test of the table would fail until it is written again"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options shared by several commands: job folder, threads, Blender files."""
+"""Options shared by several commands: job folder, threads, device, Blender files."""
 
 from __future__ import annotations
 
@@ -27,6 +27,16 @@ def add_threads(parser: ArgumentParser) -> None:
     """Add ``--threads``."""
     threads = declared("threads")
     add_option(parser, threads, default=threads.default)
+
+
+def add_device(parser: ArgumentParser, *, kept: bool = False) -> None:
+    """Add ``--device``; with ``kept``, the job's own is kept where it is not given."""
+    device = declared("device")
+    if kept:
+        help_kept = "another device than the job's: auto, cpu, cuda or cuda:N"
+        add_option(parser, device, help=help_kept)
+    else:
+        add_option(parser, device, default=device.default)
 
 
 def add_no_blend(parser: ArgumentParser) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
-from .common import Commands, add_no_blend, add_out, add_threads
+from .common import Commands, add_device, add_no_blend, add_out, add_threads
 from .follow import follow, require_bpy
 from .options.meshing_options import (
     add_method_options,
@@ -27,6 +27,7 @@ def add_mesh(commands: Commands) -> None:
     add_method_options(parser)
     add_region_options(parser)
     add_threads(parser)
+    add_device(parser)
     add_no_blend(parser)
     parser.set_defaults(run=_mesh)
 
@@ -34,6 +35,7 @@ def add_mesh(commands: Commands) -> None:
 def _mesh(options: Namespace) -> int:
     from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
+    from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.continue_training import no_finished_training
     from ..core.jobs.store.job_file import make_job
     from ..core.jobs.store.job_folder import JobFolder
@@ -46,6 +48,7 @@ def _mesh(options: Namespace) -> int:
         raise no_finished_training(options.out)
     job = make_job("mesh", Path(earlier.source), region_settings(earlier.settings, options))
     require_bpy(job, options)
+    require_device(job.settings.device)
     return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
 
 
@@ -92,6 +95,7 @@ def add_work_tiles(commands: Commands) -> None:
     )
     parser.add_argument("out", type=Path, metavar="DIR", help="job folder of that job")
     add_threads(parser)
+    add_device(parser)
     parser.add_argument(
         "--wait", type=float, default=0.0, metavar="S", help="longest time to wait for tiles, in s"
     )
@@ -102,14 +106,17 @@ def _work_tiles(options: Namespace) -> int:
     from ..core.errors import UsageError
     from ..core.files import real_path
     from ..core.jobs.client import worker_python
+    from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.commands.run_in_worker import run_in_worker
     from ..core.settings import JobSettings
 
-    JobSettings(threads=options.threads).validated()
+    JobSettings(threads=options.threads, device=options.device).validated()
     if not 0 <= options.wait <= MAX_WAIT_S:
         raise UsageError("--wait is out of range.", f"Give from 0 to {MAX_WAIT_S:.0f} seconds.")
+    require_device(options.device)
     request = {
         "out": str(real_path(options.out)), "threads": options.threads, "wait_s": options.wait,
+        "device": options.device,
     }  # fmt: skip
     return run_in_worker(
         request, python=worker_python(), module="jobs.commands.tile_worker", what="work on tiles"

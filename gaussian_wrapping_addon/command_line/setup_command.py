@@ -37,7 +37,8 @@ def add_set_up_worker(commands: Commands) -> None:
     )
     parser.add_argument(
         "--torch", choices=("cpu", "cuda", "index"), default="cpu",
-        help="build of torch; index: the default of pip's index",
+        help="build of torch; cuda: training and vacancy on an NVIDIA GPU, for several GiB more; "
+        "index: the default of pip's index",
     )  # fmt: skip
     parser.add_argument(
         "--requirements", type=Path, metavar="FILE", help="another list of packages"
@@ -59,7 +60,15 @@ def _set_up_worker(options: Namespace) -> int:
         known_environments,
     )
     from ..core.processes.worker_requirements import read_requirements, requirements_file
-    from ..core.setup.commands import SetupRequest, all_commands, as_line, check_folders
+    from ..core.setup.commands import (
+        CPU,
+        CUDA_BRINGS,
+        SetupRequest,
+        all_commands,
+        as_line,
+        check_folders,
+        cuda_present,
+    )
     from ..core.setup.install import remove
     from ..core.setup.pythons import find_pythons, probe
 
@@ -85,6 +94,8 @@ def _set_up_worker(options: Namespace) -> int:
     request = SetupRequest(str(root), python.path, str(requirements), torch, wheels)
     read_requirements(requirements)
     check_folders(request)
+    if torch == CPU and cuda_present():
+        _logger.info("An NVIDIA driver was found. With --torch cuda: %s.", CUDA_BRINGS)
     for command in all_commands(request, python):
         _logger.info("$ %s", as_line(command))
     return EXIT_DONE if options.dry_run else _follow(request)

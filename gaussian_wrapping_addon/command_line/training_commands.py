@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..core.settings import declared
 from .bake_command import follow_bake
-from .common import Commands, add_no_blend, add_out
+from .common import Commands, add_device, add_no_blend, add_out
 from .follow import follow, require_bpy
 from .options.meshing_options import add_method_options, add_region_options, region_settings
 from .options.setting_options import add_option
@@ -37,11 +37,13 @@ def _wrap(options: Namespace) -> int:
     from ..core.dataset.loading.check import check_input
     from ..core.errors import DatasetError
     from ..core.jobs.client import JobClient, worker_python
+    from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import make_job
 
     settings = training_settings(options)
     job = make_job("wrap", options.input, region_settings(settings, options))
     require_bpy(job, options)
+    require_device(job.settings.device)
     for finding in check_input(options.input):
         if finding.severity == "error":
             raise DatasetError(finding.message, finding.hint)
@@ -58,6 +60,7 @@ def add_continue_training(commands: Commands) -> None:
     add_out(parser)
     entry = declared("training.extra_iterations")
     add_option(parser, entry, dest="iterations", required=True)
+    add_device(parser, kept=True)
     add_no_blend(parser)
     parser.set_defaults(run=_continue_training)
 
@@ -65,13 +68,17 @@ def add_continue_training(commands: Commands) -> None:
 def _continue_training(options: Namespace) -> int:
     from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
+    from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.continue_training import continue_training_job
     from ..core.jobs.store.job_folder import JobFolder
     from ..core.jobs.store.rollback import finished_job
 
     folder = JobFolder(real_path(options.out))
     job = continue_training_job(folder, finished_job(folder), options.iterations)
+    if options.device is not None:
+        job = replace(job, settings=replace(job.settings, device=options.device).validated())
     require_bpy(job, options)
+    require_device(job.settings.device)
     return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
 
 
@@ -81,6 +88,7 @@ def add_resume(commands: Commands) -> None:
     parser.add_argument("out", type=Path, metavar="DIR")
     entry = declared("training.max_gaussians")
     add_option(parser, entry, dest="max_gaussians", help="train anew with this maximum")
+    add_device(parser, kept=True)
     add_no_blend(parser)
     parser.set_defaults(run=_resume)
 
@@ -88,15 +96,20 @@ def add_resume(commands: Commands) -> None:
 def _resume(options: Namespace) -> int:
     from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
+    from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import read_job
     from ..core.jobs.store.job_folder import JobFolder
 
     job = read_job(JobFolder(real_path(options.out)).job_path)
+    if options.device is not None:
+        job = replace(job, settings=replace(job.settings, device=options.device).validated())
     if job.bake is not None and options.max_gaussians is None:
         return follow_bake(JobClient.resume(options.out, python=worker_python()), job)
     require_bpy(job, options)
+    require_device(job.settings.device)
     if options.max_gaussians is None:
-        return follow(JobClient.resume(options.out, python=worker_python()), job, options)
+        client = JobClient.resume(options.out, python=worker_python(), device=options.device)
+        return follow(client, job, options)
     # A training with another maximum starts anew: extra iterations do not apply.
     training = replace(
         job.settings.training, max_gaussians=options.max_gaussians, extra_iterations=0
@@ -116,10 +129,12 @@ def add_estimate(commands: Commands) -> None:
 
 def _estimate(options: Namespace) -> int:
     from ..core.jobs.client import worker_python
+    from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.commands.run_in_worker import run_in_worker
     from ..core.jobs.store.job_file import make_job
 
     job = make_job("wrap", options.input, training_settings(options))
+    require_device(job.settings.device)
     return run_in_worker(
         job.to_json(),
         python=worker_python(),

@@ -148,4 +148,4 @@ def known_error(error: OSError, path: str | Path = "") -> WrapError | None:
 class DeviceError(WrapError):
     """The GPU, its driver or its compiler failed or lacks a required feature."""
 
-    exit_code = EXIT_RESOURCES
+    exit_code = EXIT_BAD_DATA

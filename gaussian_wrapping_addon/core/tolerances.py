@@ -70,3 +70,24 @@ FINITE_SIGMA_Z = 1e15
 """Largest sigma_z: its inverse square, the smallest a0, is a normal float32."""
 FINITE_COLOR = 2.0**24
 """Beyond, a float32 sum no longer resolves white added to it."""
+
+# Multi-view terms (docs/method.md, section 3.4).
+HALF_PATCH = 3
+"""A patch has ``2 * 3 + 1`` samples per side ..."""
+PATCH_STEP_PX = 0.5
+"""... half a pixel of the reference apart, where that is not flat."""
+MAX_NOISE_PX = 1.0
+"""Points with a larger reprojection error are occluded or wrong in one view."""
+MIN_NOISE_PX = 1e-9
+"""Below this, the direction of the reprojection error is rounding: no gradient."""
+SPREAD_PRODUCT = 1e-8
+"""Added to the product of the sums of squared deviations of two patches: patches of weak contrast
+correlate less."""
+MAX_PATCH_ERROR = 0.9
+"""Patches with a larger error show different things."""
+MIN_PLANE_NORMAL = 0.3
+"""Shortest blended normal that defines a plane."""
+MIN_PLANE_FACING = 0.1
+"""Smallest cosine between normal and ray (84 degrees): more grazing planes have no patch."""
+PATCH_SKIPPED, PATCH_KEPT, PATCH_BROKEN = 0, 1, 2
+"""States of a pixel: not compared, compared, with values that are not finite."""

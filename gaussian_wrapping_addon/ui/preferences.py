@@ -31,6 +31,7 @@ class GWRAP_preferences(bpy.types.AddonPreferences):
         subtype="DIR_PATH",
     )
     threads: property_of(declared("threads"))  # type: ignore[valid-type]
+    device: property_of(declared("device"))  # type: ignore[valid-type]
     keep_running: BoolProperty(  # type: ignore[valid-type]
         name="Keep Jobs Running After Blender Closes",
         description="Jobs continue after Blender closes; opening the file again finds them",
@@ -46,6 +47,7 @@ class GWRAP_preferences(bpy.types.AddonPreferences):
         box.prop(self, "wheel_folder")
         layout.prop(self, "worker_python")
         layout.prop(self, "threads")
+        layout.prop(self, "device")
         layout.prop(self, "keep_running")
         draw_doctor(layout, context)
 

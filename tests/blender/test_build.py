@@ -114,11 +114,12 @@ bpy.ops.extensions.package_install_files(
 name = "bl_ext.user_default.gaussian_wrapping_addon"
 preferences = bpy.context.preferences.addons[name].preferences
 preferences.threads = 3
+preferences.device = "CPU"
 preferences.worker_python = {python!r}
 assert "gaussian_wrapping_addon" not in sys.modules
 workers = sys.modules[name + ".ops.worker.preferred_worker"]
 choice = workers.worker_choice(bpy.context)
-assert (choice.threads, choice.python) == (3, {python!r}), choice
+assert (choice.threads, choice.python, choice.device) == (3, {python!r}, "cpu"), choice
 import time
 scene = bpy.context.scene
 scene.gwrap.source = {photos!r}

@@ -18,10 +18,12 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core import limits
+from gaussian_wrapping_addon.core.devices import choice
+from gaussian_wrapping_addon.core.errors import DeviceError
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.ops.common import background, tags
-from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer, watched_jobs
+from gaussian_wrapping_addon.ops.jobs import job_actions, job_attach, job_timer, watched_jobs
 from gaussian_wrapping_addon.ops.worker import preferred_worker
 from gaussian_wrapping_addon.ui.dataset import dataset_panel
 from gaussian_wrapping_addon.ui.meshing import mesh_panel
@@ -378,3 +380,35 @@ def test_job_status_of_a_half_written_file_is_survived(
 
 def test_worker_choice_without_preferences() -> None:
     assert preferred_worker.worker_choice(bpy.context) == preferred_worker.WorkerChoice()
+
+
+def test_the_device_of_the_preferences_is_the_jobs(
+    photos: Path, worker: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(choice, "device_count", lambda: 1)
+    worker("refuse")
+    scene = bpy.context.scene
+    scene.gwrap.source = str(photos)
+    folder = job_actions.start_wrap(scene, preferred_worker.WorkerChoice(device="cuda"))
+    assert read_job(folder / "job.json").settings.device == "cuda"
+    wait_for("FAILED")
+    watched_jobs.jobs[watched_jobs.key_of(str(folder))].client._process.wait(10)  # type: ignore[union-attr]
+    job_actions.resume(scene, preferred_worker.WorkerChoice(device="cpu"))
+    assert read_job(folder / "job.json").settings.device == "cpu"
+    wait_for("FAILED")
+    watched_jobs.jobs[watched_jobs.key_of(str(folder))].client._process.wait(10)  # type: ignore[union-attr]
+
+
+def test_a_gpu_that_is_missing_starts_no_job(
+    photos: Path, worker: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing() -> int:
+        raise DeviceError("There is no driver here.")
+
+    monkeypatch.setattr(choice, "device_count", missing)
+    worker("quick")
+    scene = bpy.context.scene
+    scene.gwrap.source = str(photos)
+    with pytest.raises(DeviceError, match="cuda cannot be used: There is no driver here"):
+        job_actions.start_wrap(scene, preferred_worker.WorkerChoice(device="cuda"))
+    assert not photos.with_name(photos.name + "_wrap").exists()

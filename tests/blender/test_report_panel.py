@@ -64,6 +64,7 @@ def test_full_report(tmp_path: Path) -> None:
         ("Peak Memory", "3.00 GiB"),
         ("Gaussians", "12,235"),
         ("Held-Out PSNR", "23.0 dB (2 photos)"),
+        ("Device", "cuda:1"),
         ("Cameras", "20 s"),
         ("Training", "2 min 20 s"),
         (f"Mesh {REGION}", "30 s"),
@@ -80,12 +81,23 @@ def test_full_report(tmp_path: Path) -> None:
     assert "gwrap.read_report" in layout.operators
     assert "gwrap.show_pictures" in layout.operators
     words = " ".join(layout.texts.split())
+    assert "Some GPU, kernels compiled by libnvrtc.so.13." in words
     assert "2 of 16 photos could not be placed" in words  # wrapped over lines
     assert "Take more photos with more overlap there" in words
     assert max(len(line) for line in layout.texts.splitlines()) <= 60
     warnings = len(report_of(json.dumps(figures_of_report(full_report()))).warnings)
     assert warnings > _MAX_WARNINGS
     assert f"and {warnings - _MAX_WARNINGS} more in the report" in words
+
+
+def test_the_reason_for_the_processor_is_shown(tmp_path: Path) -> None:
+    report = {**full_report(), "device": "cpu", "device_reason": "There is no GPU here."}
+    layout = show(tmp_path / "job", report)
+    assert rows(layout)["Device"] == "Processor"
+    assert "There is no GPU here." in layout.texts
+    text = report_of(json.dumps(figures_of_report(report))).as_text()
+    assert "Device: There is no GPU here." in text
+    assert "Device" not in rows(show(tmp_path / "older", {"wall_seconds": 83.2}))
 
 
 def test_a_report_without_warnings(tmp_path: Path) -> None:

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import pytest
 
 from gaussian_wrapping_addon.core.settings import JobSettings, declarations, declared
+from gaussian_wrapping_addon.ops.worker import preferred_worker
 from gaussian_wrapping_addon.ui import preferences
 from gaussian_wrapping_addon.ui.meshing import mesh_panel, texture_panel
 from gaussian_wrapping_addon.ui.training import train_advanced_panel, train_panel
@@ -17,7 +19,7 @@ from tests.fake_setting import GROUPS, copy_with_fake_setting, said_by
 
 # As in 0.1.0: .blend files hold the names of the properties and the indices of the entries.
 STORED = {
-    "preset": ["DRAFT", "STANDARD", "FINE", "PAPER"],
+    "preset": ["DRAFT", "STANDARD", "FINE", "PAPER", "LARGE"],
     "resolution": ["AUTOMATIC", "EDGE_LENGTH", "POINTS"],
     "edge_length": None,
     "points": None,
@@ -125,6 +127,26 @@ def test_full_size_is_chosen_with_the_other_parts_of_the_model() -> None:
     ]  # fmt: skip
     assert property_at("training.full_size").default == "AUTO"
     assert declared("training.full_size").from_panel("AUTO") == "auto"
+
+
+@pytest.mark.usefixtures("addon")
+def test_the_device_is_the_machines_and_shown_with_the_training(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    entry = declared("device")
+    assert entry.property_owner == "preferences"
+    assert [entry.from_panel(word) for word in ("AUTO", "CPU", "CUDA")] == ["auto", "cpu", "cuda"]
+    panel = train_advanced_panel.GWRAP_PT_train_advanced
+    assert "device" not in {field.name for field in draw(panel).fields}, "not as an add-on"
+    mine = SimpleNamespace(
+        bl_rna=SimpleNamespace(properties={"device"}), device="CUDA", threads=3,
+        worker_python="", keep_running=False,
+    )  # fmt: skip
+    for module in (train_advanced_panel, preferred_worker):
+        monkeypatch.setattr(module, "addon_preferences", lambda _context: mine)
+    assert "device" in {field.name for field in draw(panel).fields}
+    choice = preferred_worker.worker_choice(bpy.context)
+    assert (choice.device, choice.threads) == ("cuda", 3)
 
 
 @pytest.mark.parametrize("group", GROUPS)

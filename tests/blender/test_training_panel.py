@@ -72,6 +72,8 @@ def test_untouched_choices_are_the_preset() -> None:
     for name in ("draft", "standard", "fine"):
         bpy.context.scene.gwrap.preset = name.upper()
         assert panel_settings.job_settings(bpy.context.scene, 3) == preset(name, threads=3)
+        on_gpu = panel_settings.job_settings(bpy.context.scene, 3, "cuda")
+        assert on_gpu == preset(name, threads=3, device="cuda")
     for name in MODEL_SELECTION:
         assert choices_of(name) == set(SELECTION_MODES)
     assert choices_of("mask_mode") == set(MASK_MODES)

@@ -139,6 +139,10 @@ def test_the_dialog_shows_the_commands(
     assert "gwrap.copy_setup_commands" in layout.operators
     choices = [item[0] for item in worker_setup_operators._torch_items(None, None)]
     assert choices == (["cpu", "cuda", "index"] if cuda else ["cpu", "index"])
+    assert "on the GPU" not in text
+    fake.layout, fake.torch = FakeLayout(), "cuda"
+    worker_setup_operators.GWRAP_OT_set_up_worker.draw(fake, bpy.context)
+    assert "Training and vacancy on the GPU, for several GiB more" in fake.layout.texts
 
 
 def test_a_set_up_from_start_to_end_in_blender(

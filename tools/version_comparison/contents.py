@@ -62,7 +62,7 @@ LEFT_OUT_ENTRIES = (
     LeftOut(r"^machine\.", "the machine"),
     LeftOut(r"^made_with\.code$", "fingerprint of the source code"),
     LeftOut(r"(^|\.)estimate\.speed$", "speed of the machine"),
-    LeftOut(r"(^|\.)(evidence|note|lpips_note|unwrap_fallback_reason)$", "wording"),
+    LeftOut(r"(^|\.)(evidence|note|lpips_note|unwrap_fallback_reason|device_reason)$", "wording"),
     LeftOut(
         r"(^|\.)(warnings|notes)\[\d+\](\.(stage|code|text|hint|next_step))?$",
         "wording; texts in 0.1.0, codes with text and hint since",

@@ -90,4 +90,6 @@ def region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
     values |= given
     if options.threads is not None:
         values["threads"] = options.threads
+    if options.device is not None:
+        values["device"] = options.device
     return with_values(settings, values)

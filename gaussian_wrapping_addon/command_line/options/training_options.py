@@ -13,7 +13,7 @@ _SELECTION_VALUES = {"auto": "auto", "all": "on", "none": "off"}
 
 
 def add_training_options(parser: ArgumentParser) -> None:
-    """Add preset, seed, threads and all options of the training."""
+    """Add preset, seed, threads, device and all options of the training."""
     add_options(parser, "training")
     names = ", ".join(option_of(f"training.{name}") for name in MODEL_SELECTION)
     parser.add_argument(

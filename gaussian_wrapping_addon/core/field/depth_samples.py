@@ -19,6 +19,7 @@ from ..gaussians.model import OrientedGaussians
 from ..progress import Progress
 from ..render.projection.projection import RawArrays
 from ..render.types.options import RenderOptions
+from ..render.types.renderer import Renderer
 from ..render.view_renderer import ViewRenderer
 
 MAX_DEPTH_SAMPLES = 120_000
@@ -66,6 +67,7 @@ def sample_depth_maps(
     most: int = MAX_DEPTH_SAMPLES,
     near_z: float = tolerances.NEAR_Z,
     threads: int = 0,
+    renderer: Renderer | None = None,
 ) -> DepthSamples:
     """Sample the cameras' depth maps inside a volume, thinned evenly.
 
@@ -80,8 +82,10 @@ def sample_depth_maps(
     most : int
         Largest number of samples. One is kept per cell and octant of viewing directions, with cells
         as small as this number allows, but not smaller than a pixel.
+    renderer : Renderer, optional
+        By default that of the processor, which ``threads`` is for.
     """
-    renderer, raw = ViewRenderer(), RawArrays.from_gaussians(gaussians)
+    renderer, raw = renderer or ViewRenderer(), RawArrays.from_gaussians(gaussians)
     options = RenderOptions(depth=True, sh_degree=0, near_z=near_z, threads=threads)
     found, waiting = [], 0
     for index, camera in enumerate(cameras):

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from ..devices import reject_absent_gpu
 from ..errors import (
     EXIT_CANCELLED,
     EXIT_OTHER,
@@ -134,7 +135,13 @@ class JobClient:
             Interpreter that has torch; ``None`` asks :func:`worker_python`.
         keep_running : bool
             Whether the worker continues when this process ends.
+
+        Raises
+        ------
+        DeviceError
+            The job names a GPU that the driver does not find; nothing was written.
         """
+        _reject_absent_device(job)
         target = JobFolder(real_path(folder))
         source = Path(job.source)
         if source.is_dir() and target.root.is_relative_to(source):
@@ -152,18 +159,41 @@ class JobClient:
 
     @classmethod
     def resume(
-        cls, folder: Path, *, python: str | None = None, keep_running: bool = False
+        cls,
+        folder: Path,
+        *,
+        python: str | None = None,
+        keep_running: bool = False,
+        device: str | None = None,
     ) -> JobClient:
-        """Start a worker for the job in ``folder``; finished stages are re-used."""
+        """Start a worker for the job in ``folder``; finished stages are re-used.
+
+        Parameters
+        ----------
+        device : str or None
+            Replaces the job's setting; ``None`` keeps it.
+
+        Raises
+        ------
+        DeviceError
+            As for :meth:`start`.
+        """
         target = JobFolder(real_path(folder))
         if not target.is_job():
             raise UsageError(
                 f"{folder} holds no job.", "Choose the folder given as --out, or press Find Job."
             )
         target.check_entries()
-        read_job(target.job_path)  # refused here rather than by the worker
+        stored = read_job(target.job_path)  # refused here rather than by the worker
+        job = stored
+        if device is not None:
+            job = replace(stored, settings=replace(stored.settings, device=device).validated())
+        _reject_absent_device(job)
         if target.locked():
             raise UsageError(f"A job is running in {folder}.", RUNNING_HINT)
+        if job != stored:
+            with _writing(target.root):
+                write_job(target.job_path, job)
         return cls._launch(target, python, keep_running)
 
     @classmethod
@@ -329,6 +359,11 @@ class JobClient:
             raise WorkerError("This job was started by another process.", "Poll it instead.")
         self._process.wait(timeout_s)
         return self.poll()
+
+
+def _reject_absent_device(job: JobFile) -> None:
+    if job.command != "bake":  # nothing of a bake runs on a GPU
+        reject_absent_gpu(job.settings.device)
 
 
 def _signal_group(pid: int, number: int) -> None:

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..devices import DeviceChoice, choose_device
 from ..kernels.parallel import default_threads
 from ..machine import describe_machine
 from ..names import region_names
@@ -23,6 +25,8 @@ from .stages.training_stage import run_training
 from .store.job_file import JobFile, reject_region_conflicts
 from .store.job_folder import JobFolder
 from .store.stage_folder import STAGE_VERSIONS, Stage
+
+_logger = logging.getLogger(__name__)
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 STAGE_SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
@@ -84,6 +88,7 @@ def run_job(
     overall = _JobProgress(sink, is_cancelled)
     begun_s = time.time()
     reject_region_conflicts(folder.result, job)
+    device = _device_of(job)  # refused before photos are read
     names = region_names(job.settings.regions, job.region_bodies)
 
     train_begin = STAGE_SHARES["cameras"]
@@ -99,8 +104,9 @@ def run_job(
         require_training(folder, job, cameras)
     progress = overall.stage("train", _Span(train_begin, begin))
     trained = run_training(
-        folder, job, cameras, progress, version=STAGE_VERSIONS["train"], threads=threads
-    )
+        folder, job, cameras, progress, version=STAGE_VERSIONS["train"], threads=threads,
+        device=device,
+    )  # fmt: skip
     if trained.reused:
         overall.skip_to(begin)
 
@@ -117,7 +123,9 @@ def run_job(
             STAGE_SHARES["mesh"] + STAGE_SHARES["texture"]
         )
         progress = overall.stage("mesh", _Span(start, cut))
-        meshed = run_mesh(folder, job, request, name, cameras, trained, progress, threads=threads)
+        meshed = run_mesh(
+            folder, job, request, name, cameras, trained, progress, threads=threads, device=device
+        )
         progress = overall.stage("texture", _Span(cut, start + share))
         textured = run_texture(
             folder, job, name, cameras, trained, meshed, progress, threads=threads
@@ -132,9 +140,25 @@ def run_job(
         "source": Path(job.source).name,
         "settings": to_json(job.settings),
         "machine": describe_machine(threads),
+        "device": device.device,
+        "device_reason": device.reason,
         "started_unix_s": round(begun_s, 1),
         "wall_seconds": round(time.time() - begun_s, 1),
         "peak_memory_bytes": peak_memory_bytes(),
     }
     export_results(folder, job, cameras, trained, regions, summary, progress)
     progress.update(1.0, "finished")
+
+
+def _device_of(job: JobFile) -> DeviceChoice:
+    """Choose the device of a job and log it with the reason.
+
+    Raises
+    ------
+    DeviceError
+        The job names a GPU that cannot be used.
+    """
+    # Nothing of a bake runs on a GPU: it goes on where the GPU of its training is missing.
+    chosen = choose_device("cpu" if job.command == "bake" else job.settings.device)
+    _logger.info("device: %s", chosen.sentence())
+    return chosen

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
-PRESETS = ("draft", "standard", "fine", "paper")
+PRESETS = ("draft", "standard", "fine", "paper", "large")
 SELECTION_MODES = ("auto", "on", "off")
 """Of an optional part of the model; ``"auto"`` selects it by evidence in the photos."""
 SWITCH = ("off", "on")
+
+DEVICE = r"auto|cpu|cuda(:[0-9]{1,3})?"
+"""Pattern of the devices that a job can be given."""
 
 MASK_MODES = ("ignore", "background", "auto")
 """``"auto"``: background where the masks were made of a turntable, else ignore."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 from ..errors import UsageError
 from ..export_formats import JOB_FORMATS
 from .checks import Choices, Condition, Range, Subset
-from .choices import MAX_MASK_GROW_PX, PRESETS, SWITCH, TURNTABLE_MODES
+from .choices import DEVICE, MAX_MASK_GROW_PX, PRESETS, SWITCH, TURNTABLE_MODES
 from .declaration import (
     Declaration,
     Item,
@@ -61,6 +62,11 @@ class JobSettings:
                     "The published settings: 30,000 iterations on whole photos, nothing decided "
                     "automatically; many hours to days on a processor",
                 ),
+                Item(
+                    "large",
+                    "Large",
+                    "For a GPU: large photos, many Gaussians and iterations; hours on a processor",
+                ),
             ),
             panel_name="train",
             expand=True,
@@ -84,6 +90,36 @@ class JobSettings:
             owner="preferences",
             panel_name="preferences",
         ),
+    )
+    device: str = setting(
+        "auto",
+        help="Where jobs compute what has a GPU path. auto: the first NVIDIA GPU where it can be "
+        "used, else the processor, with the reason in log and report; cuda or cuda:N (numbered "
+        "from 0): that GPU, or the job is refused. A job that was begun on one continues on the "
+        "other.",
+        check=Condition(
+            lambda value: re.fullmatch(DEVICE, value) is not None,
+            "auto, cpu, cuda or cuda:N with the number of a GPU",
+        ),
+        option=Option(
+            "--device",
+            "auto|cpu|cuda|cuda:N",
+            "where to compute; auto: an NVIDIA GPU where one can be used",
+            scope="training",
+        ),
+        panel=PanelProperty(
+            "Device",
+            "Where jobs compute what can run on a GPU",
+            items=(
+                Item("auto", "Auto", "An NVIDIA GPU where one can be used, else the processor"),
+                Item("cpu", "Processor", "Never a GPU"),
+                Item("cuda", "NVIDIA GPU", "The first GPU; jobs that cannot use it are refused"),
+            ),
+            owner="preferences",
+            panel_name="preferences",
+        ),
+        affects_result=False,
+        since="0.2.0",
     )
     regions: tuple[str, ...] = setting(
         ("auto",),
@@ -198,7 +234,7 @@ class JobSettings:
 
 
 def preset(name: str, **overrides: Any) -> JobSettings:
-    """Return the settings of ``"draft"``, ``"standard"``, ``"fine"`` or ``"paper"``.
+    """Return the settings of ``"draft"``, ``"standard"``, ``"fine"``, ``"paper"`` or ``"large"``.
 
     Raises
     ------

@@ -28,10 +28,18 @@ def _constant(
     *,
     unit: str = "",
     paper: Any = None,
+    large: Any = None,
     since: str = "",
 ) -> Any:
-    """Declare a constant of the method with its option and its published value, if another."""
-    presets = {} if paper is None else {"paper": paper}
+    """Declare a constant of the method with its option and values of presets, if others.
+
+    Parameters
+    ----------
+    paper, large : optional
+        The published value, and that of the preset for GPUs.
+    """
+    values = {"paper": paper, "large": large}
+    presets = {name: value for name, value in values.items() if value is not None}
     metavar = "" if isinstance(check, Choices) else "X"
     shown = Option(option, metavar, scope="constants")
     return setting(
@@ -50,6 +58,7 @@ class MethodSettings:
         Range(1000, 10**9),
         unit="pixels",
         paper=10**9,
+        large=10**9,
     )
     coarse_to_fine: str = _constant(
         "on",
@@ -285,7 +294,7 @@ class MethodSettings:
         help="Rounds in which clones of opposite orientation are added; 0 trains the orientation "
         "alone.",
         check=Range(0, 20),
-        presets={"draft": 2, "fine": 4, "paper": 5},
+        presets={"draft": 2, "fine": 4, "paper": 5, "large": 4},
         unit="rounds",
         option=Option("--wrap-rounds", "N", "rounds of clones; 0 trains the orientation alone"),
     )

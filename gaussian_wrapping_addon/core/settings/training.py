@@ -58,7 +58,7 @@ class TrainingSettings(MethodSettings):
         help="Training iterations.",
         check=_COUNT,
         unit="iterations",
-        presets={"draft": 800, "fine": 4000, "paper": 30_000},
+        presets={"draft": 800, "fine": 4000, "paper": 30_000, "large": 7000},
         option=Option("--iterations", "N", "training iterations instead of the preset's"),
         panel=PanelProperty(
             "Iterations",
@@ -78,7 +78,7 @@ class TrainingSettings(MethodSettings):
         help="Largest number of Gaussians.",
         check=Range(100, 20_000_000),
         unit="Gaussians",
-        presets={"draft": 40_000, "fine": 120_000, "paper": 6_000_000},
+        presets={"draft": 40_000, "fine": 120_000, "paper": 6_000_000, "large": 300_000},
         option=Option("--max-gaussians", "N", "cap of Gaussians instead of the preset's"),
         panel=PanelProperty(
             "Gaussians, Max",
@@ -92,7 +92,7 @@ class TrainingSettings(MethodSettings):
         help="Long side of the finest training image.",
         check=Range(32, 16384),
         unit="pixels",
-        presets={"draft": 480, "fine": 1024, "paper": 1600},
+        presets={"draft": 480, "fine": 1024, "paper": 1600, "large": 1600},
         option=Option("--max-image-px", "N", "training image size instead of the preset's"),
         panel=PanelProperty(
             "Photo Size, Max",
@@ -106,7 +106,7 @@ class TrainingSettings(MethodSettings):
         help="Highest degree of the spherical harmonics; `harmonics` selects how much of it is "
         "used.",
         check=Range(0, 3),
-        presets={"draft": 1, "fine": 3, "paper": 3},
+        presets={"draft": 1, "fine": 3, "paper": 3, "large": 3},
         option=Option("--sh-degree", "0..3", "highest degree of the spherical harmonics"),
     )
     holdout_every: int = setting(

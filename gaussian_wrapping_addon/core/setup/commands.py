@@ -24,6 +24,8 @@ from .pythons import FoundPython
 
 CPU = "cpu"
 CUDA = "cuda"
+CUDA_BRINGS = "Training and vacancy on the GPU, for several GiB more on the disk"
+"""What the build for CUDA is for, as told where it can be chosen."""
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
 

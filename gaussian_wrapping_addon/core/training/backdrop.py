@@ -21,6 +21,7 @@ from ..gaussians.initialisation import gaussians_at
 from ..gaussians.model import OrientedGaussians
 from ..render.projection.projection import RawArrays
 from ..render.types.options import RenderOptions
+from ..render.types.renderer import Renderer
 from ..render.view_renderer import ViewRenderer
 from .initialisation.far_shell import LEAST_REACH, onto_sphere
 from .live_view import divisor_for
@@ -53,6 +54,7 @@ def with_backdrop(
     gaussians: OrientedGaussians,
     photos: PhotoSource,
     views: Sequence[int],
+    renderer: Renderer | None = None,
     *,
     threads: int = 0,
     check: Callable[[], None] | None = None,
@@ -66,6 +68,8 @@ def with_backdrop(
     photos : PhotoSource
     views : sequence of int
         Training views.
+    renderer : Renderer, optional
+        Overwrites its last view; by default one on the processor.
     threads : int
     check : callable, optional
         Called before each view; an exception ends the work.
@@ -76,7 +80,7 @@ def with_backdrop(
     tree = cKDTree(directions)
     through, seen = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
     colors = np.zeros((DIRECTIONS, 3))
-    raw, renderer = RawArrays.from_gaussians(gaussians.detached()), ViewRenderer()
+    raw, renderer = RawArrays.from_gaussians(gaussians.detached()), renderer or ViewRenderer()
     options = RenderOptions(depth=False, threads=threads)
     for view in views:
         if check is not None:

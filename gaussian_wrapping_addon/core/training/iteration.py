@@ -7,35 +7,24 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ..dataset.camera import Camera
 from ..dataset.photo_source import PhotoSource
 from ..gaussians.model import OrientedGaussians
-from ..kernels.array_store import ArrayStore
-from ..render.projection.projection import RawArrays
-from ..render.types.gradients import ImageGradients, VisibleGradients
+from ..render.types.gradients import ImageGradients
 from ..render.types.options import RenderOptions
-from ..render.view_renderer import ViewPass, ViewRenderer
 from ..stereo.depth_priors import DepthPrior
-from .appearance.background import background_gradient, composited, draw_background
+from .appearance.background import draw_background
 from .appearance.photo_exposure import exposure_rate
-from .losses.depth_prior_loss import depth_prior_loss
-from .losses.footprint_regulariser import add_footprint_regulariser, footprint_shares
-from .losses.losses import color_loss, normal_losses
-from .losses.multi_view import (
-    MultiViewOptions,
-    add_image_gradients,
-    merge_gradients,
-    multi_view_losses,
-)
-from .losses.opacity_prior import add_opacity_prior
+from .devices.backend import Backend, Shown
+from .devices.windows import Window, windows
+from .losses.multi_view import MultiViewOptions, add_image_gradients
 from .poses.camera_poses import pose_rate_px
-from .poses.pose_gradient import pose_gradient
 from .schedule import Schedule
 from .state import TrainingState
-from .windows import Window, windows
 
 AVERAGE_SHARE = 0.05
 """Weight of the newest iteration in the moving averages of the progress message."""
@@ -72,8 +61,7 @@ class _Sample:
     window: Window
     number: int
     camera: Camera
-    photo: np.ndarray  # (h, w, 3) uint8
-    mask: np.ndarray | None  # (h, w) bool
+    shown: Shown
 
 
 class Stepper:
@@ -87,6 +75,8 @@ class Stepper:
         Training views.
     neighbours : dict of int to (k,) array
         For each training view, the views that the multi-view terms compare it with.
+    backend : Backend
+        Computes; the samples drawn do not depend on it.
     threads : int
     """
 
@@ -96,15 +86,20 @@ class Stepper:
         schedule: Schedule,
         views: Sequence[int],
         neighbours: dict[int, np.ndarray],
+        backend: Backend,
         threads: int,
     ) -> None:
         self.photos, self.schedule, self.views = photos, schedule, list(views)
         self.settings, self.threads = schedule.settings, threads
-        self.neighbours = neighbours
-        self.renderer, self.store = ViewRenderer(), ArrayStore()
+        self.neighbours, self.backend = neighbours, backend
         self.priors: dict[int, DepthPrior] = {}
         """Confirmed depths of views that training started on."""
         self.multi_view = MultiViewOptions.of_settings(schedule.settings)
+
+    @property
+    def renderer(self) -> Any:
+        """Renderer of whole views, in the memory that iterations use as well."""
+        return self.backend.renderer
 
     def step(self, state: TrainingState) -> None:
         """Run one iteration.
@@ -115,74 +110,66 @@ class Stepper:
             The loss is not finite; the state must be discarded.
         """
         iteration, schedule, adam = state.iteration, self.schedule, state.adam
+        backend = self.backend
         sample = self._draw_sample(state)
         oriented = is_oriented(schedule, state)
         gathers, uses_depth = schedule.gathers_statistics(iteration), schedule.uses_depth(iteration)
         options = RenderOptions(
             depth=uses_depth, sh_degree=state.degree, threads=self.threads, screen_gradients=gathers
         )
-        gaussians = RawArrays.from_gaussians(adam.gaussians())
-        image = self.renderer.render(gaussians, sample.camera, options)
+        image = backend.render(adam, sample.camera, options)
         value, gradients, mean_squared = self._compare_colors(state, sample, image)
-        other: VisibleGradients | None = None
+        other: Any = None
         if uses_depth:
-            normal_value, by_normals, _ = normal_losses(
-                image.depth,
-                image.geometric_normal,
-                image.normal,
-                image.alpha,
-                sample.camera,
-                sample.mask,
+            normal_value, by_normals = backend.normal_losses(
+                image, sample.camera, sample.shown,
                 lambda_depth_normal=self.settings.lambda_depth_normal,
                 lambda_normal=self.settings.lambda_normal if oriented else 0,
-                threads=self.threads,
-                store=self.store,
-            )
-            value += normal_value
+            )  # fmt: skip
+            value = value + normal_value
             gradients = add_image_gradients(by_normals, gradients)
             weight, prior = schedule.prior_weight(iteration), self.priors.get(sample.view)
             if weight > 0.0 and prior is not None:
-                prior_value, by_prior = depth_prior_loss(
-                    image.depth, sample.camera, prior, sample.mask, weight=weight,
-                    threads=self.threads, store=self.store,
-                )  # fmt: skip
-                value += prior_value
+                prior_value, by_prior = backend.prior_loss(
+                    image, sample.camera, prior, sample.shown, weight
+                )
+                value = value + prior_value
                 gradients = add_image_gradients(by_prior, gradients)
             if self._compares_views(state, sample):
-                shared = self._compare_views(state, sample, image, gaussians)
-                value += shared[0]
-                gradients, other = add_image_gradients(gradients, shared[1]), shared[2]
-        if not math.isfinite(value):
+                shared_value, by_views, other = self._compare_views(state, sample, image)
+                value = value + shared_value
+                gradients = add_image_gradients(gradients, by_views)
+        if isinstance(value, float) and not math.isfinite(value):
             raise NotFinite()
-        seen = image.backward(gradients)
+        seen = backend.backward(image, gradients)
         # Before merging the other view's gradients: culled Gaussians have no boxes in this view.
         price = self.settings.overlap_price if self.schedule.compact else 0.0
         opacity_weight = schedule.opacity_weight(iteration)
         if not state.model_selection.chose("dense_start"):
             opacity_weight = 0.0
-        if price > 0.0 or opacity_weight > 0.0:
-            size_px = (sample.camera.width, sample.camera.height)
-            shares = footprint_shares(image.screen.boxes[seen.ids], size_px)
-            if price > 0.0:
-                add_footprint_regulariser(seen, adam.array("log_scales"), shares, price)
-            if opacity_weight > 0.0:
-                add_opacity_prior(seen, adam.array("opacity_logits"), shares, opacity_weight)
+        backend.add_priors(image, seen, adam, price, opacity_weight)
+        by_pose = None
         if state.poses is not None and schedule.refines_poses(iteration):
-            self._step_pose(state, sample, seen)
+            by_pose = backend.pose_gradient(sample.camera, seen, adam)
         if other is not None:
-            seen = merge_gradients(seen, other, len(adam), threads=self.threads, store=self.store)
+            seen = backend.merged(seen, other, len(adam))
         if gathers:
-            assert image.statistics is not None
             part = (
                 sample.camera.width
                 * sample.camera.height
                 / (sample.whole.width * sample.whole.height)
             )
-            state.statistics.add(image.statistics, sample.whole.width, sample.whole.height, part)
+            whole = sample.whole
+            backend.add_statistics(state.statistics, image, whole.width, whole.height, part)
         rates = schedule.rates(iteration, state.rate_factor)
         if not oriented:
             rates.pop("orientation", None)
-        adam.step_rows(seen, rates, sh_degree=state.degree, threads=self.threads)
+        backend.step(adam, seen, rates, state.degree)
+        found = backend.numbers(value, mean_squared, *([] if by_pose is None else [by_pose]))
+        if not math.isfinite(found[0]):
+            raise NotFinite()
+        if by_pose is not None:
+            self._step_pose(state, sample, found[2])
         if state.exposure is not None:
             rate = exposure_rate(iteration, self.settings.iterations, len(self.views))
             state.exposure.step(sample.view, state.rate_factor * rate)
@@ -190,19 +177,16 @@ class Stepper:
         if self._is_empty(sample):
             return  # no pixel was compared, so there is no error to record
         window_id = sample.view * _MAX_WINDOWS + sample.number
-        state.error_history.add(iteration, window_id, len(adam), mean_squared, sample.divisor)
+        error = float(found[1])
+        state.error_history.add(iteration, window_id, len(adam), error, sample.divisor)
         share = AVERAGE_SHARE if state.error_average > 0.0 else 1.0
-        state.error_average += share * (mean_squared - state.error_average)
-        state.loss_average += share * (value - state.loss_average)
+        state.error_average += share * (error - state.error_average)
+        state.loss_average += share * (float(found[0]) - state.loss_average)
 
-    def _step_pose(
-        self, state: TrainingState, sample: _Sample, gradients: VisibleGradients
-    ) -> None:
+    def _step_pose(self, state: TrainingState, sample: _Sample, by_pose: np.ndarray) -> None:
         """Move the photo's camera; at the end of an epoch take out what all cameras share."""
-        adam, poses = state.adam, state.poses
+        poses = state.poses
         assert poses is not None
-        pose = np.asarray(sample.camera.cam_from_world, np.float64)
-        by_pose = pose_gradient(pose, gradients, adam.array("means"), adam.array("quats"))
         rate_px = pose_rate_px(state.iteration, self.settings.iterations, len(self.views))
         whole = self.photos.camera(sample.view, 1)
         poses.step(sample.view, whole, by_pose, state.rate_factor * rate_px)
@@ -220,52 +204,27 @@ class Stepper:
             numbers = np.flatnonzero(shown) if shown.any() else numbers
         number = int(numbers[int(state.random.integers(len(numbers)))])
         window = choices[number]
-        return _Sample(
-            view,
-            divisor,
-            whole,
-            window,
-            number,
-            window.camera(whole),
-            window.of(self.photos.photo(view, divisor)),
-            None if mask is None else window.of(mask),
-        )
+        part = None if len(choices) == 1 else window
+        seen = self.backend.shown(self.photos, view, divisor, part)
+        return _Sample(view, divisor, whole, window, number, window.camera(whole), seen)
 
     def _is_empty(self, sample: _Sample) -> bool:
         """Return whether the mask leaves no pixel to compare."""
-        ignores = self.settings.mask_mode == "ignore"
-        return ignores and sample.mask is not None and not sample.mask.any()
+        return self.settings.mask_mode == "ignore" and sample.shown.pixels == 0
 
     def _compare_colors(
-        self, state: TrainingState, sample: _Sample, image: ViewPass
-    ) -> tuple[float, ImageGradients, float]:
+        self, state: TrainingState, sample: _Sample, image: Any
+    ) -> tuple[Any, ImageGradients, Any]:
         """Return the colour loss, its gradients on colour and alpha, and the mean squared error."""
         empty = self.settings.mask_mode == "background"
-        alpha = image.alpha if empty else None
-        color, exposure = image.color, state.exposure
-        if exposure is not None:
-            color = exposure.corrected(sample.view, image.color, alpha, threads=self.threads)
-        photo, mask = sample.photo, sample.mask
-        background = draw_background(state.random) if empty else None
-        if background is not None:
-            color, photo = composited(color, image.alpha, photo, mask, background, store=self.store)
-            mask = None
-        value, by_color, figures = color_loss(
-            color,
-            photo,
-            mask,
-            lambda_dssim=self.settings.lambda_dssim,
-            threads=self.threads,
-            store=self.store,
+        return self.backend.compare_colors(
+            image,
+            sample.shown,
+            self.settings.lambda_dssim,
+            exposure=None if state.exposure is None else (state.exposure, sample.view),
+            background=draw_background(state.random) if empty else None,
+            over_emptiness=empty,
         )
-        by_alpha = None if background is None else background_gradient(by_color, background)
-        if exposure is not None:
-            by_color, more = exposure.backward(
-                sample.view, image.color, by_color, alpha, threads=self.threads
-            )
-            if by_alpha is not None and more is not None:
-                by_alpha += more
-        return value, ImageGradients(color=by_color, alpha=by_alpha), figures.mean_squared
 
     def _compares_views(self, state: TrainingState, sample: _Sample) -> bool:
         if not state.model_selection.chose("multi_view") or len(self.neighbours[sample.view]) == 0:
@@ -273,25 +232,20 @@ class Stepper:
         return self.schedule.compares_views(state.iteration)
 
     def _compare_views(
-        self, state: TrainingState, sample: _Sample, image: ViewPass, gaussians: RawArrays
-    ) -> tuple[float, ImageGradients, VisibleGradients | None]:
+        self, state: TrainingState, sample: _Sample, image: Any
+    ) -> tuple[Any, ImageGradients, Any]:
         choices = self.neighbours[sample.view]
         other = int(choices[int(state.random.integers(len(choices)))])
-        found = multi_view_losses(
+        return self.backend.compare_views(
             image,
-            gaussians,
+            state.adam,
             sample.camera,
-            sample.photo,
-            sample.mask,
+            sample.shown,
             self.photos.camera(other, sample.divisor),
-            self.photos.photo(other, sample.divisor),
-            self.photos.mask(other, sample.divisor),
+            self.backend.shown(self.photos, other, sample.divisor, None),
             self.multi_view,
             state.random,
-            threads=self.threads,
-            store=self.store,
         )
-        return found.value, found.gradients, found.other
 
 
 def trimmed(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:

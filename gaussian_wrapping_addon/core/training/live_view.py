@@ -24,6 +24,7 @@ from ..imaging.view_metrics import psnr, score_images
 from ..progress import Progress
 from ..render.projection.projection import RawArrays
 from ..render.types.options import RenderOptions
+from ..render.types.renderer import Renderer
 from ..render.view_renderer import ViewRenderer
 from ..settings import TrainingSettings
 from .result import HeldOutMetrics
@@ -64,7 +65,7 @@ def measure_held_out(
     held_out: Sequence[int],
     *,
     threads: int,
-    renderer: ViewRenderer | None = None,
+    renderer: Renderer | None = None,
     exposure_correction: Correction | None = None,
     check: Callable[[], None] | None = None,
 ) -> float:
@@ -81,7 +82,7 @@ def measure_held_out(
         Held-out views; :data:`MEASURED_VIEWS` of them, evenly spread, are measured.
     threads : int
         The result does not depend on it.
-    renderer : ViewRenderer, optional
+    renderer : Renderer, optional
         Renderer to reuse; not one whose last view still awaits its backward pass.
     exposure_correction : callable, optional
         Applied to each render before it is measured
@@ -110,7 +111,7 @@ def measure_held_out(
 
 
 def _rendered(
-    renderer: ViewRenderer,
+    renderer: Renderer,
     raw: RawArrays,
     photos: PhotoSource,
     view: int,
@@ -139,6 +140,8 @@ class LiveView:
     settings : TrainingSettings
         ``preview_every_s`` is the time between two updates; 0 disables them.
     threads : int
+    renderer : Renderer, optional
+        By default one on the processor.
     clock : callable
         Seconds; the first update comes ``preview_every_s`` after the start.
     """
@@ -151,12 +154,17 @@ class LiveView:
         settings: TrainingSettings,
         threads: int,
         clock: Callable[[], float] = time.monotonic,
+        renderer: Renderer | None = None,
     ) -> None:
         self._photos, self._held_out, self._folder = photos, list(held_out), folder
         self._every_s, self._threads, self._clock = settings.preview_every_s, threads, clock
-        self._renderer = ViewRenderer()
+        self.renderer = renderer or ViewRenderer()
         self._updated_s = clock()
         self._shown_view = self._held_out[len(self._held_out) // 2] if self._held_out else 0
+
+    def is_due(self) -> bool:
+        """Tell whether :meth:`update` would write anything now."""
+        return self._every_s > 0 and self._clock() - self._updated_s >= self._every_s
 
     def update(
         self,
@@ -174,9 +182,7 @@ class LiveView:
             ``held_out_psnr`` (dB) and ``held_out_iteration`` for the progress figures, empty
             without held-out photos; ``None`` if no update is due.
         """
-        if self._every_s <= 0:
-            return None
-        if not force and self._clock() - self._updated_s < self._every_s:
+        if self._every_s <= 0 or not (force or self.is_due()):
             return None
         figures = {}
         quality = measure_held_out(
@@ -184,7 +190,7 @@ class LiveView:
             self._photos,
             self._held_out,
             threads=self._threads,
-            renderer=self._renderer,
+            renderer=self.renderer,
             exposure_correction=exposure_correction,
         )
         if np.isfinite(quality):
@@ -198,7 +204,7 @@ class LiveView:
         divisor = divisor_for(self._photos, self._shown_view, (PREVIEW_PX - GAP_PX) // 2)
         raw = RawArrays.from_gaussians(gaussians)
         image = _rendered(
-            self._renderer, raw, self._photos, self._shown_view, divisor, self._threads, correction
+            self.renderer, raw, self._photos, self._shown_view, divisor, self._threads, correction
         )
         picture = side_by_side(self._photos.photo(self._shown_view, divisor), image)
         try:
@@ -240,6 +246,7 @@ def held_out_metrics(
     progress: Progress,
     *,
     threads: int,
+    renderer: Renderer | None = None,
     exposure_correction: Correction | None = None,
 ) -> tuple[list[HeldOutMetrics], str]:
     """Return the metrics of held-out photos, and the reason if they have no LPIPS.
@@ -254,7 +261,7 @@ def held_out_metrics(
     """
     figures = []
     lpips, reason = lpips_if_ready() if names else (None, "")
-    raw, renderer = RawArrays.from_gaussians(gaussians), ViewRenderer()
+    raw, renderer = RawArrays.from_gaussians(gaussians), renderer or ViewRenderer()
     for view, name in names.items():
         progress.update(1.0, f"measuring {name}")
         mask = photos.mask(view, 1)

@@ -53,6 +53,8 @@ class TrainingResult:
     """Whether held-out photos were measured after an exposure fitted crosswise on their halves."""
     poses: np.ndarray | None = None
     """(views, 3, 4) refined ``cam_from_world`` of all views, or ``None`` where those given hold."""
+    device: str = "cpu"
+    """Where the last iterations ran: not the device asked for if that failed."""
 
     @property
     def held_out_psnr(self) -> float:

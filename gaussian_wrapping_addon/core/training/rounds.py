@@ -81,6 +81,7 @@ class Rounds:
             start_orientation(
                 state.adam,
                 self._views(VOTE_DIVISOR),
+                self.stepper.renderer,
                 first_sign=self.settings.first_sign,
                 threads=self.threads,
             )
@@ -192,7 +193,9 @@ class Rounds:
 
     def _normal_errors(self, state: TrainingState) -> np.ndarray:
         views = self._views(self.settings.wrap_divisor)
-        return normal_errors(state.adam.gaussians(), views, threads=self.threads)
+        return normal_errors(
+            state.adam.gaussians(), views, self.stepper.renderer, threads=self.threads
+        )
 
     def _decide_wrapping(self, state: TrainingState) -> None:
         """Decide about wrapping from the photos; if off, undo what was begun to decide it."""
@@ -229,6 +232,7 @@ class Rounds:
             [self._trial_view(state, view) for view in cancellable(self.views, self.progress)],
             [self._trial_view(state, view) for view in cancellable(self.held_out, self.progress)],
             degree,
+            self.stepper.renderer,
             threads=self.threads,
             check=self.progress.check,
         )

@@ -22,6 +22,15 @@ _MOMENTS = ("first", "second")
 _STATISTICS = ("gradient", "gradient_abs", "views")
 
 
+@dataclass(frozen=True)
+class Snapshot:
+    """A copy of a state to go back to, of which the large part stays where the training runs."""
+
+    adam: Adam
+    arrays: dict[str, np.ndarray]
+    values: dict[str, Any]
+
+
 @dataclass
 class TrainingState:
     """Parameters, moments, statistics, random generator and view order of a run."""
@@ -71,17 +80,31 @@ class TrainingState:
 
     def clear_statistics(self) -> None:
         """Reset the statistics, as after a change in the number of Gaussians."""
-        self.statistics = DensityStatistics.zeros(len(self.adam))
+        self.statistics = self.statistics.cleared(len(self.adam))
+
+    def snapshot(self) -> Snapshot:
+        """Return a copy of everything that the next iteration depends on."""
+        return Snapshot(self.adam.copy(), self._other_arrays(), self.to_json())
+
+    @classmethod
+    def of_snapshot(cls, snapshot: Snapshot) -> TrainingState:
+        """Return the state of a snapshot, which can be used again."""
+        return cls._of(snapshot.adam.copy(), snapshot.arrays, snapshot.values)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of all arrays, by name."""
-        adam, arrays = self.adam, {}
+        adam, arrays = self.adam.on_host(), {}
         for name in adam.values:
             arrays[f"value.{name}"] = adam.array(name).copy()
         for name in TRAINED:
             for kind, moment in zip(_MOMENTS, adam.moments(name), strict=True):
                 arrays[f"{kind}.{name}"] = moment.copy()
         arrays["steps"] = adam.steps.copy()
+        return arrays | self._other_arrays()
+
+    def _other_arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of the arrays that are not the optimiser's."""
+        arrays = {}
         for name in _STATISTICS:
             arrays[f"statistics.{name}"] = getattr(self.statistics, name).copy()
         if self.exposure is not None:
@@ -122,19 +145,26 @@ class TrainingState:
             if name.startswith("value.")
         }
         count = len(arrays["steps"])
-        state = cls.start(OrientedGaussians(**tensors), 0)
-        adam = state.adam
+        adam = Adam(OrientedGaussians(**tensors))
         for name in adam.values:
             _require(adam.array(name), arrays[f"value.{name}"], count)
         for name in TRAINED:
             for kind, moment in zip(_MOMENTS, adam.moments(name), strict=True):
                 moment[...] = _require(moment, arrays[f"{kind}.{name}"], count)
         adam.steps = _require(adam.steps, arrays["steps"], count).copy()
+        return cls._of(adam, arrays, values)
+
+    @classmethod
+    def _of(
+        cls, adam: Adam, arrays: dict[str, np.ndarray], values: dict[str, Any]
+    ) -> TrainingState:
+        """Return the state of an optimiser, other arrays, which are copied, and JSON values."""
+        count = len(adam)
+        statistics = DensityStatistics.zeros(count)
         for name in _STATISTICS:
-            old = getattr(state.statistics, name)
-            setattr(
-                state.statistics, name, _require(old, arrays[f"statistics.{name}"], count).copy()
-            )
+            old = getattr(statistics, name)
+            setattr(statistics, name, _require(old, arrays[f"statistics.{name}"], count).copy())
+        state = cls(adam, statistics, np.random.Generator(np.random.PCG64()))
         generator = np.random.PCG64()
         generator.state = values["random"]
         state.random = np.random.Generator(generator)

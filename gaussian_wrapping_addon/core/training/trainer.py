@@ -15,6 +15,7 @@ import torch
 from ..dataset.photo_source import PhotoSource
 from ..dataset.scene import Scene
 from ..dataset.view_split import FEW_PHOTOS, evenly_spaced, held_out_views, training_views
+from ..devices.failures import is_device_failure, is_memory_failure
 from ..errors import Cancelled, DatasetError, WrapError
 from ..gaussians.initialisation import initial_gaussians
 from ..gaussians.model import OrientedGaussians
@@ -29,6 +30,8 @@ from .appearance.photo_exposure import Exposure, corrected_for_measuring
 from .backdrop import with_backdrop
 from .cancellation import CancellablePhotos
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
+from .devices.backend import Backend
+from .devices.cpu_backend import CpuBackend
 from .initialisation.dense_start import dense_start, matched_photos, on_planes
 from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
@@ -42,7 +45,7 @@ from .selection.exposure_selection import select_exposure
 from .selection.image_size_selection import photo_detail, select_image_size
 from .selection.model_selection import Decision, ModelSelection, decide, select_multi_view
 from .selection.pose_selection import start_poses
-from .state import TrainingState
+from .state import Snapshot, TrainingState
 
 _logger = logging.getLogger(__name__)
 
@@ -72,6 +75,7 @@ def train(
     threads: int = 0,
     start_splat: Path | None = None,
     inside: Inside | None = None,
+    backend: Backend | None = None,
 ) -> TrainingResult:
     """Train oriented Gaussians on the photos of a scene.
 
@@ -97,6 +101,9 @@ def train(
         and does not densify (:func:`~.initialisation.splat_start.wrapping_settings`).
     inside : callable, optional
         Tells for points (n, 3), scene frame, where ``settings.region_weight`` applies.
+    backend : Backend, optional
+        Where to train; by default on the processor. A checkpoint goes on on any. One that fails
+        (memory, driver) is replaced by the processor, with a warning in the result.
 
     Returns
     -------
@@ -119,7 +126,7 @@ def train(
     torch.set_num_threads(threads)
     try:
         run = _Trainer(
-            scene, photos, settings, folder, seed, threads, start_splat, inside, progress
+            scene, photos, settings, folder, seed, threads, start_splat, inside, progress, backend
         )  # fmt: skip
         return run.run(progress)
     finally:
@@ -140,6 +147,7 @@ class _Trainer:
         start_splat: Path | None = None,
         inside: Inside | None = None,
         progress: Progress | None = None,
+        backend: Backend | None = None,
     ) -> None:
         if start_splat is not None:
             settings = wrapping_settings(settings)
@@ -161,9 +169,14 @@ class _Trainer:
         self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
         self.image_decision, finest = self._image_size(side_px)
         self.schedule = Schedule(settings, side_px, finest, start_splat is not None)
-        self.stepper = Stepper(self.posed, self.schedule, self.views, self.neighbours, threads)
+        self.stepper = Stepper(
+            self.posed, self.schedule, self.views, self.neighbours,
+            backend or CpuBackend(threads), threads,
+        )  # fmt: skip
         self.live_figures: dict[str, float] = {}
-        self.live = LiveView(self.posed, self.held_out, folder, settings, threads)
+        self.live = LiveView(
+            self.posed, self.held_out, folder, settings, threads, renderer=self.stepper.renderer
+        )
 
     def _image_size(self, side_px: int) -> tuple[Decision, int]:
         """Decide whether to train at full or half size."""
@@ -191,64 +204,88 @@ class _Trainer:
         else:
             _logger.info("resuming at iteration %d", state.iteration)
             self.stepper.priors = self._saved_priors(state, key, progress)
-        self.posed.poses = state.poses
+        snapshot = self._begun(state)
         begun_s = saved_s = time.monotonic()
         spent_s, begun_at = state.seconds, state.iteration
-        snapshot = (state.to_arrays(), state.to_json())
         total, consistent = self.schedule.total, True
         try:
             while state.iteration < total:
                 progress.check()
                 try:
-                    rounds.before_step(state)
-                    consistent = False
-                    self.stepper.step(state)
-                    rounds.after_step(state)
-                    self._record(state, progress)
-                    consistent = True
-                    if state.iteration % SNAPSHOT_EVERY == 0 or state.iteration == total:
-                        if not state.adam.is_finite():
-                            raise NotFinite()
-                        snapshot = (state.to_arrays(), state.to_json())
-                except NotFinite:
-                    state, consistent = self._restart(state, snapshot), True
-                    continue
-                now_s = time.monotonic()
-                state.seconds = spent_s + now_s - begun_s
-                if state.iteration % REPORT_EVERY == 0 or state.iteration == total:
-                    speed = (state.iteration - begun_at) / max(now_s - begun_s, 1e-9)
-                    self._report(state, progress, speed)
-                if now_s - saved_s >= self.settings.checkpoint_every_s:
-                    if not state.adam.is_finite():
+                    try:
+                        rounds.before_step(state)
+                        consistent = False
+                        self.stepper.step(state)
+                        rounds.after_step(state)
+                        self._record(state, progress)
+                        consistent = True
+                        if state.iteration % SNAPSHOT_EVERY == 0 or state.iteration == total:
+                            if not state.adam.is_finite():
+                                raise NotFinite()
+                            snapshot = state.snapshot()
+                        now_s = time.monotonic()
+                        state.seconds = spent_s + now_s - begun_s
+                        if state.iteration % REPORT_EVERY == 0 or state.iteration == total:
+                            speed = (state.iteration - begun_at) / max(now_s - begun_s, 1e-9)
+                            self._report(state, progress, speed)
+                        if now_s - saved_s >= self.settings.checkpoint_every_s:
+                            if not state.adam.is_finite():
+                                raise NotFinite()
+                            save_checkpoint(self.folder, state, key)
+                            saved_s = time.monotonic()
+                    except NotFinite:
                         state = self._restart(state, snapshot)
-                        continue
-                    save_checkpoint(self.folder, state, key)
-                    saved_s = time.monotonic()
+                        snapshot, consistent = self._begun(state), True
+                except (WrapError, RuntimeError) as error:
+                    if not self._is_device_failure(error):
+                        raise
+                    state = self._without_device(error, snapshot, rounds, key, progress)
+                    snapshot, consistent = self._begun(state), True
         except Cancelled:
             # Save a consistent state, not one of a half-finished round or with non-finite values.
-            if not (consistent and state.adam.is_finite()):
-                state = TrainingState.restore(*snapshot)
-            save_checkpoint(self.folder, state, key)
+            try:
+                if not (consistent and state.adam.is_finite()):
+                    state = TrainingState.of_snapshot(snapshot)
+                save_checkpoint(self.folder, state, key)
+            except (WrapError, RuntimeError) as lost:
+                if not self._is_device_failure(lost):
+                    raise
+                _logger.warning("%s failed: the last checkpoint stands", self.stepper.backend.name)
             raise
         save_checkpoint(self.folder, state, key)
+        while True:
+            try:
+                return self._result(rounds, state, spent_s + time.monotonic() - begun_s, progress)
+            except (WrapError, RuntimeError) as error:
+                if not self._is_device_failure(error):
+                    raise
+                # Both the snapshot and the checkpoint are of the last iteration.
+                state = self._without_device(error, snapshot, rounds, key, progress)
+
+    def _result(
+        self, rounds: Rounds, state: TrainingState, seconds: float, progress: Progress
+    ) -> TrainingResult:
+        """Finish the Gaussians and measure the held-out photos."""
         gaussians = self._finished(rounds, state, progress)
         self.live.update(gaussians, state.iteration, self._correction(state), force=True)
         names = {view: self.scene.views[view].camera.name for view in self.held_out}
         held_out, lpips_note = held_out_metrics(
             gaussians, self.photos, names, progress,
-            threads=self.threads, exposure_correction=self._correction(state),
+            threads=self.threads, renderer=self.stepper.renderer,
+            exposure_correction=self._correction(state),
         )  # fmt: skip
         return TrainingResult(
             gaussians,
-            total,
+            self.schedule.total,
             tuple(state.history),
             tuple(held_out),
-            spent_s + time.monotonic() - begun_s,
+            seconds,
             tuple(state.warnings),
             lpips_note,
             state.model_selection,
             state.exposure is not None,
             None if state.poses is None else state.poses.moved(),
+            self.stepper.backend.name,
         )
 
     def _start(self, rounds: Rounds, key: str, progress: Progress) -> TrainingState:
@@ -320,8 +357,9 @@ class _Trainer:
         if not state.model_selection.chose("dense_start"):
             return gaussians  # the large Gaussians of a sparse start reach beyond the photos
         return with_backdrop(
-            gaussians, self.photos, self.views, threads=self.threads, check=progress.check
-        )
+            gaussians, self.photos, self.views, self.stepper.renderer,
+            threads=self.threads, check=progress.check,
+        )  # fmt: skip
 
     def _start_scene(self) -> Scene:
         """Return the scene with the sparse points that masks do not show to be background."""
@@ -396,9 +434,78 @@ class _Trainer:
             model_selection = model_selection.with_decision(Decision.by_settings("growth", "off"))
         state.model_selection = model_selection
 
-    def _restart(
-        self, state: TrainingState, snapshot: tuple[dict[str, np.ndarray], dict[str, object]]
+    def _adopt(self, state: TrainingState) -> None:
+        """Bring a state to where the backend computes, and the photos to its poses."""
+        backend = self.stepper.backend
+        state.adam = backend.adopted(state.adam)
+        state.statistics = backend.adopted_statistics(state.statistics)
+        self.posed.poses = state.poses
+
+    def _begun(self, state: TrainingState) -> Snapshot:
+        """Adopt a state and return its snapshot; on the processor where the device fails at it."""
+        before = state.adam, state.statistics
+        try:
+            self._adopt(state)
+            return state.snapshot()
+        except (WrapError, RuntimeError) as error:
+            if not self._is_device_failure(error):
+                raise
+            name = self.stepper.backend.name
+            self._use_processor()
+            state.adam, state.statistics = before
+            self._adopt(state)
+            self._note_failure(state, name, error, "on the processor")
+            return state.snapshot()
+
+    def _is_device_failure(self, error: Exception) -> bool:
+        """Tell whether the device that trains failed, so that the training can do without it."""
+        return not isinstance(self.stepper.backend, CpuBackend) and is_device_failure(error)
+
+    def _use_processor(self) -> None:
+        self.stepper.backend = CpuBackend(self.threads)
+        self.live.renderer = self.stepper.renderer
+
+    def _without_device(
+        self, error: Exception, snapshot: Snapshot, rounds: Rounds, key: str, progress: Progress
     ) -> TrainingState:
+        """Go back to what a failing device has left: with less of its memory, or without it."""
+        backend = self.stepper.backend
+        smaller = is_memory_failure(error) and backend.use_less_memory()
+        if not smaller:
+            self._use_processor()
+        try:
+            state = TrainingState.of_snapshot(snapshot)
+            self._adopt(state)
+        except (WrapError, RuntimeError) as lost:
+            # A driver that was reset takes the snapshot along; or there is no room for its copy.
+            if not is_device_failure(lost):
+                raise
+            smaller = False
+            self._use_processor()
+            self.posed.poses = None  # as at the first start
+            found = load_checkpoint(self.folder, key)
+            state = self._start(rounds, key, progress) if found is None else found
+            self._adopt(state)
+        onward = "with less memory" if smaller else "on the processor"
+        self._note_failure(state, backend.name, error, onward)
+        return state
+
+    def _note_failure(
+        self, state: TrainingState, device: str, error: Exception, onward: str
+    ) -> None:
+        _logger.warning(
+            "%s failed (%s): going on %s from iteration %d", device, error, onward, state.iteration
+        )
+        state.warnings.append(
+            ReportWarning(
+                "device-failed",
+                f"{device} failed in the training ({error}); it went on {onward} from "
+                f"iteration {state.iteration}.",
+                "Close other programs that use the GPU, or choose fewer Gaussians.",
+            )
+        )
+
+    def _restart(self, state: TrainingState, snapshot: Snapshot) -> TrainingState:
         """Restore the last snapshot with lower rates and another view order, at most once."""
         if state.restarts > 0:
             raise WrapError(
@@ -407,9 +514,9 @@ class _Trainer:
                 "Check the camera poses; try fewer Gaussians or another seed.",
             )
         _logger.warning("non-finite values at iteration %d: going back", state.iteration)
-        restored = TrainingState.restore(snapshot[0], snapshot[1])
+        restored = TrainingState.of_snapshot(snapshot)
         restored.restarts = state.restarts + 1
-        self.posed.poses = restored.poses
+        self._adopt(restored)
         restored.rate_factor = state.rate_factor * RESTART_RATE
         restored.order = []
         restored.random = np.random.Generator(np.random.PCG64([self.seed, 3]))
@@ -434,7 +541,8 @@ class _Trainer:
         if (state.iteration % MEASURE_EVERY == 0 or last) and self.held_out:
             quality = measure_held_out(
                 state.adam.gaussians(), self.photos, self.held_out, threads=self.threads,
-                exposure_correction=self._correction(state), check=progress.check,
+                renderer=self.stepper.renderer, check=progress.check,
+                exposure_correction=self._correction(state),
             )  # fmt: skip
             if math.isfinite(quality):
                 figures["held_out_psnr"] = quality
@@ -454,11 +562,11 @@ class _Trainer:
     def _report(self, state: TrainingState, progress: Progress, speed: float) -> None:
         total, figures = self.schedule.total, self._figures(state)
         figures |= {"iterations": float(total), "iterations_per_s": speed}
-        live_figures = self.live.update(
-            state.adam.gaussians(), state.iteration, self._correction(state)
-        )
-        if live_figures is not None:
-            self.live_figures = live_figures
+        if self.live.is_due():
+            live_figures = self.live.update(
+                state.adam.gaussians(), state.iteration, self._correction(state)
+            )
+            self.live_figures = live_figures or self.live_figures
         figures |= self.live_figures
         held_out = ""
         if "held_out_psnr" in self.live_figures:

@@ -39,7 +39,7 @@ def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     properties = properties_of(scene)
     source = source_of(scene)
     folder = output_of(scene, source)
-    job = make_job("wrap", source, job_settings(scene, choice.threads))
+    job = make_job("wrap", source, job_settings(scene, choice.threads, choice.device))
     _refuse_running(folder)
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
@@ -83,6 +83,7 @@ def start_mesh(
         earlier.settings,
         {
             "threads": choice.threads,
+            "device": choice.device,
             "regions": tuple(requests),
             **meshing_choices(scene, world_per_blender(frame)),
             **texture_choices(scene),
@@ -124,7 +125,7 @@ def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerCh
     job = continue_training_job(
         JobFolder(folder), earlier, properties_of(scene).training.more_iterations
     )
-    job = replace(job, settings=replace(job.settings, threads=choice.threads))
+    job = replace(job, settings=replace(job.settings, threads=choice.threads, device=choice.device))
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
     )
@@ -140,8 +141,9 @@ def resume(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     folder = Path(bpy.path.abspath(properties_of(scene).job_folder))
     _refuse_running(folder)
     client = JobClient.resume(
-        folder, python=worker_python(choice.python), keep_running=choice.keep_running
-    )
+        folder, python=worker_python(choice.python), keep_running=choice.keep_running,
+        device=choice.device,
+    )  # fmt: skip
     job_timer.watch(scene, folder, client)
     return folder
 

@@ -62,7 +62,7 @@ def _stored(declared: Declaration, properties: bpy.types.PropertyGroup) -> Any:
     return getattr(owner, declared.property_name)
 
 
-def job_settings(scene: bpy.types.Scene, threads: int) -> JobSettings:
+def job_settings(scene: bpy.types.Scene, threads: int, device: str = "auto") -> JobSettings:
     """Return the job settings of a scene's panels: the preset, then the choices.
 
     Meshing settings are omitted: a job that trains uses their defaults.
@@ -84,7 +84,7 @@ def job_settings(scene: bpy.types.Scene, threads: int) -> JobSettings:
         and values[declared.path] == declared.default
     }  # Auto leaves it to the preset
     given = {path: value for path, value in values.items() if path not in decided}
-    return with_values(preset(name, threads=threads), given)
+    return with_values(preset(name, threads=threads, device=device), given)
 
 
 def meshing_choices(scene: bpy.types.Scene, world_per_blender: float) -> dict[str, Any]:

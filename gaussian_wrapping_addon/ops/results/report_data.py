@@ -66,6 +66,8 @@ class ReportData:
     """Model selection: decided from the photos, or by the user."""
     regions: tuple[RegionRows, ...] = ()
     warnings: tuple[str, ...] = ()
+    device_reason: str = ""
+    """Why the job ran on the device that the rows name."""
     known: bool = False
     """Whether there is a report."""
 
@@ -84,6 +86,8 @@ class ReportData:
         lines = [f"{name}: {value}" for name, value in (*self.rows, *self.stages, *self.decisions)]
         for region in self.regions:
             lines += ["", region.name, *(f"  {name}: {value}" for name, value in region.rows)]
+        if self.device_reason:
+            lines += ["", f"Device: {self.device_reason}"]
         if self.warnings:
             lines += ["", "Warnings", *(f"  {text}" for text in self.warnings)]
         return "\n".join(lines) + "\n"
@@ -101,8 +105,8 @@ def figures_of_report(report: Any) -> dict[str, Any]:
     -------
     dict
         ``seconds``, ``gaussians``, ``psnr`` (held-out photos, dB), ``psnr_count``,
-        ``memory_bytes``, ``stages`` (pairs of name and seconds), ``decisions`` (name, choice and
-        setting), ``warnings`` (texts), and
+        ``memory_bytes``, ``device``, ``device_reason``, ``stages`` (pairs of name and seconds),
+        ``decisions`` (name, choice and setting), ``warnings`` (texts), and
         ``regions``: for each name ``faces``, ``vertices``, ``closed``, ``coverage``,
         ``mesh_psnr`` (dB, where the mesh covers the photos), ``uncovered`` (share of the photos)
         and ``whole_psnr`` (dB, uncovered pixels black).
@@ -119,6 +123,9 @@ def figures_of_report(report: Any) -> dict[str, Any]:
         psnr_count=len(held_out),
         memory_bytes=max((value for value in memory if value), default=None),
     )
+    figures |= {
+        key: str(report[key])[:MAX_TEXT] for key in ("device", "device_reason") if key in report
+    }
     figures["stages"] = [
         [str(stage.get("name", ""))[:MAX_TEXT], stage["seconds"]]
         for stage in map(part, items(report.get("stages"))[:MAX_ROWS])
@@ -180,12 +187,16 @@ def _report_data(figures: dict[str, Any]) -> ReportData:
     quality = number(psnr, "dB", digits=1)
     if psnr is not None and count:
         quality += f" ({plural(int(count), 'photo')})"
-    rows = (
+    device = figures.get("device")
+    rows: tuple[Row, ...] = (
         ("Time of Last Job", duration(figures.get("seconds"))),
         ("Peak Memory", bytes_text(figures.get("memory_bytes"))),
         ("Gaussians", number(figures.get("gaussians"))),
         ("Held-Out PSNR", quality),
     )
+    if isinstance(device, str):  # version 0.1.0 had no choice
+        rows = (*rows, ("Device", "Processor" if device == "cpu" else device[:MAX_TEXT]))
+    reason = figures.get("device_reason")
     stages = tuple(
         (_stage(str(entry[0])), duration(entry[1]))
         for entry in items(figures.get("stages"))[:MAX_ROWS]
@@ -205,7 +216,8 @@ def _report_data(figures: dict[str, Any]) -> ReportData:
         for entry in items(figures.get("decisions"))[:MAX_ROWS]
         if isinstance(entry, list) and len(entry) == 3
     )
-    return ReportData(rows, stages, decisions, regions, warnings, True)
+    why = reason[:MAX_TEXT] if isinstance(reason, str) else ""
+    return ReportData(rows, stages, decisions, regions, warnings, why, True)
 
 
 def _decision(name: str, chosen: str, setting: str) -> Row:

@@ -78,7 +78,7 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
     WrapError
         The source, a choice or the interpreter cannot be used.
     """
-    job = make_job("wrap", source_of(scene), job_settings(scene, choice.threads))
+    job = make_job("wrap", source_of(scene), job_settings(scene, choice.threads, choice.device))
     command = child_command(
         MODULE, json.dumps(job.to_json(), allow_nan=False), python=worker_python(choice.python)
     )

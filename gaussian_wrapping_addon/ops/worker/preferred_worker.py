@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import bpy
 
+from ...core.settings import declared
 from ..common.addon import addon_preferences
 
 
@@ -17,6 +18,7 @@ class WorkerChoice:
     python: str = ""
     threads: int = 0
     keep_running: bool = False
+    device: str = "auto"
 
 
 def worker_choice(context: bpy.types.Context) -> WorkerChoice:
@@ -25,4 +27,5 @@ def worker_choice(context: bpy.types.Context) -> WorkerChoice:
     if preferences is None:
         return WorkerChoice()
     python = bpy.path.abspath(preferences.worker_python) if preferences.worker_python else ""
-    return WorkerChoice(python, preferences.threads, preferences.keep_running)
+    device = declared("device").from_panel(preferences.device)
+    return WorkerChoice(python, preferences.threads, preferences.keep_running, device)

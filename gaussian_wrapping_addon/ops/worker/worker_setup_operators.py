@@ -8,7 +8,7 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ...core.errors import WrapError
-from ...core.setup.commands import all_commands, as_line
+from ...core.setup.commands import CUDA, CUDA_BRINGS, all_commands, as_line
 from ..common.addon import addon_package, addon_preferences
 from ..common.error_reporting import OperatorResult, ReportsErrors
 from . import worker_setup
@@ -40,9 +40,9 @@ def _python_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
 
 
 def _torch_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
-    cuda = ("cuda", "NVIDIA GPU (CUDA)", "Several GiB more; an NVIDIA driver was found")
+    cuda = ("cuda", "NVIDIA GPU (CUDA)", f"{CUDA_BRINGS}. An NVIDIA driver was found")
     _items["torch"] = [
-        ("cpu", "Processor (Default)", "The small build, which jobs use today on every system"),
+        ("cpu", "Processor (Default)", "The small build, for every system; jobs use the processor"),
         *([cuda] if state.has_cuda else []),
         ("index", "From pip's Index",
          "For mirrors. On Linux pip's index has the CUDA build, elsewhere the processor's"),
@@ -117,6 +117,8 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
                 column.label(text=part, translate=False)
         copy: Any = layout.row().operator("gwrap.copy_setup_commands", icon="COPYDOWN")
         copy.text = "\n".join(lines)
+        if self.torch == CUDA:
+            layout.label(text=CUDA_BRINGS, icon="MEMORY")
         size = "About 2 GiB on the disk; several" if self.torch == "cpu" else "Up to 10 GiB; many"
         layout.label(text=f"{size} minutes. Blender stays usable meanwhile", icon="INFO")
 

@@ -32,6 +32,8 @@ class GWRAP_PT_report(bpy.types.Panel):
             layout.label(text="No report yet", icon="INFO")
             return
         table(layout, report.rows)
+        if report.device_reason:
+            wrapped_label(layout, report.device_reason, characters_of(context))
         if report.stages:
             box = layout.box()
             box.label(text="Time of the Stages", icon="TIME")

@@ -6,7 +6,7 @@ from typing import Final
 import bpy
 
 from ...core.settings.declaration import JOB
-from ...ops.common.addon import properties_of
+from ...ops.common.addon import addon_preferences, properties_of
 from ...ops.jobs import watched_jobs
 from ...ops.jobs.panel_settings import preset_lines
 from ..common.panel_base import CATEGORY, plain
@@ -44,6 +44,9 @@ class GWRAP_PT_train_advanced(bpy.types.Panel):
             wrapped_label(column, line, characters_of(context))
         column.separator()
         draw_settings(column, properties, start)
+        preferences = addon_preferences(context)
+        if preferences is not None:  # the machine's, not the file's
+            column.prop(preferences, "device")
         column.operator("gwrap.reset_training", icon="LOOP_BACK")
 
 

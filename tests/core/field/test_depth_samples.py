@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.field.depth_samples import (
@@ -16,7 +17,10 @@ from gaussian_wrapping_addon.core.field.depth_samples import (
 )
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.render.cuda.device_renderer import DeviceRenderer, device_renderer
+from tests.core.device_kernels import DEVICES, kernels_of
 from tests.core.field.field_scenes import cameras_around
+from tests.core.training.small_scene import sphere_gaussians
 
 SIGMA, ALPHA = 0.4, 0.95
 
@@ -100,3 +104,40 @@ def test_cancelling_stops_before_the_next_view() -> None:
     with pytest.raises(Cancelled):
         sample_depth_maps(one_ball(), cameras_around(30), everywhere, progress, threads=1)
     assert len(seen) <= 3
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_device_gives_the_samples_of_the_processor(
+    device: str, request: pytest.FixtureRequest
+) -> None:
+    """Of 6 views: the same pixels have a depth; rounding moves at most 1 in 1000 by over 1e-5."""
+    kernels = kernels_of(device, request)
+    if device == "cuda":
+        renderer = device_renderer("cuda:0")
+    else:
+        renderer = DeviceRenderer(kernels, torch.device("cpu"), lambda: 1 << 28)
+    cameras = [camera.resized(120, 90) for camera in cameras_around(6)]
+    gaussians = sphere_gaussians(opacity=0.9)
+    views: list[list[np.ndarray]] = []
+    samples = []
+    for where in (None, renderer):
+        views.append([])
+
+        def noted(points: np.ndarray, into: list[np.ndarray] = views[-1]) -> np.ndarray:
+            into.append(points)
+            return everywhere(points)
+
+        samples.append(
+            sample_depth_maps(gaussians, cameras, noted, Progress(), threads=1, renderer=where)
+        )
+    far, moved = 0, 0
+    for camera, wanted, found in zip(cameras, *views, strict=True):
+        assert len(found) == len(wanted) > 500
+        depth = np.linalg.norm(wanted - camera.center, axis=1)
+        away = np.linalg.norm(found - wanted, axis=1) / depth
+        far, moved = far + len(wanted), moved + int((away > 1e-5).sum())
+    assert moved <= 1e-3 * far
+    # A sample on the edge of a cell may fall into its neighbour: the thinned ones are nearly those.
+    assert len(samples[1]) == pytest.approx(len(samples[0]), rel=0.01)
+    reach = cKDTree(samples[0].points).query(samples[1].points)[0]
+    assert (reach <= 1e-5 * np.linalg.norm(cameras[0].center)).mean() > 0.99

@@ -292,7 +292,8 @@ def test_a_broken_job_file_is_refused_by_the_client_and_by_the_worker(
     client.folder.job_path.write_text("{}")
     with pytest.raises(UsageError, match="does not hold the entries of a job"):
         JobClient.resume(tmp_path / "out")
-    monkeypatch.setattr(client_module, "read_job", lambda _: None)
+    job = make_job("wrap", source, JobSettings())
+    monkeypatch.setattr(client_module, "read_job", lambda _: job)
     status = JobClient.resume(tmp_path / "out").wait(60)
     assert status.state == "FAILED"
     assert status.exit_code == 2

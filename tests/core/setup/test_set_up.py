@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from gaussian_wrapping_addon import batch
 from gaussian_wrapping_addon.core.errors import (
     EXIT_CANCELLED,
     EXIT_RESOURCES,
@@ -30,7 +31,7 @@ from gaussian_wrapping_addon.core.processes.worker_environment import (
     WorkerEnvironment,
     interpreter_of,
 )
-from gaussian_wrapping_addon.core.setup import install, pythons
+from gaussian_wrapping_addon.core.setup import commands, install, pythons
 from gaussian_wrapping_addon.core.setup.commands import SetupRequest
 from gaussian_wrapping_addon.core.setup.install import SetupTask
 from tests.core.setup.wheels import write_wheel
@@ -363,3 +364,20 @@ def test_two_set_ups_at_once(quick: SetupRequest) -> None:
         finally:
             other.kill()
     assert quick.environment.is_ready()
+
+
+@pytest.mark.parametrize(("driver", "torch"), [(True, "cpu"), (True, "cuda"), (False, "cpu")])
+def test_the_build_for_cuda_is_offered_where_there_is_a_driver(
+    driver: bool,
+    torch: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(commands, "cuda_present", lambda: driver)
+    words = ["set-up-worker", "--dry-run", "--python", sys.executable, "--torch", torch]
+    assert batch.main([*words, "--to", str(tmp_path / "env")]) == 0
+    told = capfd.readouterr()
+    offer = "An NVIDIA driver was found. With --torch cuda: Training and vacancy on the GPU"
+    assert (offer in told.out + told.err) == (driver and torch == "cpu")
+    assert not (tmp_path / "env").exists()

@@ -17,6 +17,7 @@ from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.stereo.depth_priors import DepthPrior
+from gaussian_wrapping_addon.core.training.devices.cpu_backend import CpuBackend
 from gaussian_wrapping_addon.core.training.iteration import Stepper, is_oriented
 from gaussian_wrapping_addon.core.training.rounds import Rounds
 from gaussian_wrapping_addon.core.training.schedule import Schedule
@@ -62,7 +63,7 @@ def street(views: int) -> tuple[Scene, PhotosInMemory, OrientedGaussians]:
 def rounds_of(scene: Scene, photos: PhotosInMemory, settings: TrainingSettings) -> Rounds:
     views = list(range(len(scene.views)))
     neighbours = {view: np.zeros(0, np.int64) for view in views}
-    stepper = Stepper(photos, Schedule(settings, SIZE_PX), views, neighbours, 1)
+    stepper = Stepper(photos, Schedule(settings, SIZE_PX), views, neighbours, CpuBackend(1), 1)
     return Rounds(stepper, [], None, Progress("train"))
 
 
@@ -171,15 +172,13 @@ def test_wrapping_that_the_photos_refuse_is_off(monkeypatch: pytest.MonkeyPatch)
     assert is_oriented(rounds.schedule, state)
     assert np.abs(state.adam.array("orientation")).max() > 0.0
     weights: list[float] = []
-    from gaussian_wrapping_addon.core.training import iteration
-
-    real = iteration.normal_losses
+    real = rounds.stepper.backend.normal_losses
 
     def watched(*arguments: object, lambda_normal: float, **others: object) -> object:
         weights.append(lambda_normal)
         return real(*arguments, lambda_normal=lambda_normal, **others)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(iteration, "normal_losses", watched)
+    monkeypatch.setattr(rounds.stepper.backend, "normal_losses", watched)
     for _ in range(at - 1, SETTINGS.iterations):
         rounds.before_step(state)
         rounds.stepper.step(state)

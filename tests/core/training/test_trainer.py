@@ -21,6 +21,7 @@ from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import iteration, live_view, rounds, trainer
+from gaussian_wrapping_addon.core.training.devices import cpu_backend
 from gaussian_wrapping_addon.core.training.result import TrainingResult
 from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
@@ -176,7 +177,7 @@ def test_numbers_that_break_down_are_recovered_once(
 ) -> None:
     scene, photos = sphere_scene(views=9, size_px=24)
     settings = dataclasses.replace(SETTINGS, iterations=20)
-    honest, bad = iteration.color_loss, {7}
+    honest, bad = cpu_backend.color_loss, {7}
     calls = [0]
 
     def sometimes_nan(*arguments, **named):  # type: ignore[no-untyped-def]
@@ -184,7 +185,7 @@ def test_numbers_that_break_down_are_recovered_once(
         loss, gradient, figures = honest(*arguments, **named)
         return (loss * float("nan") if calls[0] in bad else loss), gradient, figures
 
-    monkeypatch.setattr(iteration, "color_loss", sometimes_nan)
+    monkeypatch.setattr(cpu_backend, "color_loss", sometimes_nan)
     result = train(scene, photos, settings, tmp_path, Progress(), threads=1)
     assert any("went back from iteration 6 to 0" in w.text for w in result.warnings)
     assert all(torch.isfinite(t).all() for _, t in result.gaussians.tensors())
@@ -280,7 +281,7 @@ def test_the_price_is_asked_of_gaussians_that_this_view_has_placed(
     )  # fmt: skip
     views, brought = [], [0]
     render_view, merge, price = (
-        ViewRenderer.render, iteration.merge_gradients, iteration.add_footprint_regulariser,
+        ViewRenderer.render, cpu_backend.merge_gradients, cpu_backend.add_footprint_regulariser,
     )  # fmt: skip
 
     def rendered(self, *arguments, **named):  # type: ignore[no-untyped-def]
@@ -296,8 +297,8 @@ def test_the_price_is_asked_of_gaussians_that_this_view_has_placed(
         return price(gradients, *arguments)
 
     monkeypatch.setattr(ViewRenderer, "render", rendered)
-    monkeypatch.setattr(iteration, "merge_gradients", merged)
-    monkeypatch.setattr(iteration, "add_footprint_regulariser", priced)
+    monkeypatch.setattr(cpu_backend, "merge_gradients", merged)
+    monkeypatch.setattr(cpu_backend, "add_footprint_regulariser", priced)
     train(scene, photos, settings, tmp_path, Progress(), seed=3, threads=1)
     assert brought[0] > 0
 
@@ -396,9 +397,11 @@ def test_a_refused_degree_is_not_tried_again(
     tried: list[int] = []
     trial = rounds.select_harmonics
 
-    def counted(gaussians: Any, views: Any, held_out: Any, degree: int, **more: Any) -> Any:
+    def counted(
+        gaussians: Any, views: Any, held_out: Any, degree: int, *renderer: Any, **more: Any
+    ) -> Any:
         tried.append(degree)
-        found = trial(gaussians, views, held_out, degree, **more)
+        found = trial(gaussians, views, held_out, degree, *renderer, **more)
         sh = np.zeros((len(gaussians), (degree + 1) ** 2, 3), np.float32)
         return dataclasses.replace(found, coefficients=sh if accepts else None)
 

@@ -369,8 +369,20 @@ def _machine(report: dict[str, Any]) -> list[str]:
     return [
         f"- Started: {date}",
         f"- Processor: {processor}, {cores}, {threads}",
+        *_device(report),
         f"- Memory of the machine: {bytes_text(machine.get('memory_bytes'))}",
         f"- System: {system}, Python {python}",
         f"- Packages: {versions or 'unknown'}",
         f"- Preset: {preset}; seed: {seed}",
     ]
+
+
+def _device(report: dict[str, Any]) -> list[str]:
+    """Return the line on where the job computed; none for reports of earlier versions."""
+    if "device" not in report:
+        return []
+    device, reason = escaped_or(report.get("device")), escaped_or(report.get("device_reason"))
+    trained = part(report, "training").get("device")
+    other = trained is not None and trained != report.get("device")
+    trained_on = f" Trained on {escaped(trained)}." if other else ""
+    return [f"- Device: {device}. {reason}{trained_on}"]

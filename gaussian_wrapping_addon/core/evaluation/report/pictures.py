@@ -17,6 +17,7 @@ from ...files import write_bytes
 from ...gaussians.model import OrientedGaussians
 from ...render.projection.projection import RawArrays
 from ...render.types.options import RenderOptions
+from ...render.types.renderer import Renderer
 from ...render.view_renderer import ViewRenderer
 from .plot import Panel, Series, write_svg
 from .text import items, measured, part
@@ -110,6 +111,7 @@ def write_held_out(
     folder: Path,
     *,
     threads: int,
+    renderer: Renderer | None = None,
 ) -> list[dict[str, Any]]:
     """Render held-out views as the trainer does, and write photo, rendering and error.
 
@@ -124,13 +126,15 @@ def write_held_out(
     folder : Path
         Where ``held-out-0.jpg`` and so on are written.
     threads : int
+    renderer : Renderer, optional
+        By default that of the processor.
 
     Returns
     -------
     list of dict
         ``file``, ``name`` and ``psnr`` (dB) of each picture, the worst first.
     """
-    renderer, raw = ViewRenderer(), RawArrays.from_gaussians(gaussians)
+    renderer, raw = renderer or ViewRenderer(), RawArrays.from_gaussians(gaussians)
     options = RenderOptions(depth=False, threads=threads)
     written = []
     for number, chosen in enumerate(worst_to_best([psnr for _, _, psnr in views])):

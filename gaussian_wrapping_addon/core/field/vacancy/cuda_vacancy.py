@@ -19,7 +19,7 @@ from ...progress import Progress
 from ...render.cuda.kernels import CameraValues, Kernels, cuda_available, device_kernels
 from ...render.cuda.tile_lists import WARPS
 from .camera_bins import TILE_PX, CameraBins
-from .vacancy import VacancyField
+from .vacancy import POINTS_PER_PASS, VacancyField
 
 GPU_CACHE_SHARE = 0.25
 """Share of the GPU's free memory for prepared cameras; a pass of 2 million points takes about
@@ -27,7 +27,20 @@ GPU_CACHE_SHARE = 0.25
 POINTS_PER_WARP = 32
 CELL_BITS = 8
 """Bits of a point's cell within its tile in the keys of ``locate_points``."""
+_BYTES_PER_POINT = 90
+"""Of a pass, while it is evaluated: an estimate."""
+_BYTES_PER_GAUSSIAN = 120
+"""Of the lists of one camera: an estimate."""
 _MASK_MODES = {"ignore": 1, "background": 2}
+
+
+def needed_bytes(gaussians: int) -> int:
+    """Return the least GPU memory of a field: one pass of points and the lists of one camera.
+
+    The lists count four times, as cameras are kept in a quarter of the memory that is free.
+    """
+    lists = round(gaussians * _BYTES_PER_GAUSSIAN / GPU_CACHE_SHARE)
+    return POINTS_PER_PASS * _BYTES_PER_POINT + lists
 
 
 @dataclass(frozen=True)
@@ -132,7 +145,7 @@ class CudaVacancyField(VacancyField):
         super().__init__(arrays, cameras, **options)
         self._torch_device = torch.device(device)
         if kernels is None:
-            usable, reason = cuda_available()
+            usable, reason = cuda_available(self._torch_device.index)
             if not usable:
                 raise DeviceError(reason, "Evaluate vacancy on the processor.")
             index = self._torch_device.index
@@ -248,5 +261,5 @@ class CudaVacancyField(VacancyField):
             raise ResourceError(
                 f"The GPU has too little memory for the vacancy field of {len(self.arrays)} "
                 f"Gaussians: {error}.",
-                "Close other programs that use the GPU, or mesh on the processor.",
+                "Close other programs that use the GPU, or mesh on the processor (--device cpu).",
             ) from None

@@ -53,7 +53,7 @@ def diagnose(folder: str = ".") -> list[Diagnosis]:
         )
     ]
     found += _packages()
-    found.append(_device())
+    found += _devices()
     found.append(_memory())
     free_bytes = shutil.disk_usage(folder).free
     found.append(
@@ -94,16 +94,17 @@ def _build(module: Any) -> str:
     return f", built for CUDA {cuda}" if cuda else ", built for the processor"
 
 
-def _device() -> Diagnosis:
+def _devices() -> list[Diagnosis]:
+    """Return where jobs compute, and the GPUs; a GPU that cannot be used prevents no job."""
     try:
-        import torch
-    except Exception:  # reported by the finding about torch
-        return Diagnosis("Device", False, "torch is missing", "Press Set Up Worker.")
-    if torch.cuda.is_available():
-        return Diagnosis(
-            "Device", True, f"{torch.cuda.get_device_name(0)} is present; jobs run on the processor"
-        )
-    return Diagnosis("Device", True, "no CUDA device; jobs run on the processor")
+        from ...devices.card import gpu_findings
+
+        found = gpu_findings()
+    except ImportError:  # reported by the findings about the packages
+        return [Diagnosis("Device", False, "a package is missing", "Press Set Up Worker.")]
+    except Exception as error:  # a broken torch or driver can raise anything
+        return [Diagnosis("Device", True, f"jobs run on the processor: {error}")]
+    return [Diagnosis(subject, True, finding) for subject, finding in found]
 
 
 def _memory() -> Diagnosis:

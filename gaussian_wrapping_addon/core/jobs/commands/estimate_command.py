@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ...devices import choose_device
 from ...errors import DatasetError
 from ...files import real_path
 from ...report_warning import ReportWarning
@@ -27,7 +28,7 @@ def main(arguments: list[str]) -> int:
 
 def _estimate(job: JobFile) -> list[str | ReportWarning]:
     from ...kernels.parallel import default_threads
-    from ...training.cost.machine_speed import machine_speed, renderer_is_compiled
+    from ...training.cost.machine_speed import renderer_is_compiled, speeds
     from ...training.cost.training_estimate import (
         MESH_AND_TEXTURE_SHARE,
         check_resources,
@@ -38,19 +39,20 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
     from ..stages.splat_scene import start_splat_of
 
     facts = input_facts(Path(job.source))
+    device = choose_device(job.settings.device)
     training = job.settings.training
     if start_splat_of(job) is not None:
         training = wrapping_settings(training)
     threads = job.settings.threads or default_threads()
-    compiled = renderer_is_compiled()
-    speed = machine_speed(threads) if compiled else 1.0
-    machine = this_machine(Path.cwd(), threads, speed)
+    timed = device.is_cuda or renderer_is_compiled()
+    machine = this_machine(Path.cwd(), threads, *speeds(threads, device.device))
     expected = estimate(facts, training, machine)
     low, high = MESH_AND_TEXTURE_SHARE
     points = f"{facts.points} sparse points" if facts.points else "camera poses still to be solved"
+    where = device.card if device.is_cuda else f"{threads} threads"
     lines = [
         f"{facts.photos} photos, long side {facts.long_side_px} px, {points}",
-        f"training ({job.settings.preset}, {threads} threads): {expected.span()}",
+        f"training ({job.settings.preset}, {where}): {expected.span()}",
         f"memory: {expected.memory_bytes / 2**30:.1f} GB",
         f"disk: {expected.disk_bytes / 2**30:.2f} GB",
         f"Gaussians: up to {expected.gaussians:,}",
@@ -58,7 +60,7 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
     ]
     if not facts.points:
         lines.append("solving the cameras: minutes before")
-    if not compiled:
+    if not timed:
         lines.append("not timed here: the first job compiles the renderer, about a minute, once")
     return [*lines, *check_resources(expected, machine)]
 

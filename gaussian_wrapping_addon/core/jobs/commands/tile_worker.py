@@ -22,24 +22,27 @@ POLL_S = 0.5
 
 
 def main(arguments: list[str]) -> int:
-    """Work for ``arguments = [{"out": folder, "threads": n, "wait_s": s} as JSON]``."""
+    """Work for ``arguments = [{"out", "threads", "wait_s", "device"} as JSON]``."""
 
     def work() -> list[str]:
         request = json.loads(arguments[0])
         folder = JobFolder(Path(request["out"]))
-        done = work_on_tiles(folder, int(request["threads"]), float(request["wait_s"]))
+        threads, wait_s = int(request["threads"]), float(request["wait_s"])
+        done = work_on_tiles(folder, threads, wait_s, str(request["device"]))
         return [f"{done} parts done by this process"]
 
     return run_command(work)
 
 
-def work_on_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
+def work_on_tiles(folder: JobFolder, threads: int, wait_s: float, device: str) -> int:
     """Work on every unfinished tile list of a job; return the number of tasks completed here.
 
     Parameters
     ----------
     wait_s : float
         Longest time to wait for a list.
+    device : str
+        The setting of this process, which need not be that of the job.
 
     Raises
     ------
@@ -63,8 +66,9 @@ def work_on_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
     for path in lists:
         try:
             work_on_tile_list(
-                folder.stages, path, progress, done, threads=threads or default_threads()
-            )
+                folder.stages, path, progress, done, threads=threads or default_threads(),
+                device=device,
+            )  # fmt: skip
         except (WrapError, OSError):
             # The job may have joined the tiles and removed their files meanwhile.
             if path in unfinished_tile_lists(folder):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...array_file import is_whole
+from ...devices import DeviceChoice
 from ...errors import MeshingError
 from ...progress import Progress
 from ..store.job_file import JobFile
@@ -28,6 +29,7 @@ def run_mesh(
     progress: Progress,
     *,
     threads: int,
+    device: DeviceChoice,
 ) -> Stage:
     """Mesh a region, or re-use its finished mesh stage.
 
@@ -37,6 +39,9 @@ def run_mesh(
         The region's entry in the job's settings.
     name : str
         Name of the region's folder.
+    device : DeviceChoice
+        The job's; vacancy is evaluated and depth maps are rendered there. Everything else gets
+        arrays and CPU tensors.
 
     Raises
     ------
@@ -52,6 +57,7 @@ def run_mesh(
 
         from ...dataset.frames.scene_grid import snapped_length
         from ...dataset.refined_scene import load_refined_scene
+        from ...devices.whole_views import with_renderer
         from ...field.depth_samples import DepthSamples, sample_depth_maps
         from ...field.vector_field import VectorField
         from ...gaussians.gaussian_file import load_gaussians
@@ -61,7 +67,8 @@ def run_mesh(
         from ...meshing.cleanup.clean_up import clean_up
         from ...meshing.cleanup.open_boundary import without_caps
         from ...regions.region import write_region
-        from .region_field import field_figures, region_field, requested_region
+        from ...render.types.renderer import Renderer
+        from .region_field import field_device, field_figures, region_field, requested_region
         from .region_meshing import (
             mesh_by_pivots_in_stage,
             mesh_in_stage,
@@ -75,14 +82,17 @@ def run_mesh(
         region, world_region = requested_region(request, body, scene, arrays)
         vacancy = region_field(
             scene, arrays, region, job.settings.training, meshing, threads=threads,
-            device=str(gaussians.means.device),
+            device=field_device(device, job.settings.device, arrays).device,
         )  # fmt: skip
 
         def sampled() -> DepthSamples:
-            return sample_depth_maps(
-                gaussians, vacancy.cameras, lambda points: region.contains(points, 0.0),
-                progress.span(0.0, 0.15), threads=threads,
-            )  # fmt: skip
+            def on(renderer: Renderer) -> DepthSamples:
+                return sample_depth_maps(
+                    gaussians, vacancy.cameras, lambda points: region.contains(points, 0.0),
+                    progress.span(0.0, 0.15), threads=threads, renderer=renderer,
+                )  # fmt: skip
+
+            return with_renderer(vacancy.device, "Depth maps", on)
 
         if meshing.method == "pivots":
             alone = meshing.pivot_samples == "none"

@@ -7,7 +7,9 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...errors import DatasetError, DeviceError
+from ...devices import DeviceChoice, stage_device
+from ...devices.failures import is_device_failure
+from ...errors import DatasetError, WrapError
 from ...names import AUTOMATIC_REGIONS
 
 if TYPE_CHECKING:
@@ -115,6 +117,21 @@ def field_views(scene: Scene, photos: PhotoSource, holdout_every: int, cameras: 
     return views
 
 
+def field_device(chosen: DeviceChoice, setting: str, arrays: GaussianArrays) -> DeviceChoice:
+    """Return where the field of these Gaussians is evaluated: the job's device if it fits there.
+
+    Raises
+    ------
+    DeviceError
+        As :func:`~...devices.choice.stage_device`.
+    """
+    if not chosen.is_cuda:
+        return chosen
+    from ...field.vacancy.cuda_vacancy import needed_bytes
+
+    return stage_device(chosen, setting, needed_bytes(len(arrays)), "Vacancy")
+
+
 def region_field(
     scene: Scene,
     arrays: GaussianArrays,
@@ -136,8 +153,8 @@ def region_field(
     meshing : MeshingSettings
         ``unseen`` and ``cameras`` are read.
     device : str
-        Torch device that the Gaussians were trained on. On a GPU the field is evaluated there too;
-        if its kernels cannot run, it is evaluated on the CPU and the log says why.
+        Torch device of the field, from :func:`field_device`. If the kernels of a GPU cannot run,
+        the field is evaluated on the processor and the log says why.
 
     Raises
     ------
@@ -163,10 +180,11 @@ def region_field(
 
         try:
             return CudaVacancyField(arrays, cameras, device=device, **options)
-        except DeviceError as error:
-            _logger.warning(
-                "Vacancy is evaluated on the processor, not on the GPU: %s", error.message
-            )
+        except (WrapError, RuntimeError) as error:
+            if not is_device_failure(error):
+                raise
+            reason = getattr(error, "message", error)
+            _logger.warning("Vacancy is evaluated on the processor, not on the GPU: %s", reason)
     return VacancyField(arrays, cameras, **options)
 
 

@@ -281,9 +281,20 @@ def unfinished_tile_lists(folder: JobFolder) -> list[Path]:
 
 
 def work_on_tile_list(
-    stages: Path, folder: Path, progress: Progress, done_here: list[str], *, threads: int
+    stages: Path,
+    folder: Path,
+    progress: Progress,
+    done_here: list[str],
+    *,
+    threads: int,
+    device: str,
 ) -> None:
     """Work on a tile list in a separate process; append the names of completed tasks.
+
+    Parameters
+    ----------
+    device : str
+        The setting of this process.
 
     Raises
     ------
@@ -291,12 +302,13 @@ def work_on_tile_list(
         A stage named by the list is not in the job folder.
     """
     from ...dataset.refined_scene import load_refined_scene
+    from ...devices import choose_device
     from ...field.vector_field import VectorField
     from ...files import resolve_inside
     from ...gaussians.gaussian_file import load_gaussians
     from ...meshing.tiles.plan import Field
     from ...meshing.tiles.store import load_plan
-    from .region_field import region_field
+    from .region_field import field_device, region_field
     from .tile_tasks import tile_tasks
 
     plan, origin = load_plan(folder)
@@ -307,12 +319,11 @@ def work_on_tile_list(
         raise MeshingError("The tile list names no stages of this job.", "Mesh the region again.")
     cameras, training = (stage for stage in stage_folders if stage is not None)
     scene = load_refined_scene(cameras, training)
-    gaussians = load_gaussians(training / "gaussians.npz")
-    arrays = gaussians.arrays()
+    arrays = load_gaussians(training / "gaussians.npz").arrays()
     settings = from_json(JobSettings, origin.get("settings"), "settings").validated()
     vacancy = region_field(
         scene, arrays, plan.region, settings.training, settings.meshing, threads=threads,
-        device=str(gaussians.means.device),
+        device=field_device(choose_device(device), device, arrays).device,
     )  # fmt: skip
     field = Field(vacancy, VectorField(arrays, threads=threads), threads)
     tasks = tile_tasks(folder, plan, field)

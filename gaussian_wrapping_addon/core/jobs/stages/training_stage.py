@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...array_file import is_whole
+from ...devices import DeviceChoice, stage_device
 from ...errors import DatasetError
 from ...progress import COMPILING, Progress
 from ...report_warning import ReportWarning
@@ -84,8 +85,14 @@ def run_training(
     *,
     version: int,
     threads: int,
+    device: DeviceChoice,
 ) -> Stage:
     """Train, or re-use a finished training.
+
+    Parameters
+    ----------
+    device : DeviceChoice
+        The job's. A training that was begun elsewhere continues here: no key depends on it.
 
     Raises
     ------
@@ -106,7 +113,7 @@ def run_training(
                 raise nothing_to_continue(folder)
         begun_s = time.monotonic()
         try:
-            done = _train(stage_folder, job, cameras, progress, threads)
+            done = _train(stage_folder, job, cameras, progress, threads, device)
         except BaseException:
             record_interrupted_time(folder.stages, "train", key, time.monotonic() - begun_s)
             raise
@@ -123,28 +130,40 @@ def run_training(
 
 
 def _train(
-    stage_folder: Path, job: JobFile, cameras: Stage, progress: Progress, threads: int
+    stage_folder: Path,
+    job: JobFile,
+    cameras: Stage,
+    progress: Progress,
+    threads: int,
+    device: DeviceChoice,
 ) -> dict[str, Any]:
     from ...dataset.photos.photo_store import PhotoStore
     from ...dataset.refined_scene import load_refined_scene, save_poses
     from ...dataset.scene_file import load_saved_scene
     from ...dataset.view_split import held_out_views
+    from ...devices.whole_views import with_renderer
     from ...evaluation.report.pictures import write_held_out
     from ...gaussians.gaussian_file import save_gaussians
     from ...training.checkpoint import remove_checkpoints
+    from ...training.devices.chosen import chosen_backend
     from ...training.trainer import train
     from .splat_scene import start_splat_of
 
     scene = load_saved_scene(cameras.folder)
-    estimated, warnings = _estimate(scene, job, stage_folder, progress, threads)
+    device = _fitting(scene, job, device)
+    estimated, warnings = _estimate(scene, job, stage_folder, progress, threads, device)
 
     inside = _inside_regions(job, scene)
+    _logger.info("training on %s", device.device)
 
     def attempt(settings: TrainingSettings) -> TrainingResult:
         photos = PhotoStore(scene, settings.max_image_px)
         return train(
             scene, photos, settings, stage_folder, progress,
             seed=job.settings.seed, threads=threads, start_splat=start_splat_of(job), inside=inside,
+            backend=chosen_backend(
+                device.device, threads, or_processor=job.settings.device == "auto"
+            ),
         )  # fmt: skip
 
     trained = train_with_oom_retry(
@@ -162,12 +181,20 @@ def _train(
         if scene.views[index].camera.name in measured
     ]
     photos = PhotoStore(scene, trained.settings.max_image_px)
-    pictures = write_held_out(result.gaussians, photos, shown, stage_folder, threads=threads)
+    pictures = with_renderer(
+        result.device,
+        "Pictures of held-out photos",
+        lambda renderer: write_held_out(
+            result.gaussians, photos, shown, stage_folder, threads=threads, renderer=renderer
+        ),
+    )
     done = {**result.to_json(), REFINED: result.poses is not None}
     earlier = [warning.to_json() for warning in (*warnings, *trained.warnings)]
     done["warnings"] = [*earlier, *done["warnings"]]
     return {
         **done,
+        "device": result.device,
+        "device_reason": device.reason,
         "pictures": pictures,
         "estimate": estimated,
         "settings": to_json(trained.settings),
@@ -196,14 +223,30 @@ def _inside_regions(job: JobFile, scene: Scene) -> Callable[[np.ndarray], np.nda
     return inside
 
 
+def _fitting(scene: Scene, job: JobFile, device: DeviceChoice) -> DeviceChoice:
+    """Return the job's device, or the processor where its memory does not suffice."""
+    from ...training.cost.training_estimate import gpu_bytes, scene_facts
+
+    if not device.is_cuda:
+        return device
+    training = job.settings.training
+    needed = gpu_bytes(scene_facts(scene), training, training.max_gaussians)
+    return stage_device(device, job.settings.device, needed, "Training")
+
+
 def _estimate(
-    scene: Scene, job: JobFile, stage_folder: Path, progress: Progress, threads: int
+    scene: Scene,
+    job: JobFile,
+    stage_folder: Path,
+    progress: Progress,
+    threads: int,
+    device: DeviceChoice,
 ) -> tuple[dict[str, Any], list[ReportWarning]]:
     """Estimate the training's cost; raise if the disk is too full.
 
     Compiles the renderer first if that was never done on this machine.
     """
-    from ...training.cost.machine_speed import machine_speed, renderer_is_compiled
+    from ...training.cost.machine_speed import renderer_is_compiled, speeds
     from ...training.cost.training_estimate import (
         check_resources,
         estimate,
@@ -217,11 +260,11 @@ def _estimate(
     training = job.settings.training
     if start_splat_of(job) is not None:
         training = wrapping_settings(training)
-    if not renderer_is_compiled():
+    if not device.is_cuda and not renderer_is_compiled():
         progress.enter(COMPILING, "compiling the renderer, about a minute, only this once")
         compile_kernels(training, stage_folder, progress, threads=threads)
     progress.update(0.0, "timing this machine")
-    machine = this_machine(stage_folder, threads, machine_speed(threads))
+    machine = this_machine(stage_folder, threads, *speeds(threads, device.device))
     done = [int(path.stem.rpartition("-")[2]) for path in checkpoints(stage_folder)]
     first = max(done, default=0)
     expected = estimate(scene_facts(scene), training, machine, first=first)

@@ -110,6 +110,32 @@ def load_driver() -> ctypes.CDLL:
     return cuda
 
 
+def device_count() -> int:
+    """Return how many GPUs the driver shows to this process; needs no torch.
+
+    Raises
+    ------
+    DeviceError
+        If the driver is not installed, fails, or finds no GPU.
+    """
+    count = ctypes.c_int()
+    _check(load_driver(), "cuDeviceGetCount", ctypes.byref(count))
+    return count.value
+
+
+def driver_cuda_version() -> str:
+    """Return the newest version of CUDA that the driver supports, such as ``"13.0"``.
+
+    Raises
+    ------
+    DeviceError
+        If the driver is not installed or fails.
+    """
+    number = ctypes.c_int()
+    _check(load_driver(), "cuDriverGetVersion", ctypes.byref(number))
+    return f"{number.value // 1000}.{number.value % 1000 // 10}"
+
+
 def _check(cuda: ctypes.CDLL, function: str, *arguments: object) -> None:
     result = getattr(cuda, function)(*arguments)
     if result != 0:

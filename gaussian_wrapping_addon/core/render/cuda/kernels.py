@@ -6,6 +6,7 @@ from __future__ import annotations
 import ctypes
 import functools
 from abc import ABC, abstractmethod
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -29,7 +30,7 @@ class CameraValues(ctypes.Structure):
         return cls.from_buffer_copy(np.ascontiguousarray(packed, np.float64).tobytes())
 
 
-Argument = Tensor | int | float | CameraValues
+Argument = Tensor | int | float | CameraValues | ctypes.c_double
 
 
 class Kernels(ABC):
@@ -39,7 +40,7 @@ class Kernels(ABC):
         """Run a kernel with :data:`THREADS_PER_BLOCK` threads per block; 0 blocks do nothing.
 
         Tensors must be contiguous and are passed by address; integers are passed as ``int``, other
-        numbers as ``float``.
+        numbers as ``float``, but a ``c_double`` as ``double``.
         """
         if blocks == 0:
             return
@@ -59,7 +60,7 @@ class DeviceKernels(Kernels):
     """The kernels, compiled for and run on one GPU."""
 
     def __init__(self, device_index: int) -> None:
-        library = find_nvrtc(_torch_cuda_major())
+        library = nvrtc_of_torch()
         if library is None:
             raise DeviceError("No NVRTC library was found.", _NO_NVRTC_HINT)
         capability = torch.cuda.get_device_capability(device_index)
@@ -87,31 +88,42 @@ def device_kernels(device_index: int) -> DeviceKernels:
     return DeviceKernels(device_index)
 
 
-def cuda_available() -> tuple[bool, str]:
-    """Return whether the renderer can run on a GPU of this machine, and the reason."""
+def cuda_available(device_index: int | None = None) -> tuple[bool, str]:
+    """Return whether the renderer can run on a GPU of this machine, and the reason.
+
+    Parameters
+    ----------
+    device_index : int, optional
+        Device index of torch; by default its current device.
+    """
     if torch.version.cuda is None:
         return False, "This PyTorch was built without CUDA."
     if not torch.cuda.is_available():
         return False, "PyTorch finds no CUDA device, or the driver is too old for it."
-    library = find_nvrtc(_torch_cuda_major())
+    library = nvrtc_of_torch()
     if library is None:
         return False, f"No NVRTC library was found. {_NO_NVRTC_HINT}"
     try:
         load_driver()
     except DeviceError as error:
         return False, str(error)
-    return True, f"{torch.cuda.get_device_name()}, kernels compiled by {library.name}."
+    count = torch.cuda.device_count()
+    if device_index is not None and device_index >= count:
+        return False, f"There is no GPU {device_index}: PyTorch finds {count}, counted from 0."
+    name = torch.cuda.get_device_name(device_index)
+    return True, f"{name}, kernels compiled by {library.name}."
 
 
-def _torch_cuda_major() -> int | None:
-    return int(torch.version.cuda.split(".")[0]) if torch.version.cuda else None
+def nvrtc_of_torch() -> Path | None:
+    """Return the NVRTC library for torch's version of CUDA; ``None`` where there is none."""
+    return find_nvrtc(int(torch.version.cuda.split(".")[0]) if torch.version.cuda else None)
 
 
 def _value(argument: Argument) -> ctypes._SimpleCData | ctypes.Structure:
     if isinstance(argument, Tensor):
         assert argument.is_contiguous()
         return ctypes.c_void_p(argument.data_ptr())
-    if isinstance(argument, CameraValues):
+    if isinstance(argument, (CameraValues, ctypes.c_double)):
         return argument
     if isinstance(argument, (int, np.integer)):
         return ctypes.c_int(int(argument))

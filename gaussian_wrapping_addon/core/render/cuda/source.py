@@ -8,6 +8,8 @@ import math
 from pathlib import Path
 
 from ... import tolerances
+from ...imaging import ssim_kernels
+from ..query.fine_screen import BOX_END
 from ..simd.raster_math import FLOAT32_MAX, FRONT_SIGMAS
 
 PARTS = (
@@ -19,6 +21,10 @@ PARTS = (
     "isosurface.cu",
     "raster_backward.cu",
     "vacancy.cu",
+    "losses.cu",
+    "adam.cu",
+    "query.cu",
+    "multi_view.cu",
 )
 
 KERNELS = (
@@ -38,6 +44,26 @@ KERNELS = (
     "finish_params",
     "locate_points",
     "transmittance_tiles",
+    "ssim_maps",
+    "color_gradient",
+    "agree_normals",
+    "gather_depth",
+    "prior_depths",
+    "adam_rows",
+    "project_finely",
+    "bound_points",
+    "count_areas",
+    "list_areas",
+    "solve_points",
+    "query_gradients",
+    "position_gradients",
+    "grey_pixels",
+    "measure_pixels",
+    "pick_pixels",
+    "lift_points",
+    "return_points",
+    "compare_patches",
+    "finish_pixels",
 )
 """Names of the kernels (entry points)."""
 
@@ -69,9 +95,18 @@ _SINGLE = {
     "SOLVER_LEVEL_FAR": 0.05,
     "SOLVER_FLAT": 0.02,
     "SOLVER_LEAST_SLOPE": 1e-12,
+    "FLOAT_MARGIN": 4e-6,  # as in query_spans.py
     # As in core/field/vacancy/vacancy_kernels.py.
     "FACTOR_MIN": 1e-7,
     "TRANSMITTANCE_LOST": 1e-4,
+    **{f"SSIM_W{tap}": weight for tap, weight in enumerate(ssim_kernels.WEIGHTS[:6])},
+    "SSIM_C1": ssim_kernels.C1,
+    "SSIM_C2": ssim_kernels.C2,
+    # As in core/training: loss_kernels.py, adam_kernels.py.
+    "MIN_NORMAL_SQ": 1e-30,
+    "ADAM_BETA1": 0.9,
+    "ADAM_BETA2": 0.999,
+    "ADAM_EPSILON": 1e-15,
 }
 _DOUBLE = {
     "ALPHA_MIN_WIDE": tolerances.ALPHA_MIN,
@@ -92,10 +127,22 @@ _DOUBLE = {
     "BASIS_MAX": 3.0,
     # As in projection_kernels.py and tile_kernels.py.
     "PLANE_MARGIN": 1e-12,
+    # As in core/training/losses/depth_prior_loss.py.
+    "PRIOR_TOLERANCE": 0.01,
+    "PRIOR_OUTLIER": 0.03,
     "FLOAT32_STEP": 2.0**-23,
     "FARTHEST_PX": 1.0e9,
     "SHARE_MARGIN": 1e-6,
     "STRIP_MARGIN": 0.02,
+    # As in fine_screen.py.
+    "BOX_END": BOX_END,
+    "PATCH_STEP_PX": tolerances.PATCH_STEP_PX,
+    "MAX_NOISE_PX": tolerances.MAX_NOISE_PX,
+    "MIN_NOISE_PX": tolerances.MIN_NOISE_PX,
+    "SPREAD_PRODUCT": tolerances.SPREAD_PRODUCT,
+    "MAX_PATCH_ERROR": tolerances.MAX_PATCH_ERROR,
+    "MIN_PLANE_NORMAL": tolerances.MIN_PLANE_NORMAL,
+    "MIN_PLANE_FACING": tolerances.MIN_PLANE_FACING,
     "SH_C0": 0.5 / math.sqrt(math.pi),
     "SH_C1": math.sqrt(3.0 / (4.0 * math.pi)),
     "SH_C2A": math.sqrt(15.0 / (4.0 * math.pi)),
@@ -107,7 +154,15 @@ _DOUBLE = {
     "SH_C3D": math.sqrt(7.0 / (16.0 * math.pi)),
     "SH_C3E": math.sqrt(105.0 / (16.0 * math.pi)),
 }
-_INTEGER = {"TILE": tolerances.TILE_PX, "SOLVER_NEWTON_STEPS": 8, "SOLVER_MAX_STEPS": 80}
+_INTEGER = {
+    "TILE": tolerances.TILE_PX,
+    "SOLVER_NEWTON_STEPS": 8,
+    "SOLVER_MAX_STEPS": 80,
+    "HALF_PATCH": tolerances.HALF_PATCH,
+    "PATCH_SKIPPED": tolerances.PATCH_SKIPPED,
+    "PATCH_KEPT": tolerances.PATCH_KEPT,
+    "PATCH_BROKEN": tolerances.PATCH_BROKEN,
+}
 
 
 @functools.cache

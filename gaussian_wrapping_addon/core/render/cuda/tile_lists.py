@@ -24,7 +24,7 @@ KEPT_BYTES = 4 + 4 + 4 * WARPS
 """Memory per intersection kept for the backward pass: Gaussian, slot, contribution masks."""
 PASSING_BYTES = 4 * ROW_VALUES
 """Temporary memory per intersection of one band: its gradient row; binning needs less."""
-_MAX_INTERSECTIONS = 2**31 - 1
+MAX_INTERSECTIONS = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,17 @@ class DeviceScreen:
     visible: Tensor  # (n,) bool
     depths: Tensor  # (n,) float32
     skews: Tensor  # (n,) float32
+
+    @classmethod
+    def empty(cls, count: int, device: torch.device) -> DeviceScreen:
+        """Return a screen for a kernel to fill."""
+        return cls(
+            torch.empty((count, ROW_VALUES), device=device),
+            torch.empty((count, 4), device=device),
+            torch.empty(count, dtype=torch.bool, device=device),
+            torch.empty(count, device=device),
+            torch.empty(count, device=device),
+        )
 
 
 @dataclass(frozen=True)
@@ -88,13 +99,7 @@ class RawTensors:
 def project(kernels: Kernels, raw: RawTensors) -> DeviceScreen:
     """Activate and project in float64, like ``projection.project_gaussians``."""
     count, device = len(raw.gaussians), raw.gaussians.means.device
-    screen = DeviceScreen(
-        torch.empty((count, ROW_VALUES), device=device),
-        torch.empty((count, 4), device=device),
-        torch.empty(count, dtype=torch.bool, device=device),
-        torch.empty(count, device=device),
-        torch.empty(count, device=device),
-    )
+    screen = DeviceScreen.empty(count, device)
     kernels.launch_each(
         "project_gaussians",
         count,
@@ -129,7 +134,7 @@ def bin_bands(
     # Invisible rows have infinite depth and come last; ties are ordered by index.
     order = torch.sort(screen.depths, stable=True).indices  # (n,) int64
     half = budget_bytes // 2
-    max_band_intersections = min(half // PASSING_BYTES, _MAX_INTERSECTIONS)
+    max_band_intersections = min(half // PASSING_BYTES, MAX_INTERSECTIONS)
     kept = 0
     waiting = [(0, tiles_y)]
     while waiting:
@@ -189,8 +194,8 @@ def _list(
 ) -> Band:
     tiles_x, first_row, end_row = tile_rows
     device = order.device
-    intersection_offsets = _offsets(counts)
-    rank_offsets = _offsets(counts[order])
+    intersection_offsets = offsets(counts)
+    rank_offsets = offsets(counts[order])
     unsorted = torch.empty((3, intersections), dtype=torch.int32, device=device)
     kernels.launch_each(
         "list_pairs",
@@ -223,7 +228,7 @@ def _list(
     )
 
 
-def _offsets(counts: Tensor) -> Tensor:
+def offsets(counts: Tensor) -> Tensor:
     """(n + 1,) int64 exclusive running sum."""
     offsets = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
     torch.cumsum(counts, 0, out=offsets[1:])

@@ -23,8 +23,16 @@ from ..types.options import RenderOptions
 _FINE_SIDE_PX = 65536
 """Longer side of the screen that Gaussians are projected onto for queries. Projection drops those
 between pixel centres; at this size none of them is relevant."""
-_BOX_END = 0.999e9
+BOX_END = 0.999e9
 """Projection clips boxes at 1e9 pixels."""
+
+
+def fine_scale(camera: Camera) -> int:
+    """Return how many times as fine the screen is that Gaussians are projected onto."""
+    scale = 1
+    while scale * max(camera.width, camera.height) < _FINE_SIDE_PX:
+        scale *= 2
+    return scale
 
 
 def project_finely(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> ScreenGaussians:
@@ -45,9 +53,7 @@ def project_finely(gaussians: RawArrays, camera: Camera, options: RenderOptions)
         In pixels of ``camera``; Gaussians that rendering hides at that size are hidden.
     """
     threads = options.threads or default_threads()
-    scale = 1
-    while scale * max(camera.width, camera.height) < _FINE_SIDE_PX:
-        scale *= 2
+    scale = fine_scale(camera)
     fine = camera.resized(camera.width * scale, camera.height * scale)
     screen = project_gaussians(gaussians, fine, options)
 
@@ -135,7 +141,7 @@ def _shrink_range(
             params[i, column] = value
         skews[i] /= scale
         for column in range(4):
-            if abs(boxes[i, column]) > _BOX_END:
+            if abs(boxes[i, column]) > BOX_END:
                 # Clipped, far outside the image: no longer the box of the ellipse.
                 skews[i] = math.inf
             boxes[i, column] /= scale

@@ -4,19 +4,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 
 @dataclass(frozen=True)
 class ImageGradients:
-    """Gradient of a scalar with respect to the images of a view; ``None`` means zeros."""
+    """Gradient of a scalar with respect to the images of a view; ``None`` means zeros.
 
-    color: np.ndarray | None = None  # (h, w, 3)
-    normal: np.ndarray | None = None  # (h, w, 3)
-    geometric_normal: np.ndarray | None = None  # (h, w, 3)
-    alpha: np.ndarray | None = None  # (h, w)
-    depth: np.ndarray | None = None  # (h, w)
+    numpy arrays, or tensors where the images are tensors.
+    """
+
+    color: Any = None  # (h, w, 3)
+    normal: Any = None  # (h, w, 3)
+    geometric_normal: Any = None  # (h, w, 3)
+    alpha: Any = None  # (h, w)
+    depth: Any = None  # (h, w)
 
 
 @dataclass(frozen=True)

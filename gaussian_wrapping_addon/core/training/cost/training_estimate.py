@@ -54,6 +54,19 @@ MULTI_VIEW_SHARE = 0.4
 """Additional time of a multi-view iteration, as a share of a plain one (57 ms against 144 ms of one
 thread, 40 000 Gaussians, 4000 pixels)."""
 
+GPU_ITERATION_S, GPU_PIXEL_S, GPU_GAUSSIAN_S = 5.0e-3, 1.4e-9, 5.5e-9
+"""On the reference GPU, an NVIDIA H200: of an iteration with all losses, per pixel, per Gaussian
+(fitted to the three cases of benchmarks/cuda_training.py in docs/cuda.md; 3000 iterations on fox
+took 18 s without their trials, 19 s by these)."""
+
+GPU_GAUSSIAN_BYTES, GPU_PIXEL_BYTES, GPU_BASE_BYTES = 2400, 200, 300 * 2**20
+"""Of GPU memory: values, moments, gradients, a snapshot and tile intersections of a Gaussian;
+images and losses of a pixel; the rest. An iteration on 1,000,000 Gaussians and 1920 x 1080 px took
+1.79 GiB (docs/cuda.md), to which the snapshot of 0.66 GiB is added."""
+
+TRIAL_S = 6.0
+"""Of one trial of harmonics on the processor of that machine."""
+
 MATCHING_PIXEL_S = 6e-6
 """Per pixel of all photos at the size at which they are matched for a dense start: 7.6 us of one
 thread (35 photos of 320 x 240 px, benchmarks/scenes wheel) on two threads, and 2 us for planes
@@ -131,6 +144,8 @@ class Machine:
     memory_bytes: int = 0
     """Memory available now."""
     disk_free_bytes: int = 0
+    gpu_speed: float = 0.0
+    """Of the GPU that trains, relative to the reference GPU; 0: the processor trains."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +189,7 @@ def scene_facts(scene: Scene) -> SceneFacts:
     )
 
 
-def this_machine(folder: Path, threads: int, speed: float = 1.0) -> Machine:
+def this_machine(folder: Path, threads: int, speed: float = 1.0, gpu_speed: float = 0.0) -> Machine:
     """Return the resources free now; disk space is that of ``folder``, which need not exist yet."""
     existing = folder
     while not existing.exists() and existing != existing.parent:
@@ -183,7 +198,7 @@ def this_machine(folder: Path, threads: int, speed: float = 1.0) -> Machine:
         free_bytes = shutil.disk_usage(existing).free
     except OSError:
         free_bytes = 0
-    return Machine(threads, speed, available_memory_bytes(), free_bytes)
+    return Machine(threads, speed, available_memory_bytes(), free_bytes, gpu_speed)
 
 
 def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float) -> np.ndarray:
@@ -248,6 +263,21 @@ def _seconds(
     return total_s
 
 
+def _gpu_seconds(
+    facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray, first: int
+) -> float:
+    """Return the modelled time on the reference GPU, from iteration ``first`` on."""
+    schedule, pixels = _schedule(facts, settings), _trained_pixels(facts, settings)
+    total_s = 0.0
+    for iteration, count in enumerate(counts.tolist()):
+        if iteration < first:
+            continue
+        divisor = schedule.divisor(min(iteration, settings.iterations - 1))
+        size = _window(pixels / divisor**2, settings.pixels_per_iteration)
+        total_s += GPU_ITERATION_S + size * GPU_PIXEL_S + count * GPU_GAUSSIAN_S
+    return total_s
+
+
 def _matched_pixels(facts: SceneFacts, settings: TrainingSettings) -> float:
     """Return the pixels of all photos at the size at which they are matched."""
     if settings.dense_start == "off":
@@ -290,8 +320,15 @@ def estimate(
     most = gaussian_counts(scene_facts, settings, 1.0)
     matched = _matched_pixels(scene_facts, settings)
     matching_s = MATCHING_PIXEL_S * matched if first == 0 else 0.0
-    low_s = LOW * (_seconds(scene_facts, cheap, least, first) + matching_s) / machine.speed
-    high_s = HIGH * (_seconds(scene_facts, settings, most, first) + matching_s) / machine.speed
+    if machine.gpu_speed:
+        iterating = [_gpu_seconds(scene_facts, settings, c, first) for c in (least, most)]
+        trials_s = TRIAL_S * (settings.harmonics == "auto")
+        low_s = LOW * (iterating[0] / machine.gpu_speed + matching_s / machine.speed)
+        high_s = iterating[1] / machine.gpu_speed + (matching_s + 3 * trials_s) / machine.speed
+        high_s *= HIGH
+    else:
+        low_s = LOW * (_seconds(scene_facts, cheap, least, first) + matching_s) / machine.speed
+        high_s = HIGH * (_seconds(scene_facts, settings, most, first) + matching_s) / machine.speed
     count = math.ceil(float(most.max()))
     coefficients = 3 * (settings.sh_degree + 1) ** 2
     trained = 3 + 3 + 4 + 1 + coefficients + 4  # values of a Gaussian that are trained
@@ -308,6 +345,12 @@ def estimate(
     )
     disk = CHECKPOINTS * count * state_bytes + count * RESULT_BYTES_PER_GAUSSIAN
     return Estimate(low_s, high_s, round(memory), round(disk) + OTHER_DISK_BYTES, count)
+
+
+def gpu_bytes(facts: SceneFacts, settings: TrainingSettings, gaussians: int) -> int:
+    """Return the GPU memory that a training needs at most."""
+    pixels = _window(_trained_pixels(facts, settings), settings.pixels_per_iteration)
+    return round(gaussians * GPU_GAUSSIAN_BYTES + pixels * GPU_PIXEL_BYTES) + GPU_BASE_BYTES
 
 
 def check_resources(expected: Estimate, machine: Machine) -> list[ReportWarning]:

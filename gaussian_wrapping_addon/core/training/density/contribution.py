@@ -10,7 +10,7 @@ import numpy as np
 from ...gaussians.model import OrientedGaussians
 from ...render.projection.projection import RawArrays
 from ...render.types.options import RenderOptions
-from ...render.view_renderer import ViewRenderer
+from ...render.types.renderer import Renderer
 from ..optimizer.adam import Adam
 from .wrapping import WrapView
 
@@ -18,7 +18,7 @@ from .wrapping import WrapView
 def contributions(
     gaussians: OrientedGaussians,
     views: Iterable[WrapView],
-    renderer: ViewRenderer,
+    renderer: Renderer,
     *,
     threads: int = 0,
 ) -> np.ndarray:
@@ -32,7 +32,7 @@ def contributions(
     gaussians : OrientedGaussians
         Scene frame.
     views : iterable of WrapView
-    renderer : ViewRenderer
+    renderer : Renderer
         Overwrites its last view.
 
     Returns
@@ -56,7 +56,7 @@ def contributions(
 def needed_by_a_view(
     gaussians: OrientedGaussians,
     views: Iterable[WrapView],
-    renderer: ViewRenderer,
+    renderer: Renderer,
     share: float,
     weights: np.ndarray | None = None,
     *,
@@ -74,7 +74,7 @@ def needed_by_a_view(
         Scene frame.
     views : iterable of WrapView
         All training views.
-    renderer : ViewRenderer
+    renderer : Renderer
         Overwrites its last view.
     share : float
         In [0, 1).

@@ -51,6 +51,14 @@ class DensityStatistics:
             np.zeros(count, np.float32), np.zeros(count, np.float32), np.zeros(count, np.int32)
         )
 
+    def cleared(self, count: int) -> DensityStatistics:
+        """Return empty statistics of ``count`` Gaussians of the same kind."""
+        return DensityStatistics.zeros(count)
+
+    def on_host(self) -> DensityStatistics:
+        """Return the statistics in the host's memory: these."""
+        return self
+
     def add(self, statistics: RenderStatistics, width: int, height: int, part: float = 1.0) -> None:
         """Accumulate one view after its backward pass.
 

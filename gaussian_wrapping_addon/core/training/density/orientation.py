@@ -10,8 +10,10 @@ import torch
 
 from ...dataset.camera import Camera
 from ...gaussians.model import OrientedGaussians
-from ...render.render import render
+from ...render.projection.projection import RawArrays
 from ...render.types.options import RenderOptions
+from ...render.types.renderer import Renderer
+from ...render.view_renderer import ViewRenderer
 from ...settings import TrainingSettings
 
 FIRST_SIGN = TrainingSettings.first_sign
@@ -21,6 +23,7 @@ FIRST_SIGN = TrainingSettings.first_sign
 def voted_orientation(
     gaussians: OrientedGaussians,
     cameras: Iterable[Camera],
+    renderer: Renderer | None = None,
     *,
     first_sign: float = FIRST_SIGN,
     threads: int = 0,
@@ -47,10 +50,10 @@ def voted_orientation(
     direction = axes[torch.arange(len(gaussians)), :, shortest].numpy()  # (n, 3)
     means = gaussians.means.numpy()
     votes = np.zeros(len(gaussians))
+    renderer, raw = renderer or ViewRenderer(), RawArrays.from_gaussians(gaussians)
     options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
     for camera in cameras:
-        with torch.no_grad():
-            statistics = render(gaussians, camera, options).statistics
+        statistics = renderer.render(raw, camera, options).statistics
         assert statistics is not None
         toward = camera.center - means  # (n, 3)
         votes += statistics.weight_sum * np.sign((toward * direction).sum(1))

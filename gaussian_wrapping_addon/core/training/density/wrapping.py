@@ -13,8 +13,10 @@ import torch
 from ... import tolerances
 from ...dataset.camera import Camera
 from ...gaussians.model import OrientedGaussians
-from ...render.render import render
+from ...render.projection.projection import RawArrays
 from ...render.types.options import RenderOptions
+from ...render.types.renderer import Renderer
+from ...render.view_renderer import ViewRenderer
 from ..losses.losses import normals_from_depth
 from ..optimizer.adam import Adam
 from .orientation import FIRST_SIGN, voted_orientation
@@ -40,7 +42,12 @@ class WrapView:
 
 
 def start_orientation(
-    adam: Adam, views: Iterable[WrapView], *, first_sign: float = FIRST_SIGN, threads: int = 0
+    adam: Adam,
+    views: Iterable[WrapView],
+    renderer: Renderer | None = None,
+    *,
+    first_sign: float = FIRST_SIGN,
+    threads: int = 0,
 ) -> None:
     """Initialise missing orientations: the shortest axis, with its sign by a vote of the views.
 
@@ -54,13 +61,17 @@ def start_orientation(
     if not missing.any():
         return
     cameras = (view.camera for view in views)
-    voted = voted_orientation(gaussians, cameras, first_sign=first_sign, threads=threads)
+    voted = voted_orientation(gaussians, cameras, renderer, first_sign=first_sign, threads=threads)
     adam.array("orientation")[missing] = voted[missing]
     adam.reset_moments("orientation")
 
 
 def normal_errors(
-    gaussians: OrientedGaussians, views: Iterable[WrapView], *, threads: int = 0
+    gaussians: OrientedGaussians,
+    views: Iterable[WrapView],
+    renderer: Renderer | None = None,
+    *,
+    threads: int = 0,
 ) -> np.ndarray:
     """Return (n,) mean normal error of each Gaussian over the views (docs/method.md, section 4.2).
 
@@ -70,20 +81,20 @@ def normal_errors(
     count = len(gaussians)
     unit = gaussians.orientation.detach().clone()
     unit[:, 3] = _SATURATED * torch.sign(unit[:, 3])
-    oriented = gaussians.detached().replaced(orientation=unit)
+    oriented = RawArrays.from_gaussians(gaussians.detached().replaced(orientation=unit))
+    renderer = renderer or ViewRenderer()
     options = RenderOptions(depth=True, sh_degree=0, threads=threads, statistics=True)
     total, seen = np.zeros(count), np.zeros(count)
     for view in views:
-        with torch.no_grad():
-            image = render(oriented, view.camera, options)
+        image = renderer.render(oriented, view.camera, options)
         assert image.statistics is not None
         assert image.statistics.strongest is not None
-        normals, valid = normals_from_depth(image.depth.numpy(), view.camera, threads=threads)
+        normals, valid = normals_from_depth(image.depth, view.camera, threads=threads)
         if view.mask is not None:
             valid &= view.mask
         strongest = image.statistics.strongest
         valid &= strongest >= 0
-        error = 1.0 - (image.normal.numpy() * normals).sum(2)[valid]
+        error = 1.0 - (image.normal * normals).sum(2)[valid]
         owner = strongest[valid]
         pixels = np.bincount(owner, minlength=count)
         sums = np.bincount(owner, weights=error, minlength=count)

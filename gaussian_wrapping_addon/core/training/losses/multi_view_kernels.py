@@ -14,31 +14,20 @@ from typing import Any
 
 import numpy as np
 
+from ... import tolerances
 from ...kernels.compiled import inline, kernel
 
 # Cameras are (6,): fx, fy, cx, cy, width, height.
 
-HALF_PATCH = 3
-"""A patch has ``2 * 3 + 1`` samples per side ..."""
-PATCH_STEP_PX = 0.5
-"""... half a pixel of the reference apart, where that is not flat."""
+HALF_PATCH = tolerances.HALF_PATCH
+PATCH_STEP_PX = tolerances.PATCH_STEP_PX
 SAMPLES = (2 * HALF_PATCH + 1) ** 2
-
-MAX_NOISE_PX = 1.0
-"""Points with a larger reprojection error are occluded or wrong in one view."""
-MIN_NOISE_PX = 1e-9
-"""Below this, the direction of the reprojection error is rounding: no gradient."""
-
-SPREAD_PRODUCT = 1e-8
-"""Added to the product of two such sums: patches of weak contrast correlate less."""
-MAX_ERROR = 0.9
-"""Patches with a larger error show different things."""
-MIN_NORMAL = 0.3
-"""Shortest blended normal that defines a plane (docs/method.md, section 3.4)."""
-MIN_FACING = 0.1
-"""Smallest cosine between normal and ray (84 degrees): more grazing planes have no patch."""
-# States of a compared pixel.
-SKIPPED, KEPT, BROKEN = 0, 1, 2
+MAX_NOISE_PX, MIN_NOISE_PX = tolerances.MAX_NOISE_PX, tolerances.MIN_NOISE_PX
+SPREAD_PRODUCT = tolerances.SPREAD_PRODUCT
+MAX_ERROR = tolerances.MAX_PATCH_ERROR
+MIN_NORMAL, MIN_FACING = tolerances.MIN_PLANE_NORMAL, tolerances.MIN_PLANE_FACING
+SKIPPED, KEPT = tolerances.PATCH_SKIPPED, tolerances.PATCH_KEPT
+BROKEN = tolerances.PATCH_BROKEN
 
 
 @inline

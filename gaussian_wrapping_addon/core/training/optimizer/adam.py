@@ -28,12 +28,22 @@ _STAYS = np.float32(-1.0)
 
 
 @functools.lru_cache(maxsize=1)
-def _corrections() -> np.ndarray:
+def corrections() -> np.ndarray:
+    """Return (s, 2) float32 bias corrections by step: ``1 / (1 - beta1^t)``, ``1 / sqrt(...)``."""
     steps = np.arange(1, _TABLE_STEPS, dtype=np.float64)
     table = np.ones((_TABLE_STEPS, 2))
     table[1:, 0] = 1.0 / (1.0 - BETA1**steps)
     table[1:, 1] = 1.0 / np.sqrt(1.0 - BETA2**steps)
     return table.astype(np.float32)
+
+
+def packed_rates(columns: int, rates: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return (columns,) float32 rates of the moments' columns; negative: not changed."""
+    packed = np.full(columns, _STAYS)
+    for name, begin in (*COLUMNS.items(), ("sh", SH_COLUMN)):
+        if name in rates:
+            packed[begin : begin + len(rates[name])] = rates[name]
+    return packed
 
 
 class Adam:
@@ -53,7 +63,8 @@ class Adam:
             name: tensor.detach().clone().contiguous() for name, tensor in gaussians.tensors()
         }
         harmonics = -(-3 * self.values["sh"].shape[1] // LANES) * LANES
-        self._moments = np.zeros((len(gaussians), 2, SH_COLUMN + harmonics), np.float32)
+        self.all_moments = np.zeros((len(gaussians), 2, SH_COLUMN + harmonics), np.float32)
+        """(n, 2, c) first and second moments, in the columns of :mod:`.adam_kernels`."""
         self.steps = np.zeros(len(gaussians), np.int32)
 
     def __len__(self) -> int:
@@ -69,10 +80,25 @@ class Adam:
 
     def moments(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return views of the first and second moment of one tensor, in its shape."""
-        shape = tuple(self.values[name].shape)
+        shape = self.shape(name)
         begin = COLUMNS.get(name, SH_COLUMN)
-        both = self._moments[:, :, begin : begin + math.prod(shape[1:])]
+        both = self.all_moments[:, :, begin : begin + math.prod(shape[1:])]
         return both[:, 0].reshape(shape), both[:, 1].reshape(shape)
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of one tensor."""
+        return tuple(self.values[name].shape)
+
+    def on_host(self) -> Adam:
+        """Return the optimiser of the host's memory: this one."""
+        return self
+
+    def copy(self) -> Adam:
+        """Return a copy of values, moments and steps."""
+        twin = Adam(self.gaussians())
+        twin.all_moments[...] = self.all_moments
+        twin.steps[...] = self.steps
+        return twin
 
     def step_rows(
         self,
@@ -101,20 +127,17 @@ class Adam:
         threads = threads or default_threads()
         coefficients = self.values["sh"].shape[1]
         used = coefficients if sh_degree is None else min(coefficients, (sh_degree + 1) ** 2)
-        packed = np.full(self._moments.shape[2], _STAYS)
-        for name, begin in (*COLUMNS.items(), ("sh", SH_COLUMN)):
-            if name in rates:
-                packed[begin : begin + len(rates[name])] = rates[name]
+        packed = packed_rates(self.all_moments.shape[2], rates)
         rows, listed = len(self), len(gradients.ids)
         flat = [getattr(gradients, name).reshape(-1) for name in COLUMNS]
         flat += [gradients.sh.reshape(listed, 3 * coefficients)]
         flat += [self.array(name).reshape(-1) for name in COLUMNS]
         flat += [self.array("sh").reshape(rows, 3 * coefficients)]
-        table = _corrections()
+        table = corrections()
 
         def run(begin: int, end: int) -> None:
             adam_rows(
-                begin, end, gradients.ids, *flat, self._moments, self.steps, table, packed,
+                begin, end, gradients.ids, *flat, self.all_moments, self.steps, table, packed,
                 3 * used,
             )  # fmt: skip
 
@@ -141,8 +164,8 @@ class Adam:
                 self.values[name] = torch.from_numpy(array.copy())
             else:
                 self.values[name] = self.values[name][rows].contiguous()
-        self._moments = self._moments[parents]
-        self._moments[fresh] = 0.0
+        self.all_moments = self.all_moments[parents]
+        self.all_moments[fresh] = 0.0
         self.steps = self.steps[parents]
         self.steps[fresh] = 0
 

@@ -8,7 +8,7 @@ import numpy as np
 from ...render.types.gradients import VisibleGradients
 
 # Row k maps a quaternion (w, x, y, z) to that of the k-th unit rotation vector times it.
-_LEFT = np.array(
+LEFT = np.array(
     [
         [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, -1], [0, 0, 1, 0]],
         [[0, 0, -1, 0], [0, 0, 0, 1], [1, 0, 0, 0], [0, -1, 0, 0]],
@@ -55,5 +55,5 @@ def pose_gradient(
     torque = np.array([odd[1, 2], odd[2, 0], odd[0, 1]])
     by_quats = gradients.quats.astype(np.float64)
     turned = np.einsum("va,vb->ab", by_quats, quats[gradients.ids].astype(np.float64))
-    torque += rotation @ (0.5 * np.einsum("kab,ab->k", _LEFT, turned))
+    torque += rotation @ (0.5 * np.einsum("kab,ab->k", LEFT, turned))
     return np.concatenate([torque, rotation @ force])

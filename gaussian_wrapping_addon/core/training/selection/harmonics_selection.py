@@ -21,6 +21,8 @@ from ...errors import UsageError
 from ...gaussians.model import OrientedGaussians
 from ...kernels.parallel import default_threads
 from ...render.projection.harmonics_kernels import MAX_DEGREE
+from ...render.types.renderer import Renderer
+from ...render.view_renderer import ViewRenderer
 from .harmonics_trial import HarmonicsTrial, TrialView, summed_weights
 from .model_selection import OFF, Decision
 
@@ -112,6 +114,7 @@ def select_harmonics(
     views: Sequence[TrialView],
     held_out: Sequence[TrialView],
     degree: int,
+    renderer: Renderer | None = None,
     *,
     threads: int = 0,
     check: Callable[[], None] | None = None,
@@ -138,6 +141,8 @@ def select_harmonics(
         Photos never trained on; used for evaluation only.
     degree : int
         The degree to try, from 1 to 3.
+    renderer : Renderer, optional
+        Overwrites its last view; by default one on the processor.
     threads : int
         0 uses every core. The result does not depend on it.
     check : callable, optional
@@ -155,6 +160,7 @@ def select_harmonics(
     if not 1 <= degree <= MAX_DEGREE:
         raise UsageError(f"Degree {degree} cannot be tried.", f"Give 1 to {MAX_DEGREE}.")
     threads, check = threads or default_threads(), check or _no_check
+    renderer = renderer or ViewRenderer()
     fitted, evaluation_views = (
         _evenly_spaced(views, MAX_FIT_VIEWS),
         _evenly_spaced(held_out, MAX_HELD_OUT),
@@ -163,10 +169,10 @@ def select_harmonics(
     halves = _halves(fitted)
     if min(len(half) for half in halves) < MIN_FIT_VIEWS or len(gaussians) == 0:
         return unknown
-    shown = summed_weights(gaussians, [*fitted, *evaluation_views], threads, check)
+    shown = summed_weights(gaussians, [*fitted, *evaluation_views], renderer, threads, check)
     statistics = _ErrorStatistics(len(gaussians))
     for half, other, apart in zip(halves, reversed(halves), _halves(evaluation_views), strict=True):
-        trial = HarmonicsTrial(gaussians, half, degree, shown, threads, check)
+        trial = HarmonicsTrial(gaussians, half, degree, shown, renderer, threads, check)
         trial.fit_lower_degrees()
         without, with_degree = trial.fit(degree - 1, degree)
         for view in (*other, *apart):
@@ -180,7 +186,7 @@ def select_harmonics(
     needed = share > NEEDED_SHARE
     coefficients = None
     if needed:
-        trial = HarmonicsTrial(gaussians, fitted, degree, shown, threads, check)
+        trial = HarmonicsTrial(gaussians, fitted, degree, shown, renderer, threads, check)
         trial.fit_lower_degrees()
         (coefficients,) = trial.fit(degree)
     evaluated = len(fitted) + len(evaluation_views)

@@ -24,7 +24,7 @@ from ...render.projection.projection import RawArrays
 from ...render.reference.reference_projection import harmonics_basis
 from ...render.types.gradients import ImageGradients
 from ...render.types.options import RenderOptions
-from ...render.view_renderer import ViewRenderer
+from ...render.types.renderer import Renderer
 
 LOWER_DEGREE_FITS = 3
 """Fits without the degree before the comparison. With unconverged colours any further parameter
@@ -104,6 +104,7 @@ class HarmonicsTrial:
         fitted: Sequence[TrialView],
         degree: int,
         weight_sums: np.ndarray,
+        renderer: Renderer,
         threads: int,
         check: Callable[[], None],
     ) -> None:
@@ -113,7 +114,7 @@ class HarmonicsTrial:
             degree,
             weight_sums,
         )
-        self.renderer = ViewRenderer()
+        self.renderer = renderer
         self.raw = raw = RawArrays.from_gaussians(gaussians)
         count, kept = len(raw), min(raw.sh.shape[1], degree**2)
         self.start = np.zeros((count, (degree + 1) ** 2, 3), np.float32)
@@ -217,11 +218,12 @@ class HarmonicsTrial:
 def summed_weights(
     gaussians: OrientedGaussians,
     views: Sequence[TrialView],
+    renderer: Renderer,
     threads: int,
     check: Callable[[], None],
 ) -> np.ndarray:
     """Return (n,) sums of blending weights over all views, pixels."""
-    renderer, raw = ViewRenderer(), RawArrays.from_gaussians(gaussians)
+    raw = RawArrays.from_gaussians(gaussians)
     options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
     weight_sums = np.zeros(len(raw), np.float64)
     for view in views:

@@ -44,6 +44,8 @@ def full_summary() -> dict[str, Any]:
             "python": "3.11.7",
             "packages": {"numpy": "1.26.4", "numba": "0.68.1"},
         },
+        "device": "cuda:1",
+        "device_reason": "Some GPU, kernels compiled by libnvrtc.so.13.",
         "started_unix_s": 1795271321.2,
         "wall_seconds": 201.5,
         "peak_memory_bytes": {"worker": 3 * 2**30, "largest_helper": 2**29},

@@ -364,3 +364,18 @@ def test_names_that_no_encoding_writes_do_not_stop_the_report(tmp_path: Path) ->
     values, text = write(tmp_path, summary, {REGION: region})
     assert values["source"] == "photos \udcff"
     assert "# Report: photos ?" in text
+
+
+@pytest.mark.parametrize(
+    ("trained", "told"), [(None, ""), ("cuda:1", ""), ("cpu", " Trained on cpu.")]
+)
+def test_where_the_job_computed_and_why_is_said(
+    trained: str | None, told: str, tmp_path: Path
+) -> None:
+    report = {"version": 1, **full_summary(), "regions": {}}
+    if trained is not None:
+        report["training"]["device"] = trained
+    line = f"- Device: cuda:1. Some GPU, kernels compiled by libnvrtc.so.13.{told}"
+    assert line in report_markdown(report, tmp_path).splitlines()
+    del report["device"]  # as version 0.1.0 wrote it
+    assert "- Device" not in report_markdown(report, tmp_path)

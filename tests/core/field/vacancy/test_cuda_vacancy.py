@@ -359,7 +359,7 @@ def test_constants_are_those_of_the_processors_kernel() -> None:
 
 
 def test_no_gpu_is_a_typed_error_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda_vacancy, "cuda_available", lambda: (False, "No GPU here."))
+    monkeypatch.setattr(cuda_vacancy, "cuda_available", lambda _: (False, "No GPU here."))
     with pytest.raises(DeviceError, match="No GPU here"):
         CudaVacancyField(make_arrays(np.zeros(3), 0.1, 0.9), cameras_around(2))
 

@@ -19,6 +19,7 @@ from gaussian_wrapping_addon.core.dataset.refined_scene import (
     load_refined_scene,
     save_poses,
 )
+from gaussian_wrapping_addon.core.devices import choose_device
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians, save_gaussians
 from gaussian_wrapping_addon.core.jobs.runner import STAGE_VERSIONS
@@ -47,6 +48,7 @@ def turn_a_bit(path: Path) -> None:
     path.write_bytes(data)
 
 
+PROCESSOR = choose_device("cpu")
 damaged = pytest.mark.parametrize("damage", [cut, turn_a_bit, Path.unlink])
 
 
@@ -60,7 +62,13 @@ def run(folder: JobFolder) -> tuple[JobFile, Stage, Stage]:
     job = read_job(folder.job_path)
     cameras = run_cameras(folder, job, Progress(), threads=1)
     trained = run_training(
-        folder, job, cameras, Progress(), version=STAGE_VERSIONS["train"], threads=1
+        folder,
+        job,
+        cameras,
+        Progress(),
+        version=STAGE_VERSIONS["train"],
+        threads=1,
+        device=PROCESSOR,
     )
     return job, cameras, trained
 
@@ -144,7 +152,17 @@ def test_a_damaged_mesh_is_made_again(
     job = make_job("mesh", Path(earlier.source), settings)
 
     def mesh() -> Stage:
-        return run_mesh(folder, job, str(path), "ball", cameras, trained, Progress(), threads=1)
+        return run_mesh(
+            folder,
+            job,
+            str(path),
+            "ball",
+            cameras,
+            trained,
+            Progress(),
+            threads=1,
+            device=PROCESSOR,
+        )
 
     made = mesh()
     first = load_mesh(made.folder / "mesh.npz")

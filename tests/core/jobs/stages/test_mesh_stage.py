@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial import cKDTree
 
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
+from gaussian_wrapping_addon.core.devices import DeviceChoice, choice, choose_device
 from gaussian_wrapping_addon.core.field import depth_samples
+from gaussian_wrapping_addon.core.field.vacancy import cuda_vacancy
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
 from gaussian_wrapping_addon.core.jobs.stages.mesh_stage import run_mesh
@@ -26,14 +29,19 @@ from gaussian_wrapping_addon.core.meshing.tetrahedra.marching_tetrahedra import 
     marching_tetrahedra,
 )
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.render.cuda import device_renderer
+from gaussian_wrapping_addon.core.render.cuda.device_renderer import DeviceRenderer
+from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
+from tests.core.render.cuda.emulation import EmulatedKernels
 
+PROCESSOR = choose_device("cpu")
 HELD_OUT = {"000.png", "008.png"}
 """Of the twelve photos of the sphere, every eighth."""
 
 
-def mesh_of(folder: JobFolder, meshing: MeshingSettings) -> Stage:
+def mesh_of(folder: JobFolder, meshing: MeshingSettings, device: DeviceChoice = PROCESSOR) -> Stage:
     """Mesh the cube around the sphere."""
     earlier = read_job(folder.job_path)
     path = write_cube(folder.root / "ball.json")
@@ -44,8 +52,9 @@ def mesh_of(folder: JobFolder, meshing: MeshingSettings) -> Stage:
         (found,) = folder.stages.glob(f"{name}-*")
         stages[name] = Stage(name, found.name.partition("-")[2], found, read_done(found), True)
     return run_mesh(
-        folder, job, str(path), "ball", stages["cameras"], stages["train"], Progress(), threads=1
-    )
+        folder, job, str(path), "ball", stages["cameras"], stages["train"], Progress(), threads=1,
+        device=device,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("method", ["pam", "pivots"])
@@ -107,3 +116,81 @@ def test_a_job_makes_the_mesh_of_the_pivots_alone(
     for here, there in ((found, expected), (expected, found)):
         assert np.quantile(cKDTree(there).query(here)[0], 0.99) < tolerance
     assert len(found) == pytest.approx(len(expected), rel=0.05)
+
+
+class _EmulatedField(cuda_vacancy.CudaVacancyField):
+    """The GPU's field with its kernels on the host; says that it is where it was asked to be."""
+
+    library: Path
+
+    def __init__(self, arrays, cameras, *, device, **options):  # type: ignore[no-untyped-def]
+        super().__init__(
+            arrays, cameras, device="cpu", kernels=EmulatedKernels(self.library),
+            device_cache_bytes=1 << 30, **options,
+        )  # fmt: skip
+        self.device = device
+
+
+GPU = DeviceChoice("cuda:0", "Some GPU", "It passed.")
+
+
+@pytest.mark.parametrize(
+    ("free_gib", "device", "renderers"),
+    [
+        (4, "cuda:0", [DeviceRenderer]),
+        (1, "cuda:0", [DeviceRenderer, ViewRenderer]),
+        (0, "cpu", [ViewRenderer]),
+    ],
+)
+def test_on_a_gpu_the_field_and_the_depth_maps_are_there_if_they_fit(
+    free_gib: int,
+    device: str,
+    renderers: list[type],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    emulator_library: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    folder = write_finished_sphere(tmp_path)
+    monkeypatch.setattr(_EmulatedField, "library", emulator_library, raising=False)
+    monkeypatch.setattr(cuda_vacancy, "CudaVacancyField", _EmulatedField)
+    monkeypatch.setattr(choice, "_usable", lambda index: (True, "It passed."))
+    monkeypatch.setattr(choice, "_card", lambda index: "Some GPU")
+    free = (free_gib << 30, 8 << 30)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda index: free)
+    kernels = EmulatedKernels(emulator_library)
+    budget = 1 << 28 if free_gib > 1 else 1  # for tile intersections
+    asked = []
+
+    def renderer_of(device: str) -> DeviceRenderer:
+        asked.append(device)
+        return DeviceRenderer(kernels, torch.device("cpu"), lambda: budget)
+
+    monkeypatch.setattr(device_renderer, "device_renderer", renderer_of)
+    sampled = []
+    honest = depth_samples.sample_depth_maps
+
+    def watched(gaussians, *arguments, renderer, **named):  # type: ignore[no-untyped-def]
+        assert {tensor.device.type for _, tensor in gaussians.tensors()} == {"cpu"}
+        sampled.append(type(renderer))
+        return honest(gaussians, *arguments, renderer=renderer, **named)
+
+    monkeypatch.setattr(depth_samples, "sample_depth_maps", watched)
+    made = mesh_of(folder, MeshingSettings(points=300), GPU)
+    assert made.done["provenance"]["field_device"] == device
+    assert made.done["check"]["good"] is True
+    assert sampled == renderers
+    assert asked == ["cuda:0"] * (device == "cuda:0")
+    told = [line for line in caplog.messages if line.startswith("Vacancy runs on the processor")]
+    assert len(told) == (device == "cpu")
+    told = [line for line in caplog.messages if line.startswith("Depth maps are rendered on the")]
+    assert len(told) == (len(renderers) == 2)
+
+
+def test_a_finished_mesh_is_re_used_on_another_device(tmp_path: Path) -> None:
+    folder = write_finished_sphere(tmp_path)
+    settings = MeshingSettings(
+        method="pivots", pivots=2, pivot_samples="none", min_component_share=0.0
+    )
+    assert not mesh_of(folder, settings).reused
+    assert mesh_of(folder, settings, GPU).reused

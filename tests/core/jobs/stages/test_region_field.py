@@ -158,7 +158,7 @@ def test_without_a_usable_gpu_the_log_says_why_and_the_report_where(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     scene = scene_with_masks(tmp_path, slice(None))
-    monkeypatch.setattr(cuda_vacancy, "cuda_available", lambda: (False, "The driver is too old."))
+    monkeypatch.setattr(cuda_vacancy, "cuda_available", lambda _: (False, "The driver is too old."))
     fields = [
         region_field(
             scene, shell_arrays(0.9), cube(1.5), TrainingSettings(), MeshingSettings(), threads=1,

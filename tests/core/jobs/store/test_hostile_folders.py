@@ -234,7 +234,9 @@ def test_a_lock_that_is_a_pipe_is_replaced(folder: JobFolder) -> None:
     assert folder.locked()
 
 
-@pytest.mark.parametrize("use", [lambda f: work_on_tiles(f, 1, 0.0), lambda f: result_of(f.root)])
+@pytest.mark.parametrize(
+    "use", [lambda f: work_on_tiles(f, 1, 0.0, "cpu"), lambda f: result_of(f.root)]
+)
 def test_commands_on_a_job_refuse_links(
     folder: JobFolder, outside: Path, use: Callable[[JobFolder], None]
 ) -> None:

@@ -152,7 +152,7 @@ def test_tiles_are_open_for_the_job_that_they_are_of_alone(folder: JobFolder) ->
     begin(folder, regions=("auto",))
     assert unfinished_tile_lists(folder) == []
     with pytest.raises(UsageError, match="no tiles to work on"):
-        work_on_tiles(folder, 1, 0.0)
+        work_on_tiles(folder, 1, 0.0, "cpu")
     assert work(folder, 'MeshingError("a")') == 3
     assert not tiles.exists()
     # Nor where the job is done and another one, which ended well, has left them.

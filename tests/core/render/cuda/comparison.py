@@ -36,7 +36,7 @@ class Outcome:
 
     def slope(self) -> Tensor:
         """Return the slope of -log T at the depths, (h, w), of a rendering by the CUDA text."""
-        slope = self.render.color.grad_fn.slope  # type: ignore[union-attr]
+        slope = self.render.color.grad_fn.view.images.slope  # type: ignore[union-attr]
         assert isinstance(slope, Tensor)
         return slope.cpu().double()
 

@@ -9,7 +9,6 @@
 //
 // Compiled with -DKERNEL_TEXT="..." (the CUDA text) and -DKERNEL_TABLE="..." (one line per kernel).
 #include <math.h>
-#include <setjmp.h>
 #include <string.h>
 #include <ucontext.h>
 
@@ -44,52 +43,78 @@ static const size_t STACK_BYTES = 1 << 16;
 
 // -- fibres ---------------------------------------------------------------------------------------
 
-static jmp_buf scheduler, fibres[THREADS];
+// A fibre runs the threads of one place in the order, block after block. Only those that can go on
+// are switched to; the buffers are those of the compiler's own jumps, which save three words.
+typedef void* Jump[5];
+static Jump launcher, fibres[THREADS];
+static bool started[THREADS];
 static std::vector<char> stacks(THREADS * STACK_BYTES);
-static bool ended[THREADS];
-static int current, direction = 1, idle;
+static unsigned long long ready[THREADS / 64]; // bit of each place whose fibre can go on
+static int current, live;
+static bool backward, stuck;
 static void (*body)();
 
-static void give_way() {
-    if (_setjmp(fibres[current]) == 0) _longjmp(scheduler, 1);
+static int thread_at(int place) { return backward ? THREADS - 1 - place : place; }
+
+// Return the next place that can go on, round and round; -1 for none.
+static int next_place() {
+    const int word = current >> 6, shift = current & 63;
+    const unsigned long long later = shift == 63 ? 0 : ready[word] >> (shift + 1) << (shift + 1);
+    if (later) return (word << 6) + __builtin_ctzll(later);
+    for (int i = 1; i <= THREADS / 64; ++i) {
+        const int w = (word + i) % (THREADS / 64);
+        if (ready[w]) return (w << 6) + __builtin_ctzll(ready[w]);
+    }
+    return -1;
+}
+
+static void fibre();
+
+__attribute__((noinline, noreturn)) static void back_to_launcher() {
+    __builtin_longjmp(launcher, 1);
+}
+
+__attribute__((noinline, noreturn)) static void resume(int place) {
+    if (place < 0) {
+        stuck = live > 0;
+        back_to_launcher();
+    }
+    current = place;
+    threadIdx.x = thread_at(place);
+    if (started[place]) __builtin_longjmp(fibres[place], 1);
+    started[place] = true;
+    ucontext_t context;
+    getcontext(&context);
+    context.uc_stack.ss_sp = &stacks[place * STACK_BYTES];
+    context.uc_stack.ss_size = STACK_BYTES;
+    context.uc_link = 0;
+    makecontext(&context, fibre, 0);
+    setcontext(&context);
+    __builtin_unreachable();
+}
+
+// Let the others go on until this fibre is ready again.
+__attribute__((noinline)) static void give_way() {
+    ready[current >> 6] &= ~(1ull << (current & 63));
+    if (__builtin_setjmp(fibres[current]) == 0) resume(next_place());
 }
 
 static void fibre() {
-    body();
-    ended[current] = true;
-    _longjmp(scheduler, 1);
+    for (;;) {
+        body();
+        --live;
+        give_way(); // until the next block
+    }
 }
 
 // Return whether the block ran to its end.
-static bool run_block() {
-    for (int t = 0; t < THREADS; ++t) ended[t] = false;
-    std::vector<bool> started(THREADS, false);
-    volatile int live = THREADS;
-    idle = 0;
-    current = direction > 0 ? THREADS - 1 : 0;
-    while (live > 0) {
-        do current = (current + direction + THREADS) % THREADS;
-        while (ended[current]);
-        threadIdx.x = current;
-        if (_setjmp(scheduler) == 0) {
-            if (started[current]) _longjmp(fibres[current], 1);
-            started[current] = true;
-            ucontext_t context;
-            getcontext(&context);
-            context.uc_stack.ss_sp = &stacks[current * STACK_BYTES];
-            context.uc_stack.ss_size = STACK_BYTES;
-            context.uc_link = 0;
-            makecontext(&context, fibre, 0);
-            setcontext(&context);
-        }
-        if (ended[current]) {
-            --live;
-            idle = 0;
-        } else if (++idle > 2 * THREADS) {
-            return false;
-        }
-    }
-    return true;
+__attribute__((noinline)) static bool run_block() {
+    for (unsigned long long& bits : ready) bits = ~0ull;
+    live = THREADS;
+    if (__builtin_setjmp(launcher) == 0) resume(0);
+    if (stuck)
+        for (bool& has : started) has = false;
+    return !stuck;
 }
 
 // -- collective operations ------------------------------------------------------------------------
@@ -100,19 +125,22 @@ struct Meeting {
 };
 static Meeting block_meeting, warp_meetings[THREADS / 32];
 
-// Bring a value, wait for the others, return everybody's values.
+// Bring a value, wait for the others, return everybody's values. Those who waited can go on then;
+// they are all threads of the block, or those of the 32 places of this one.
 static const double* meet(Meeting& meeting, int member, double value) {
-    const int generation = meeting.generation;
-    meeting.values[generation & 1][member] = value;
-    idle = 0;
-    if (++meeting.arrived == meeting.expected) {
-        meeting.arrived = 0;
-        ++meeting.generation;
-    } else {
-        while (meeting.generation == generation) give_way();
-        idle = 0;
+    const double* values = meeting.values[meeting.generation & 1];
+    meeting.values[meeting.generation & 1][member] = value;
+    if (++meeting.arrived < meeting.expected) {
+        give_way();
+        return values;
     }
-    return meeting.values[generation & 1];
+    meeting.arrived = 0;
+    ++meeting.generation;
+    if (meeting.expected == THREADS)
+        for (unsigned long long& bits : ready) bits = ~0ull;
+    else
+        ready[current >> 6] |= 0xffffffffull << (current & 32);
+    return values;
 }
 
 static void __syncthreads() { meet(block_meeting, threadIdx.x, 0.0); }
@@ -150,6 +178,7 @@ static inline float __int_as_float(int bits) {
     return value;
 }
 static inline float __fmul_rn(float a, float b) { return a * b; }
+static inline float __fadd_rn(float a, float b) { return a + b; }
 
 // The hardware's approximations may be off by this many units in the last place; set to test what
 // that does. The sign alternates with the argument's bits, so that errors do not all agree.
@@ -204,7 +233,7 @@ extern "C" int emulate(const char* name, int blocks, void** arguments, int backw
         if (strcmp(entry.name, name) != 0) continue;
         body = entry.run;
         parameters = arguments;
-        direction = backwards ? -1 : 1;
+        backward = backwards;
         approximation_ulp = ulp;
         for (int b = 0; b < blocks; ++b) {
             blockIdx.x = b;

@@ -218,4 +218,4 @@ def test_bands_change_only_the_order_of_sums(emulator_library: Path) -> None:
 
 def pair_count(found: Outcome) -> int:
     """Return how many pairs of Gaussian and tile the view has."""
-    return len(found.render.color.grad_fn.bands[0].gaussian_ids)  # type: ignore[union-attr]
+    return len(found.render.color.grad_fn.view.band_lists[0].gaussian_ids)  # type: ignore[union-attr]

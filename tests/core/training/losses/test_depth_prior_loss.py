@@ -8,12 +8,12 @@ import pytest
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.stereo.depth_priors import DepthPrior
+from gaussian_wrapping_addon.core.training.devices.windows import Window
 from gaussian_wrapping_addon.core.training.losses.depth_prior_loss import (
     OUTLIER_SHARE,
     TOLERANCE_SHARE,
     depth_prior_loss,
 )
-from gaussian_wrapping_addon.core.training.windows import Window
 from tests.core.render.scenes import look_at
 
 WEIGHT = 0.3

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..dataset.camera import Camera
+from ...dataset.camera import Camera
 
 OVERLAP_PX = 16
 """Overlap of neighbouring windows: SSIM leaves out five pixels along the border of each."""

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Render a few Gaussians with the CUDA kernels and compare with the definition."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..dataset.camera import Camera
+from ..errors import DeviceError, ResourceError
+from ..gaussians.model import OrientedGaussians
+from ..render.cuda.cuda_render import render_with
+from ..render.cuda.kernels import Kernels, device_kernels
+from ..render.reference.reference import render_reference
+from ..render.types.images import Render
+from ..render.types.options import RenderOptions
+
+TOLERANCE = 1e-3
+"""Of images and, relative to their length, of gradients: far above float32 rounding (below 1e-5
+here, with the hardware's approximations), far below what a kernel that does not run gives."""
+
+_BUDGET_BYTES = 1 << 24
+_OPTIONS = RenderOptions(depth=True)
+_COMPARED = ("color", "normal", "alpha", "depth")
+_TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
+
+
+def failure_on(device_index: int) -> str:
+    """Return why a GPU's kernels give no right result, ``""`` where they do.
+
+    Compiles the kernels on the first call of the process.
+    """
+    try:
+        return check_kernels(device_kernels(device_index), torch.device("cuda", device_index))
+    except (DeviceError, ResourceError) as error:
+        return error.message
+    except RuntimeError as error:  # torch's errors of the driver and of kernels that fail
+        lines = str(error).strip().splitlines()
+        return f"The test of the GPU's kernels failed: {lines[0] if lines else 'no message'}."
+
+
+def check_kernels(kernels: Kernels, device: torch.device) -> str:
+    """Compare images and gradients of a small scene; return what differs, ``""`` if nothing.
+
+    Parameters
+    ----------
+    kernels : Kernels
+    device : torch.device
+        Where their tensors are.
+    """
+    camera = _camera()
+    definition = _scene(torch.float64, torch.device("cpu"))
+    expected = render_reference(definition, camera, _OPTIONS)
+    tested = _scene(torch.float32, device)
+    found = render_with(kernels, tested, camera, _OPTIONS, _BUDGET_BYTES)
+    for name in _COMPARED:
+        gap = float((_on_cpu(getattr(found, name)) - _on_cpu(getattr(expected, name))).abs().max())
+        if not gap <= TOLERANCE:  # NaN is no match either
+            return f"The GPU renders another {name} than the definition: {gap:.1g} off."
+    _loss(expected).backward()
+    _loss(found).backward()
+    for name in _TRAINED:
+        wanted = getattr(definition, name).grad
+        gap = float((_on_cpu(getattr(tested, name).grad) - wanted).norm() / wanted.norm())
+        if not gap <= TOLERANCE:
+            return f"The GPU gives another gradient of {name} than the definition: {gap:.1g} off."
+    return ""
+
+
+def _on_cpu(tensor: Tensor) -> Tensor:
+    return tensor.detach().to("cpu", torch.float64)
+
+
+def _loss(images: Render) -> Tensor:
+    """Return a number that every image contributes to, each pixel differently."""
+    height, width = images.alpha.shape
+    weights = torch.linspace(0.5, 1.5, height * width, dtype=torch.float64)
+    weights = weights.reshape(height, width).to(images.alpha)
+    flat = images.alpha + images.depth + images.color.sum(-1) + images.normal.sum(-1)
+    return (weights * flat).sum()
+
+
+def _camera() -> Camera:
+    """Return a camera at the origin that looks along z; the image has tiles with a rest."""
+    pose = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
+    return Camera("check", 20, 18, 20.0, 20.0, 10.0, 9.0, pose)
+
+
+def _scene(dtype: torch.dtype, device: torch.device) -> OrientedGaussians:
+    """Return Gaussians that all pixels see: no rounding decides whether one contributes."""
+    rows = {
+        "means": [[0.1, 0.0, 3.0], [-0.4, 0.2, 3.5], [0.3, -0.3, 4.0], [0.0, 0.1, 5.0]],
+        "log_scales": [[0.3, 0.2, -1.5], [0.4, 0.3, -1.0], [0.5, 0.4, -1.2], [0.9, 0.9, -0.5]],
+        "quats": [[1.0, 0.1, 0.0, 0.1], [1.0, 0.0, 0.2, 0.0], [1.0, -0.1, 0.1, 0.0],
+                  [1.0, 0.0, 0.0, 0.3]],
+        "opacity_logits": [0.0, 0.3, 0.5, 3.0],
+        "sh": [[[0.8, 0.1, -0.3]], [[-0.2, 0.6, 0.2]], [[0.1, -0.4, 0.7]], [[0.3, 0.3, 0.1]]],
+        "orientation": [[0.0, 0.1, -1.0, 0.8], [0.2, 0.0, -1.0, 0.5], [0.0, -0.3, -1.0, 1.2],
+                        [0.1, 0.1, -1.0, 0.9]],
+        "filter_3d": [0.01, 0.01, 0.02, 0.02],
+    }  # fmt: skip
+    tensors = {
+        name: torch.tensor(values, dtype=dtype, device=device, requires_grad=name in _TRAINED)
+        for name, values in rows.items()
+    }
+    return OrientedGaussians(**tensors)

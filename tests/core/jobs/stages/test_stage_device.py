@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The device that stages compute on: handed to the training, noted, and in no key."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from gaussian_wrapping_addon.core import devices
+from gaussian_wrapping_addon.core.devices import DeviceChoice, choose_device, whole_views
+from gaussian_wrapping_addon.core.evaluation.report import pictures
+from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
+from gaussian_wrapping_addon.core.jobs.runner import STAGE_VERSIONS
+from gaussian_wrapping_addon.core.jobs.stages import (
+    region_field,
+    region_meshing,
+    training_stage,
+)
+from gaussian_wrapping_addon.core.jobs.stages.training_stage import GAUSSIANS_NAME, run_training
+from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage, read_done
+from gaussian_wrapping_addon.core.meshing.tiles import store
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.training import trainer
+from gaussian_wrapping_addon.core.training.devices import chosen
+from gaussian_wrapping_addon.core.training.result import TrainingResult
+from tests.core.jobs.finished_sphere import write_finished_sphere
+from tests.core.meshing.meshing_scenes import cube
+
+GPU = DeviceChoice("cuda:1", "Some GPU", "It passed.")
+
+
+def stage_of(folder: JobFolder, name: str) -> Stage:
+    (found,) = folder.stages.glob(f"{name}-*")
+    return Stage(name, found.name.partition("-")[2], found, read_done(found) or {}, True)
+
+
+def trained(folder: JobFolder, device: DeviceChoice) -> Stage:
+    return run_training(
+        folder, read_job(folder.job_path), stage_of(folder, "cameras"), Progress(),
+        version=STAGE_VERSIONS["train"], threads=1, device=device,
+    )  # fmt: skip
+
+
+def test_the_training_gets_the_device_and_notes_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    folder = write_finished_sphere(tmp_path)
+    path = stage_of(folder, "train").folder / GAUSSIANS_NAME
+    gaussians = load_gaussians(path)
+    path.unlink()
+    given: list[Any] = []
+
+    def train(*_: object, backend: object, **__: object) -> TrainingResult:
+        given.append(backend)
+        return TrainingResult(gaussians, 7, (), (), 1.0, (), device="cuda:1")
+
+    def with_renderer(device: str, what: str, work: Callable[[Any], Any]) -> Any:
+        given.append((device, what))
+        return work("its renderer")
+
+    def write_held_out(*_: object, renderer: object, **__: object) -> list[dict[str, Any]]:
+        given.append(renderer)
+        return []
+
+    monkeypatch.setattr(trainer, "train", train)
+    monkeypatch.setattr(
+        chosen, "chosen_backend", lambda device, threads, **_: f"backend of {device}"
+    )
+    monkeypatch.setattr(whole_views, "with_renderer", with_renderer)
+    monkeypatch.setattr(pictures, "write_held_out", write_held_out)
+    monkeypatch.setattr(training_stage, "stage_device", lambda chosen, *_: chosen)
+    monkeypatch.setattr(training_stage, "_estimate", lambda *_: ({}, []))
+    done = trained(folder, GPU)
+    expected = [
+        "backend of cuda:1", ("cuda:1", "Pictures of held-out photos"), "its renderer",
+    ]  # fmt: skip
+    assert given == expected
+    assert (done.done["device"], done.done["device_reason"]) == ("cuda:1", "It passed.")
+    assert "training on cuda:1" in caplog.messages
+    again = trained(folder, choose_device("cpu"))
+    assert (again.reused, again.folder, again.done["device"]) == (True, done.folder, "cuda:1")
+    assert given == expected
+
+
+class _Asked(Exception):  # noqa: N818 - no error: ends where the field would be made
+    pass
+
+
+def test_a_helper_at_tiles_uses_its_own_device_not_the_jobs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_finished_sphere(tmp_path)
+    settings = replace(read_job(folder.job_path).settings, device="cuda:5")
+    origin = region_meshing.tiles_origin(
+        stage_of(folder, "cameras").folder, stage_of(folder, "train").folder, settings
+    )
+    plan = SimpleNamespace(region=cube(1.4))
+    asked: list[str] = []
+
+    def choose(setting: str) -> DeviceChoice:
+        asked.append(setting)
+        return GPU
+
+    def field(*_: object, device: str, **__: object) -> None:
+        asked.append(device)
+        raise _Asked
+
+    monkeypatch.setattr(store, "load_plan", lambda _: (plan, origin))
+    monkeypatch.setattr(devices, "choose_device", choose)
+    monkeypatch.setattr(region_field, "stage_device", lambda chosen, *_: chosen)
+    monkeypatch.setattr(region_field, "region_field", field)
+    with pytest.raises(_Asked):
+        region_meshing.work_on_tile_list(
+            folder.stages, tmp_path, Progress(), [], threads=1, device="cuda:1"
+        )
+    assert asked == ["cuda:1", "cuda:1"]
