@@ -46,12 +46,12 @@ HALF = 1.3
 
 SETTINGS = JobSettings(
     training=TrainingSettings(
-        iterations=40, short_run_power=0.0, max_gaussians=260, sh_degree=1, densify_every=10,
+        iterations=40, short_run_power=0.0, max_gaussians=450, sh_degree=1, densify_every=10,
         depth_from=0.2,
         multi_view_pixels=60, multi_view="on", lambda_geometric=0.0, harmonics="on",
         wrapping="on", wrap_rounds=1, dense_start="off", holdout_every=6,
     ),
-    meshing=MeshingSettings(points=300),
+    meshing=MeshingSettings(points=600),
     texture=TextureSettings(size_px=64),
     export=("ply",),
 )  # fmt: skip
@@ -96,7 +96,7 @@ def start_near(monkeypatch: pytest.MonkeyPatch) -> None:
     """
 
     def start(scene: Scene, *_: Any, **__: Any) -> OrientedGaussians:
-        near = perturbed_sphere(200, 1, factor=0.2, opacity=0.9)
+        near = perturbed_sphere(400, 1, factor=0.05, opacity=0.97)
         moved = transform_gaussians(near, scene.world_from_scene.inverse())
         return OrientedGaussians(**{name: t.float() for name, t in moved.tensors()})
 
@@ -148,8 +148,7 @@ def distances(mesh: trimesh.Trimesh, other: trimesh.Trimesh) -> np.ndarray:
     """Return the distances of a mesh's points near the sphere from another mesh.
 
     The region's corners lie in the sphere's shadow, and its poles are hardly seen: a bit decides
-    there what the mesh is. On these coarse meshes, elsewhere too, Gaussians moved by 1e-6 give
-    vertices moved by 1 % of the diagonal here and there, and a PSNR of 0.2 dB more or less.
+    there what the mesh is.
     """
     points = np.concatenate([mesh.vertices, mesh.sample(4000, seed=1)])
     height = np.linalg.norm(points, axis=1)
@@ -186,11 +185,12 @@ def test_the_mesh_of_a_gpu_is_that_of_the_processor(
     assert b["loss"] == pytest.approx(a["loss"], rel=1e-3)
     assert two["held_out_psnr"] == pytest.approx(one["held_out_psnr"], abs=0.02)
     assert two["held_out_psnr"] > 25.0
-    assert mean_psnr(there) == pytest.approx(mean_psnr(here), abs=0.5)
+    # Of photos of 24 px half of what the mesh covers is its rim: a vertex moves it by a decibel.
+    assert mean_psnr(there) == pytest.approx(mean_psnr(here), abs=2.0)
     assert mesh.is_watertight
     assert other.is_watertight
     gaps = [distances(*pair) for pair in ((mesh, other), (other, mesh))]
     diagonal = 2.0 * HALF * 3**0.5
     for gap in gaps:
-        assert np.quantile(gap, 0.99) < 0.01 * diagonal
-        assert gap.max() < 0.04 * diagonal
+        assert np.quantile(gap, 0.99) < 0.004 * diagonal
+        assert gap.max() < 0.01 * diagonal
