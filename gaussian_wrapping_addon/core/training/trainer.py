@@ -15,7 +15,6 @@ import torch
 from ..dataset.photo_source import PhotoSource
 from ..dataset.scene import Scene
 from ..dataset.view_split import FEW_PHOTOS, evenly_spaced, held_out_views, training_views
-from ..devices.failures import is_device_failure, is_memory_failure
 from ..errors import Cancelled, DatasetError, WrapError
 from ..gaussians.initialisation import initial_gaussians
 from ..gaussians.model import OrientedGaussians
@@ -30,6 +29,7 @@ from .appearance.photo_exposure import Exposure, corrected_for_measuring
 from .backdrop import with_backdrop
 from .cancellation import CancellablePhotos
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
+from .device_recovery import DeviceRecovery
 from .devices.backend import Backend
 from .devices.cpu_backend import CpuBackend
 from .initialisation.dense_start import dense_start, matched_photos, on_planes
@@ -177,6 +177,7 @@ class _Trainer:
         self.live = LiveView(
             self.posed, self.held_out, folder, settings, threads, renderer=self.stepper.renderer
         )
+        self.recovery = DeviceRecovery(self.stepper, self.posed, self.live, threads)
 
     def _image_size(self, side_px: int) -> tuple[Decision, int]:
         """Decide whether to train at full or half size."""
@@ -204,7 +205,12 @@ class _Trainer:
         else:
             _logger.info("resuming at iteration %d", state.iteration)
             self.stepper.priors = self._saved_priors(state, key, progress)
-        snapshot = self._begun(state)
+
+        def again() -> TrainingState:
+            found = load_checkpoint(self.folder, key)
+            return self._start(rounds, key, progress) if found is None else found
+
+        snapshot = self.recovery.begun(state)
         begun_s = saved_s = time.monotonic()
         spent_s, begun_at = state.seconds, state.iteration
         total, consistent = self.schedule.total, True
@@ -235,12 +241,12 @@ class _Trainer:
                             saved_s = time.monotonic()
                     except NotFinite:
                         state = self._restart(state, snapshot)
-                        snapshot, consistent = self._begun(state), True
+                        snapshot, consistent = self.recovery.begun(state), True
                 except (WrapError, RuntimeError) as error:
-                    if not self._is_device_failure(error):
+                    if not self.recovery.is_device_failure(error):
                         raise
-                    state = self._without_device(error, snapshot, rounds, key, progress)
-                    snapshot, consistent = self._begun(state), True
+                    state = self.recovery.without_device(error, snapshot, again)
+                    snapshot, consistent = self.recovery.begun(state), True
         except Cancelled:
             # Save a consistent state, not one of a half-finished round or with non-finite values.
             try:
@@ -248,7 +254,7 @@ class _Trainer:
                     state = TrainingState.of_snapshot(snapshot)
                 save_checkpoint(self.folder, state, key)
             except (WrapError, RuntimeError) as lost:
-                if not self._is_device_failure(lost):
+                if not self.recovery.is_device_failure(lost):
                     raise
                 _logger.warning("%s failed: the last checkpoint stands", self.stepper.backend.name)
             raise
@@ -257,10 +263,10 @@ class _Trainer:
             try:
                 return self._result(rounds, state, spent_s + time.monotonic() - begun_s, progress)
             except (WrapError, RuntimeError) as error:
-                if not self._is_device_failure(error):
+                if not self.recovery.is_device_failure(error):
                     raise
                 # Both the snapshot and the checkpoint are of the last iteration.
-                state = self._without_device(error, snapshot, rounds, key, progress)
+                state = self.recovery.without_device(error, snapshot, again)
 
     def _result(
         self, rounds: Rounds, state: TrainingState, seconds: float, progress: Progress
@@ -434,77 +440,6 @@ class _Trainer:
             model_selection = model_selection.with_decision(Decision.by_settings("growth", "off"))
         state.model_selection = model_selection
 
-    def _adopt(self, state: TrainingState) -> None:
-        """Bring a state to where the backend computes, and the photos to its poses."""
-        backend = self.stepper.backend
-        state.adam = backend.adopted(state.adam)
-        state.statistics = backend.adopted_statistics(state.statistics)
-        self.posed.poses = state.poses
-
-    def _begun(self, state: TrainingState) -> Snapshot:
-        """Adopt a state and return its snapshot; on the processor where the device fails at it."""
-        before = state.adam, state.statistics
-        try:
-            self._adopt(state)
-            return state.snapshot()
-        except (WrapError, RuntimeError) as error:
-            if not self._is_device_failure(error):
-                raise
-            name = self.stepper.backend.name
-            self._use_processor()
-            state.adam, state.statistics = before
-            self._adopt(state)
-            self._note_failure(state, name, error, "on the processor")
-            return state.snapshot()
-
-    def _is_device_failure(self, error: Exception) -> bool:
-        """Tell whether the device that trains failed, so that the training can do without it."""
-        return not isinstance(self.stepper.backend, CpuBackend) and is_device_failure(error)
-
-    def _use_processor(self) -> None:
-        self.stepper.backend = CpuBackend(self.threads)
-        self.live.renderer = self.stepper.renderer
-
-    def _without_device(
-        self, error: Exception, snapshot: Snapshot, rounds: Rounds, key: str, progress: Progress
-    ) -> TrainingState:
-        """Go back to what a failing device has left: with less of its memory, or without it."""
-        backend = self.stepper.backend
-        smaller = is_memory_failure(error) and backend.use_less_memory()
-        if not smaller:
-            self._use_processor()
-        try:
-            state = TrainingState.of_snapshot(snapshot)
-            self._adopt(state)
-        except (WrapError, RuntimeError) as lost:
-            # A driver that was reset takes the snapshot along; or there is no room for its copy.
-            if not is_device_failure(lost):
-                raise
-            smaller = False
-            self._use_processor()
-            self.posed.poses = None  # as at the first start
-            found = load_checkpoint(self.folder, key)
-            state = self._start(rounds, key, progress) if found is None else found
-            self._adopt(state)
-        onward = "with less memory" if smaller else "on the processor"
-        self._note_failure(state, backend.name, error, onward)
-        return state
-
-    def _note_failure(
-        self, state: TrainingState, device: str, error: Exception, onward: str
-    ) -> None:
-        _logger.warning(
-            "%s failed (%s): going on %s from iteration %d", device, error, onward, state.iteration
-        )
-        state.warnings.append(
-            ReportWarning(
-                "device-failed",
-                f"{device} failed in the training ({error}); it went on {onward} from "
-                f"iteration {state.iteration}.",
-                "Close other programs that use the GPU, or choose fewer Gaussians.",
-            )
-        )
-
     def _restart(self, state: TrainingState, snapshot: Snapshot) -> TrainingState:
         """Restore the last snapshot with lower rates and another view order, at most once."""
         if state.restarts > 0:
@@ -516,7 +451,7 @@ class _Trainer:
         _logger.warning("non-finite values at iteration %d: going back", state.iteration)
         restored = TrainingState.of_snapshot(snapshot)
         restored.restarts = state.restarts + 1
-        self._adopt(restored)
+        self.recovery.adopt(restored)
         restored.rate_factor = state.rate_factor * RESTART_RATE
         restored.order = []
         restored.random = np.random.Generator(np.random.PCG64([self.seed, 3]))
