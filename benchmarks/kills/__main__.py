@@ -42,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=DOCUMENTS, help="folder of the page")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    options.out.mkdir(parents=True, exist_ok=True)  # before hours of trials, not after
     outcomes = {} if options.again else read_outcomes()
     trials = draw(options.n, options.seed, tuple(options.ways))
     missing = [trial for trial in trials if trial.identity not in outcomes]
