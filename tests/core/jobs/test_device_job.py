@@ -21,6 +21,8 @@ from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.jobs.runner import run_job
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.region import write_region
 from gaussian_wrapping_addon.core.render.cuda import device_renderer
 from gaussian_wrapping_addon.core.render.cuda.device_renderer import DeviceRenderer
 from gaussian_wrapping_addon.core.settings import (
@@ -35,24 +37,24 @@ from gaussian_wrapping_addon.core.training.devices import chosen
 from gaussian_wrapping_addon.core.training.initialisation.splat_transform import (
     transform_gaussians,
 )
-from tests.core.jobs.finished_sphere import write_cube
 from tests.core.render.cuda.emulation import EmulatedKernels
 from tests.core.training.devices.device_training import emulated_backend, perturbed_sphere
 from tests.core.training.small_scene import sphere_scene
 
-SIZE_PX, NEAR = 24, (1.0, 1.2)
-HALF = 1.3
-"""Half of the side of the region, a cube around the sphere."""
+SIZE_PX, TRAINED_PX = 64, 32
+REGION_RADIUS = 1.35
+"""Of the region, an icosphere: all of it is in view. A cube's corners are not: a bit decides what
+they are, and before the background they move the textured mesh's PSNR by decibels."""
 
 SETTINGS = JobSettings(
     training=TrainingSettings(
         iterations=40, short_run_power=0.0, max_gaussians=450, sh_degree=1, densify_every=10,
-        depth_from=0.2,
+        depth_from=0.2, max_image_px=TRAINED_PX,
         multi_view_pixels=60, multi_view="on", lambda_geometric=0.0, harmonics="on",
-        wrapping="on", wrap_rounds=1, dense_start="off", holdout_every=6,
+        wrapping="on", wrap_rounds=1, dense_start="off", holdout_every=3,
     ),
-    meshing=MeshingSettings(points=600),
-    texture=TextureSettings(size_px=64),
+    meshing=MeshingSettings(points=1000),
+    texture=TextureSettings(size_px=128),
     export=("ply",),
 )  # fmt: skip
 
@@ -133,8 +135,10 @@ def write_photos(folder: Path) -> Path:
 
 def finished(source: Path, out: Path, device: str) -> tuple[dict[str, Any], trimesh.Trimesh]:
     """Run the job; return its report and the mesh."""
-    box = write_cube(source.parent / "ball.json", HALF)
-    settings = dataclasses.replace(SETTINGS, device=device, regions=(str(box),))
+    region = Region("ball", np.asarray(trimesh.creation.icosphere(1, REGION_RADIUS).vertices))
+    path = source.parent / "ball.json"
+    write_region(path, region)
+    settings = dataclasses.replace(SETTINGS, device=device, regions=(str(path),))
     folder = JobFolder(out)
     folder.create()
     job = make_job("wrap", source, settings)
@@ -145,15 +149,8 @@ def finished(source: Path, out: Path, device: str) -> tuple[dict[str, Any], trim
 
 
 def distances(mesh: trimesh.Trimesh, other: trimesh.Trimesh) -> np.ndarray:
-    """Return the distances of a mesh's points near the sphere from another mesh.
-
-    The region's corners lie in the sphere's shadow, and its poles are hardly seen: a bit decides
-    there what the mesh is.
-    """
+    """Return the distances of a mesh's points from another mesh."""
     points = np.concatenate([mesh.vertices, mesh.sample(4000, seed=1)])
-    height = np.linalg.norm(points, axis=1)
-    points = points[(height > NEAR[0]) & (height < NEAR[1])]
-    assert len(points) > 3000
     return np.asarray(trimesh.proximity.closest_point(other, points)[1])
 
 
@@ -185,12 +182,13 @@ def test_the_mesh_of_a_gpu_is_that_of_the_processor(
     assert b["loss"] == pytest.approx(a["loss"], rel=1e-3)
     assert two["held_out_psnr"] == pytest.approx(one["held_out_psnr"], abs=0.02)
     assert two["held_out_psnr"] > 25.0
-    # Of photos of 24 px half of what the mesh covers is its rim: a vertex moves it by a decibel.
-    assert mean_psnr(there) == pytest.approx(mean_psnr(here), abs=2.0)
+    # Gaussians moved by 1e-6 change the processor's own by 0.12 dB, its mesh by 0.4 %.
+    assert mean_psnr(there) == pytest.approx(mean_psnr(here), abs=0.3)
+    assert mean_psnr(here) > 26.0
     assert mesh.is_watertight
     assert other.is_watertight
     gaps = [distances(*pair) for pair in ((mesh, other), (other, mesh))]
-    diagonal = 2.0 * HALF * 3**0.5
+    diagonal = 2.0 * REGION_RADIUS * 3**0.5
     for gap in gaps:
         assert np.quantile(gap, 0.99) < 0.004 * diagonal
         assert gap.max() < 0.01 * diagonal
