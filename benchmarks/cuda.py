@@ -25,7 +25,7 @@ if __package__ in (None, ""):
 
 from benchmarks.workload import surface_gaussians, view
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 from gaussian_wrapping_addon.core.render.cuda.cuda_render import render_with
 from gaussian_wrapping_addon.core.render.cuda.kernels import (
@@ -38,7 +38,6 @@ from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types.images import Render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
-TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")
 BUDGET_BYTES = 4 << 30
 CPU_REPEATS = 3

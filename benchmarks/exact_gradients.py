@@ -10,14 +10,13 @@ import numpy as np
 import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
 from gaussian_wrapping_addon.core.render.reference.reference import render_reference
 from gaussian_wrapping_addon.core.render.types.images import Render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .exact import TILE, Tiles, as_float64
 
-TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")
 
 Weights = dict[str, torch.Tensor]

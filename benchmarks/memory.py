@@ -26,13 +26,13 @@ if __package__ in (None, ""):
 from benchmarks.workload import surface_gaussians, view
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
 from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients, VisibleGradients
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 
-_TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 _MIB = 2**20
 # Rows an optimiser step works on at once: its temporary arrays stay small.
 _STEP_ROWS = 65_536
@@ -60,7 +60,7 @@ def step(
     raw: RawArrays, moments: dict[str, tuple[np.ndarray, np.ndarray]], gradients: VisibleGradients
 ) -> None:
     """Move the seen rows like Adam, at a rate that leaves the workload what it is."""
-    for name in _TRAINED:
+    for name in TRAINED:
         values, (first, second) = getattr(raw, name), moments[name]
         for begin in range(0, len(gradients.ids), _STEP_ROWS):
             rows = gradients.ids[begin : begin + _STEP_ROWS]
@@ -100,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Path("/proc/self/clear_refs").write_text("5")
     moments = {
         name: (np.zeros_like(getattr(raw, name)), np.zeros_like(getattr(raw, name)))
-        for name in _TRAINED
+        for name in TRAINED
     }
     for pair in moments.values():
         for moment in pair:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..dataset.camera import Camera
 from ..errors import DeviceError, ResourceError
-from ..gaussians.model import OrientedGaussians
+from ..gaussians.model import TRAINED, OrientedGaussians
 from ..render.cuda.cuda_render import render_with
 from ..render.cuda.kernels import Kernels, device_kernels
 from ..render.reference.reference import render_reference
@@ -23,7 +23,6 @@ here, with the hardware's approximations), far below what a kernel that does not
 _BUDGET_BYTES = 1 << 24
 _OPTIONS = RenderOptions(depth=True)
 _COMPARED = ("color", "normal", "alpha", "depth")
-_TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 
 
 def failure_on(device_index: int) -> str:
@@ -60,7 +59,7 @@ def check_kernels(kernels: Kernels, device: torch.device) -> str:
             return f"The GPU renders another {name} than the definition: {gap:.1g} off."
     _loss(expected).backward()
     _loss(found).backward()
-    for name in _TRAINED:
+    for name in TRAINED:
         wanted = getattr(definition, name).grad
         gap = float((_on_cpu(getattr(tested, name).grad) - wanted).norm() / wanted.norm())
         if not gap <= TOLERANCE:
@@ -101,7 +100,7 @@ def _scene(dtype: torch.dtype, device: torch.device) -> OrientedGaussians:
         "filter_3d": [0.01, 0.01, 0.02, 0.02],
     }  # fmt: skip
     tensors = {
-        name: torch.tensor(values, dtype=dtype, device=device, requires_grad=name in _TRAINED)
+        name: torch.tensor(values, dtype=dtype, device=device, requires_grad=name in TRAINED)
         for name, values in rows.items()
     }
     return OrientedGaussians(**tensors)

@@ -12,6 +12,10 @@ from torch import Tensor
 
 from .. import tolerances
 
+TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
+"""Tensors of :class:`OrientedGaussians` that receive gradients; ``filter_3d`` is recomputed
+instead (docs/method.md, section 1.5)."""
+
 
 @dataclass(frozen=True)
 class GaussianArrays:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..dataset.camera import Camera
-from ..gaussians.model import OrientedGaussians
+from ..gaussians.model import TRAINED, OrientedGaussians
 from ..kernels.array_store import ArrayStore
 from ..kernels.parallel import default_threads
 from .cuda.cuda_render import render_cuda
@@ -24,8 +24,6 @@ from .types.gradients import ImageGradients
 from .types.images import Render, RenderStatistics
 from .types.options import RenderOptions
 from .view_renderer import ViewPass, ViewRenderer, allocate_screen, band_view
-
-_TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 
 
 @functools.cache
@@ -71,7 +69,7 @@ def render(
         return render_cuda(gaussians, camera, options)
     options = options or RenderOptions()
     collected: list[RenderStatistics] = []
-    tensors = [getattr(gaussians, name) for name in _TRAINED]
+    tensors = [getattr(gaussians, name) for name in TRAINED]
     images = _Rasterize.apply(
         *tensors, gaussians, camera, options, collected, buffers or _shared_buffers()
     )
@@ -134,7 +132,7 @@ class _Rasterize(torch.autograd.Function):
         screen = dataclasses.replace(view.screen, visible=seen)
         raw = RawGradients.zeros(gaussians)
         project_backward(gaussians, ctx.camera, ctx.options, screen, grad_params, raw)
-        return (*(torch.from_numpy(getattr(raw, name)) for name in _TRAINED), *[None] * 5)
+        return (*(torch.from_numpy(getattr(raw, name)) for name in TRAINED), *[None] * 5)
 
 
 def _render_view(

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..gaussians.model import OrientedGaussians
+from ..gaussians.model import TRAINED, OrientedGaussians
 from ..report_warning import ReportWarning, read_warnings
 from .appearance.photo_exposure import Exposure
 from .density.density_control import DensityStatistics
-from .optimizer.adam import TRAINED, Adam
+from .optimizer.adam import Adam
 from .poses.camera_poses import CameraPoses
 from .selection.growth_selection import ErrorHistory
 from .selection.model_selection import ModelSelection

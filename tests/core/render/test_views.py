@@ -11,7 +11,7 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
 from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients, VisibleGradients
@@ -21,7 +21,6 @@ from gaussian_wrapping_addon.core.render.view_renderer import ViewPass, ViewRend
 
 from .scenes import isotropic, look_at, random_gaussians
 
-TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")
 CAMERA = look_at((2.2, 1.0, 0.8), width=41, height=35)
 

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.errors import ParseError, UsageError
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training.checkpoint import (
     fingerprint,
@@ -20,7 +21,6 @@ from gaussian_wrapping_addon.core.training.checkpoint import (
     remove_checkpoints,
     save_checkpoint,
 )
-from gaussian_wrapping_addon.core.training.optimizer.adam import TRAINED
 from gaussian_wrapping_addon.core.training.state import TrainingState
 from tests.core.render.scenes import random_gaussians
 from tests.core.training.small_scene import sphere_scene

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from ...dataset.camera import Camera
 from ...errors import UsageError
-from ...gaussians.model import OrientedGaussians
+from ...gaussians.model import TRAINED, OrientedGaussians
 from ..types.images import Render, RenderStatistics
 from ..types.options import RenderOptions
-from .device_view import IMAGES, TRAINED, DeviceView
+from .device_view import IMAGES, DeviceView
 from .kernels import Kernels, device_kernels
 
 _BUDGET_SHARE = 0.5

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from ...dataset.camera import Camera
-from ...gaussians.model import OrientedGaussians
+from ...gaussians.model import TRAINED, OrientedGaussians
 from ..projection.projection import RawArrays
 from ..types.gradients import ImageGradients, VisibleGradients
 from ..types.images import RenderStatistics
 from ..types.options import RenderOptions
 from .cuda_render import empty_statistics, fill_statistics, free_budget_bytes
-from .device_view import IMAGES, TRAINED, DeviceView
+from .device_view import IMAGES, DeviceView
 from .kernels import Kernels, device_kernels
 
 

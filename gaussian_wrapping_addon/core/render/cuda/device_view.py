@@ -13,7 +13,7 @@ from torch import Tensor
 from ... import tolerances
 from ...dataset.camera import Camera
 from ...errors import ResourceError, UsageError
-from ...gaussians.model import OrientedGaussians
+from ...gaussians.model import TRAINED, OrientedGaussians
 from ..types.options import RenderOptions
 from .kernels import Kernels
 from .tile_lists import (
@@ -26,7 +26,6 @@ from .tile_lists import (
     project,
 )
 
-TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")
 
 

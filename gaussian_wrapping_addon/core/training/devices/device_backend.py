@@ -205,7 +205,7 @@ class DeviceBackend(Backend):
         )  # fmt: skip
 
     def _keep_prior(self, held: tuple[DepthPrior, tuple[Tensor, Tensor, Camera]]) -> None:
-        """Keep a prior that was sent; give up those sent first where all take too much."""
+        """Keep a prior that was sent; first give up all others where they take too much."""
         if sum(8 * prior.depth.size for prior, _ in self._priors.values()) > self._prior_bytes:
             self._priors.clear()
         self._priors[id(held[0])] = held

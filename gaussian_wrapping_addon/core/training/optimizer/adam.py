@@ -15,12 +15,6 @@ from ...kernels.parallel import default_threads, even_bounds, run_chunks
 from ...render.types.gradients import VisibleGradients
 from .adam_kernels import BETA1, BETA2, COLUMNS, LANES, SH_COLUMN, adam_rows
 
-TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
-"""Tensors that receive gradients; ``filter_3d`` is recomputed instead.
-
-See docs/method.md, section 1.5.
-"""
-
 _TABLE_STEPS = 20_000
 """Steps from which both bias corrections are 1 in float32."""
 

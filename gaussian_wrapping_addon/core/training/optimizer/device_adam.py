@@ -12,7 +12,7 @@ from torch import Tensor
 from ...gaussians.model import OrientedGaussians
 from ...render.cuda.kernels import Kernels
 from ...render.cuda.source import THREADS_PER_BLOCK
-from .adam import TRAINED, Adam, corrections, packed_rates
+from .adam import Adam, corrections, packed_rates
 from .adam_kernels import SH_COLUMN
 
 _WARPS = THREADS_PER_BLOCK // 32
@@ -198,6 +198,3 @@ class DeviceAdam(Adam):
 def _copied(tensor: Tensor) -> Tensor:
     """Return a contiguous copy on the host, also of a tensor that lies there."""
     return tensor.detach().to("cpu", copy=True).contiguous()
-
-
-__all__ = ["TRAINED", "DeviceAdam"]

@@ -12,13 +12,12 @@ from torch import Tensor
 
 from gaussian_wrapping_addon.core import tolerances
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
 from gaussian_wrapping_addon.core.render.cuda.cuda_render import render_with
 from gaussian_wrapping_addon.core.render.cuda.kernels import Argument, Kernels
 from gaussian_wrapping_addon.core.render.types.images import Render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
-TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")
 STATISTICS = ("visible", "radii_px", "weight_sum", "weight_max", "grad_px", "grad_abs_px")
 BUDGET_BYTES = 1 << 30

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
 from gaussian_wrapping_addon.core.render.types.images import RenderStatistics
 from gaussian_wrapping_addon.core.training.density.density_control import (
     CLONE_SIZE,
@@ -18,7 +18,7 @@ from gaussian_wrapping_addon.core.training.density.density_control import (
     densify_and_prune,
     reset_opacity,
 )
-from gaussian_wrapping_addon.core.training.optimizer.adam import TRAINED, Adam
+from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
 from tests.core.render.scenes import random_gaussians
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED
 from gaussian_wrapping_addon.core.training.density.orientation import FIRST_SIGN
 from gaussian_wrapping_addon.core.training.density.wrapping import (
     WrapView,
@@ -14,7 +15,7 @@ from gaussian_wrapping_addon.core.training.density.wrapping import (
     start_orientation,
     wrap,
 )
-from gaussian_wrapping_addon.core.training.optimizer.adam import TRAINED, Adam
+from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
 from tests.core.render.scenes import random_gaussians
 from tests.core.training.small_scene import ring_cameras, sphere_gaussians
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import trainer
 from gaussian_wrapping_addon.core.training.checkpoint import load_checkpoint
-from gaussian_wrapping_addon.core.training.optimizer.adam import TRAINED
 from gaussian_wrapping_addon.core.training.optimizer.device_adam import DeviceAdam
 from gaussian_wrapping_addon.core.training.state import TrainingState
 from gaussian_wrapping_addon.core.training.trainer import train

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.stereo.depth_priors import DepthPrior
@@ -30,7 +31,6 @@ from gaussian_wrapping_addon.core.training.devices.cpu_backend import CpuBackend
 from gaussian_wrapping_addon.core.training.iteration import Stepper
 from gaussian_wrapping_addon.core.training.losses import multi_view
 from gaussian_wrapping_addon.core.training.losses.neighbours import find_neighbours
-from gaussian_wrapping_addon.core.training.optimizer.adam import TRAINED
 from gaussian_wrapping_addon.core.training.poses.camera_poses import CameraPoses
 from gaussian_wrapping_addon.core.training.poses.posed_photos import PosedPhotos
 from gaussian_wrapping_addon.core.training.rounds import Rounds

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED
 from gaussian_wrapping_addon.core.render.types.gradients import VisibleGradients
-from gaussian_wrapping_addon.core.training.optimizer.adam import TRAINED, Adam
+from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
 from gaussian_wrapping_addon.core.training.optimizer.adam_kernels import BETA1, BETA2, EPSILON
 from tests.core.render.scenes import random_gaussians
 
