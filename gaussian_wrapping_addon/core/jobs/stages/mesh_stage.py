@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
 from ...array_file import is_whole
-from ...devices import DeviceChoice
+from ...devices import CPU, DeviceChoice
 from ...errors import MeshingError
 from ...progress import Progress
+from ...report_warning import ReportWarning
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import Stage, run_stage
 from .mesh_keys import mesh_key
+
+_logger = logging.getLogger(__name__)
 
 DENSE_MESH = "dense.npz"
 """In a mesh stage: the mesh before decimation, if it was decimated; texture maps use it."""
@@ -52,7 +56,9 @@ def run_mesh(
     body = job.region_bodies.get(request)
     key = mesh_key(job, request, name, trained.key)
 
-    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+    def meshed(
+        chosen: DeviceChoice, stage_folder: Path, progress: Progress, warnings: list[ReportWarning]
+    ) -> dict[str, Any]:
         import numpy as np
 
         from ...dataset.frames.scene_grid import snapped_length
@@ -82,7 +88,7 @@ def run_mesh(
         region, world_region = requested_region(request, body, scene, arrays)
         vacancy = region_field(
             scene, arrays, region, job.settings.training, meshing, threads=threads,
-            device=field_device(device, job.settings.device, arrays).device,
+            device=field_device(chosen, job.settings.device, arrays).device,
         )  # fmt: skip
 
         def sampled() -> DepthSamples:
@@ -119,6 +125,10 @@ def run_mesh(
             if dense is not None:
                 dense = without_caps(dense, open_at, meshing.min_component_share)
         mesh.provenance.update(field_figures(vacancy), cameras=meshing.cameras)
+        if warnings:
+            mesh.provenance["warnings"] = [
+                *mesh.provenance.get("warnings", []), *(warning.to_json() for warning in warnings)
+            ]  # fmt: skip
         if not np.isfinite(mesh.vertices).all():
             raise MeshingError(
                 "The mesh has vertices that are not finite.",
@@ -137,6 +147,28 @@ def run_mesh(
             "edge_length_world": meshing.edge_length,
             "estimate": expected,
         }
+
+    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        from ...devices.failures import is_device_failure
+        from .region_meshing import remove_tiles
+
+        try:
+            return meshed(device, stage_folder, progress, [])
+        except Exception as error:
+            if not (device.is_cuda and is_device_failure(error)):
+                raise
+            reason = getattr(error, "message", error)
+        # Tiles of two devices differ by rounding where they join.
+        remove_tiles(stage_folder)
+        warning = ReportWarning(
+            "device-failed",
+            f"{device.device} failed while region {name!r} was meshed ({reason}); it was meshed "
+            "again on the processor.",
+            "Close other programs that use the GPU.",
+        )
+        _logger.warning("%s", warning.text)
+        processor = DeviceChoice(CPU, "", "The GPU failed.")
+        return meshed(processor, stage_folder, progress, [warning])
 
     def whole(stage_folder: Path) -> bool:
         dense = stage_folder / DENSE_MESH

@@ -13,10 +13,12 @@ from scipy.spatial import cKDTree
 
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.devices import DeviceChoice, choice, choose_device
+from gaussian_wrapping_addon.core.errors import DeviceError, MeshingError
 from gaussian_wrapping_addon.core.field import depth_samples
 from gaussian_wrapping_addon.core.field.vacancy import cuda_vacancy
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
+from gaussian_wrapping_addon.core.jobs.stages import region_field
 from gaussian_wrapping_addon.core.jobs.stages.mesh_stage import run_mesh
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
@@ -185,6 +187,59 @@ def test_on_a_gpu_the_field_and_the_depth_maps_are_there_if_they_fit(
     assert len(told) == (device == "cpu")
     told = [line for line in caplog.messages if line.startswith("Depth maps are rendered on the")]
     assert len(told) == (len(renderers) == 2)
+
+
+class _FailingField(VacancyField):
+    """A GPU's field that fails after some evaluations."""
+
+    left = 0
+
+    def __init__(self, arrays, cameras, *, device, **options):  # type: ignore[no-untyped-def]
+        super().__init__(arrays, cameras, **options)
+        self.device = device
+
+    def vacancy(self, points, progress=None):  # type: ignore[no-untyped-def]
+        type(self).left -= 1
+        if self.left < 0:
+            raise DeviceError("The launch failed.", "")
+        return super().vacancy(points, progress)
+
+
+@pytest.mark.parametrize("tiles", ["off", "8"])
+def test_a_gpu_that_fails_in_the_middle_leaves_the_mesh_of_the_processor(
+    tiles: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(device: str) -> DeviceRenderer:
+        raise DeviceError("The launch failed.", "")
+
+    settings = MeshingSettings(points=300, tiles=tiles)
+    (tmp_path / "cpu").mkdir()
+    (tmp_path / "gpu").mkdir()
+    here = mesh_of(write_finished_sphere(tmp_path / "cpu"), settings)
+    monkeypatch.setattr(cuda_vacancy, "CudaVacancyField", _FailingField)
+    monkeypatch.setattr(region_field, "stage_device", lambda chosen, *_: chosen)
+    monkeypatch.setattr(device_renderer, "device_renderer", fail)
+    monkeypatch.setattr(_FailingField, "left", 7)
+    there = mesh_of(write_finished_sphere(tmp_path / "gpu"), settings, GPU)
+    assert _FailingField.left < 0
+    provenance = there.done["provenance"]
+    assert provenance["field_device"] == "cpu"
+    assert [warning["code"] for warning in provenance["warnings"]] == ["device-failed"]
+    assert "The launch failed." in caplog.text
+    one, two = (load_mesh(stage.folder / "mesh.npz") for stage in (here, there))
+    assert np.array_equal(one.vertices, two.vertices)
+    assert np.array_equal(one.faces, two.faces)
+
+
+def test_what_no_device_would_have_met_ends_the_stage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wrong(*_: object, **__: object) -> VacancyField:
+        raise MeshingError("No surface.", "")
+
+    monkeypatch.setattr(region_field, "region_field", wrong)
+    with pytest.raises(MeshingError, match="No surface"):
+        mesh_of(write_finished_sphere(tmp_path), MeshingSettings(points=300), GPU)
 
 
 def test_a_finished_mesh_is_re_used_on_another_device(tmp_path: Path) -> None:
