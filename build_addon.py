@@ -109,6 +109,7 @@ def package_files() -> dict[str, Path]:
         A file is missing, is a link, or is a pointer of Git LFS.
     """
     files = {name: ROOT / name for name in BESIDE_THE_PACKAGE}
+    files |= {path.name: path for path in ROOT.glob("requirements-worker-*-hashes.txt")}  # extras
     for path in PACKAGE.rglob("*"):
         inside = path.relative_to(PACKAGE)
         if path.is_file() and not any(

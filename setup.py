@@ -15,7 +15,7 @@ class BuildWithRequirements(build_py):
     def run(self) -> None:
         super().run()
         if not self.editable_mode:
-            for name in ("requirements-worker.txt", "requirements-worker-hashes.txt"):
+            for name in map(str, Path().glob("requirements-worker*.txt")):
                 self.copy_file(name, str(Path(self.build_lib) / "gaussian_wrapping_addon" / name))
 
 

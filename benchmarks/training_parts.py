@@ -10,7 +10,7 @@ import numpy as np
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.mip_filter import mip_filter
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
 from gaussian_wrapping_addon.core.kernels.array_store import ArrayStore
 from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
 from gaussian_wrapping_addon.core.render.raster.blend import (
@@ -26,7 +26,7 @@ from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewPass, ViewRenderer
 from gaussian_wrapping_addon.core.training.density.density_control import DensityStatistics
 from gaussian_wrapping_addon.core.training.losses.losses import color_loss, normal_losses
-from gaussian_wrapping_addon.core.training.optimizer.adam import TRAINED, Adam
+from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
 
 Part = tuple[str, Callable[[], object]]
 

@@ -15,9 +15,11 @@ from .ops.cameras import camera_operators
 from .ops.common import background
 from .ops.dataset import input_operators
 from .ops.export import export_operators
-from .ops.jobs import job_attach, job_operators, job_timer, live_preview
+from .ops.jobs import job_attach, job_operators, job_timer, live_points, live_preview
+from .ops.masks import mask_operators, mask_review
 from .ops.meshing import bake_operators, region_estimate, region_list_operators
 from .ops.placement import placement, placement_operators
+from .ops.presets import preset_operators
 from .ops.regions import region_operators, region_watch
 from .ops.results import import_operators, report_operators
 from .ops.training import training_estimate, training_operators
@@ -25,11 +27,14 @@ from .ops.worker import worker_check_operators, worker_setup, worker_setup_opera
 from .ui import preferences, properties
 from .ui.baking import bake_panel, bake_properties
 from .ui.dataset import dataset_panel
+from .ui.jobs import points_drawing, status_bar
 from .ui.meshing import mesh_panel, texture_panel
 from .ui.placement import scene_panel
+from .ui.presets import preset_menu
 from .ui.regions import region_drawing, region_gizmo, region_panel, region_properties
 from .ui.results import report_panel, result_panel
 from .ui.training import train_advanced_panel, train_panel, training_properties
+from .ui.translations import table
 
 _logger = logging.getLogger(__name__)
 
@@ -45,6 +50,7 @@ CLASSES: Final[tuple[type, ...]] = (
     *worker_check_operators.CLASSES,
     *region_operators.CLASSES,
     *region_list_operators.CLASSES,
+    *mask_operators.CLASSES,
     *bake_operators.CLASSES,
     *import_operators.CLASSES,
     *export_operators.CLASSES,
@@ -52,6 +58,8 @@ CLASSES: Final[tuple[type, ...]] = (
     *placement_operators.CLASSES,
     *report_operators.CLASSES,
     *training_operators.CLASSES,
+    *preset_operators.CLASSES,
+    *preset_menu.CLASSES,
     *dataset_panel.CLASSES,
     *train_panel.CLASSES,
     *train_advanced_panel.CLASSES,
@@ -84,12 +92,16 @@ def register() -> None:
     """Register everything; remnants of a failed earlier attempt are removed first."""
     unregister()
     try:
+        table.use_context(CLASSES)
         for cls in CLASSES:
             bpy.utils.register_class(cls)
         properties.add_pointers()
         for name, handler in HANDLERS:
             getattr(bpy.app.handlers, name).append(handler)
+        table.register()
         region_drawing.start()
+        points_drawing.start()
+        status_bar.start()
         cli_command.register(batch.main)
         # While Blender starts, scripts may not see the open file yet.
         background.watch(job_attach.attach_later)
@@ -104,12 +116,17 @@ def unregister() -> None:
     training_estimate.forget()
     region_estimate.stop()
     region_drawing.stop()
+    points_drawing.stop()
+    status_bar.stop()
     region_gizmo.stop()
     region_watch.forget()
     job_timer.forget_all()
     live_preview.stop()
+    mask_review.stop()
+    live_points.stop()
     background.stop()  # last of these: what they end is ended by its threads
     cli_command.unregister()
+    table.unregister()
     for name, handler in HANDLERS:
         handlers: list[Any] = getattr(bpy.app.handlers, name)
         while handler in handlers:

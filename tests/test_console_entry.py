@@ -73,7 +73,8 @@ def test_the_wheel_is_complete(entry: tuple[str, str], tmp_path: Path) -> None:
     package = "gaussian_wrapping_addon"
     unneeded = shutil.ignore_patterns("__pycache__")
     shutil.copytree(ROOT / package, source / package, ignore=unneeded)
-    lists = ("requirements-worker.txt", "requirements-worker-hashes.txt")
+    extras = sorted(p.name for p in ROOT.glob("requirements-worker-*-hashes.txt"))
+    lists = ("requirements-worker.txt", "requirements-worker-hashes.txt", *extras)
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", *lists):
         shutil.copy(ROOT / name, source)
     built = subprocess.run(

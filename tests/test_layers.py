@@ -18,8 +18,10 @@ CORE = PACKAGE / "core"
 FOLDERS = (
     "core",
     "core/settings", "core/ply", "core/kernels", "core/processes", "core/imaging",
-    "core/dataset", "core/dataset/frames", "core/dataset/photos", "core/dataset/readers",
-    "core/dataset/poses", "core/dataset/loading",
+    "core/dataset", "core/dataset/frames", "core/dataset/photos", "core/dataset/video",
+    "core/dataset/readers", "core/dataset/readers/programs", "core/dataset/lenses",
+    "core/dataset/matching", "core/dataset/poses", "core/dataset/panoramas", "core/dataset/units",
+    "core/dataset/loading", "core/dataset/quality",
     "core/mesh", "core/mesh/exchange", "core/stereo", "core/stereo/plain", "core/gaussians",
     "core/regions", "core/mesh/simplification",
     "core/render/types", "core/render/simd", "core/render/projection", "core/render/tiling",
@@ -29,7 +31,7 @@ FOLDERS = (
     "core/training/optimizer", "core/training/losses", "core/training/density",
     "core/training/appearance", "core/training/poses", "core/training/selection",
     "core/training/initialisation", "core/training/devices",
-    "core/training", "core/training/cost",
+    "core/training", "core/training/cost", "core/masks",
     "core/meshing/tetrahedra", "core/meshing/points", "core/meshing/cleanup",
     "core/meshing/checks", "core/meshing", "core/meshing/tiles", "core/meshing/cost",
     "core/texture/atlas", "core/texture/unwrap", "core/texture/bake", "core/texture/cost",
@@ -37,13 +39,16 @@ FOLDERS = (
     "core/evaluation/surface", "core/evaluation/alignment", "core/evaluation/layouts",
     "core/evaluation/color_field", "core/evaluation/views", "core/evaluation/report",
     "core/evaluation",
-    "core/jobs/store", "core/jobs/stages", "core/jobs/baking", "core/jobs",
+    "core/jobs/store", "core/jobs/video", "core/jobs/stages", "core/jobs/masking",
+    "core/jobs/baking", "core/jobs",
     "core/jobs/commands", "core/setup",
     "ops/common", "ops/cameras", "ops/regions", "ops/placement", "ops/results", "ops/baking",
     "ops/export",
-    "ops/worker", "ops/jobs", "ops/training", "ops/dataset", "ops/meshing", "ops",
-    "ui/common", "ui/worker", "ui/jobs", "ui/dataset", "ui/training", "ui/regions", "ui/meshing",
-    "ui/baking",    "ui/results", "ui/placement", "ui",
+    "ops/worker", "ops/jobs", "ops/presets", "ops/training", "ops/dataset", "ops/meshing",
+    "ops/masks", "ops",
+    "ui/translations", "ui/common", "ui/worker", "ui/jobs", "ui/presets", "ui/dataset",
+    "ui/training", "ui/masks", "ui/regions", "ui/meshing", "ui/baking", "ui/results",
+    "ui/placement", "ui",
     "command_line/options", "command_line", "",
 )  # fmt: skip
 
@@ -62,9 +67,9 @@ BLENDER_SIDE = (
     "core.jobs.commands.evaluate_command", "core.jobs.store.job_file",
     "core.dataset.loading.check", "core.settings", "core.setup.install",
     "core.processes.worker_environment", "core.regions.box", "core.regions.region_file",
-    "core.names",
+    "core.names", "core.gaussians.preview_points",
 )  # fmt: skip
-HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl")
+HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl", "av")
 
 
 def python_files(folder: Path) -> list[Path]:

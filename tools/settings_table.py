@@ -24,6 +24,7 @@ TARGET = Path(__file__).resolve().parents[1] / "docs" / "settings.md"
 _logger = logging.getLogger("tools.settings_table")
 
 _PANELS = {
+    "dataset": "Dataset",
     "train": "Train",
     "train_advanced": "Train, Advanced",
     "mesh": "Mesh",

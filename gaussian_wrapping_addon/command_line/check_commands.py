@@ -17,18 +17,48 @@ def add_check(commands: Commands) -> None:
     """Add ``check``."""
     parser = commands.add_parser("check", help="findings about an input, without starting anything")
     parser.add_argument("input", type=Path)
+    parser.add_argument(
+        "--quick", action="store_true", help="do not decode the photos: no blur, no duplicates"
+    )
+    parser.add_argument(
+        "--threads", type=int, default=0, metavar="N", help="threads that decode (default: all)"
+    )
     parser.set_defaults(run=_check)
 
 
 def _check(options: Namespace) -> int:
     from ..core.dataset.loading.check import check_input
+    from ..core.dataset.loading.source_kind import WITHOUT_PHOTOS
     from ..core.errors import EXIT_BAD_DATA, EXIT_DONE
+    from ..core.jobs.client import worker_if_any
 
-    findings = check_input(options.input)
+    findings = check_input(options.input, worker=worker_if_any())
     for finding in findings:
         _logger.info("%s: %s %s", finding.severity, finding.message, finding.hint)
-    bad = any(finding.severity == "error" for finding in findings)
-    return EXIT_BAD_DATA if bad else EXIT_DONE
+    if any(finding.severity == "error" for finding in findings):
+        return EXIT_BAD_DATA
+    if options.quick or any(finding.kind in WITHOUT_PHOTOS for finding in findings):
+        return EXIT_DONE
+    return _look_at_photos(options.input, options.threads)
+
+
+def _look_at_photos(source: Path, threads: int) -> int:
+    """Let the worker decode the photos; return the exit code."""
+    from ..core.errors import EXIT_DONE, UsageError
+    from ..core.jobs.client import worker_python
+    from ..core.jobs.commands.run_in_worker import run_in_worker
+
+    try:
+        python = worker_python()
+    except UsageError as error:
+        _logger.info("fact: Blur, exposure and duplicates were not looked for. %s", error)
+        return EXIT_DONE
+    return run_in_worker(
+        {"source": str(source.absolute()), "threads": threads},
+        python=python,
+        module="jobs.commands.photo_check_command",
+        what="check of the photos",
+    )
 
 
 def add_doctor(commands: Commands) -> None:

@@ -13,6 +13,7 @@ from .evaluate_command import add_evaluate
 from .export_command import add_export
 from .job_commands import add_cancel, add_status
 from .meshing_commands import add_estimate_mesh, add_mesh, add_work_tiles
+from .region_command import add_convert_region
 from .setup_command import add_set_up_worker
 from .training_commands import add_continue_training, add_estimate, add_resume, add_wrap
 
@@ -29,6 +30,7 @@ _COMMANDS = (
     add_estimate_mesh,
     add_work_tiles,
     add_export,
+    add_convert_region,
     add_evaluate,
     add_estimate,
     add_check,

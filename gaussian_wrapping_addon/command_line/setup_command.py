@@ -19,6 +19,7 @@ _logger = logging.getLogger("gaussian_wrapping")
 
 POLL_S = 0.2
 LINE_EVERY_S = 5.0
+_OMIT = {False: "Omit --repair.", True: "Give --extras instead of --add, which sets one up."}
 
 
 def add_set_up_worker(commands: Commands) -> None:
@@ -43,13 +44,26 @@ def add_set_up_worker(commands: Commands) -> None:
     parser.add_argument(
         "--requirements", type=Path, metavar="FILE", help="another list of packages"
     )
+    parser.add_argument(
+        "--extras", default="", metavar="NAMES",
+        help="optional packages too, separated by commas: " + _extras_help(),
+    )  # fmt: skip
     parser.add_argument("--dry-run", action="store_true", help="only show the commands")
     action = parser.add_mutually_exclusive_group()
     action.add_argument(
         "--repair", action="store_true", help="create it again with its present Python and torch"
     )
     action.add_argument("--remove", action="store_true", help="delete the environment")
+    action.add_argument(
+        "--add", default="", metavar="NAMES", help="add extras to the present environment"
+    )
     parser.set_defaults(run=_set_up_worker)
+
+
+def _extras_help() -> str:
+    from ..core.processes.worker_extras import EXTRAS
+
+    return "; ".join(f"{extra.name}: {extra.purpose}" for extra in EXTRAS)
 
 
 def _set_up_worker(options: Namespace) -> int:
@@ -59,6 +73,7 @@ def _set_up_worker(options: Namespace) -> int:
         default_root,
         known_environments,
     )
+    from ..core.processes.worker_extras import read_extra_names
     from ..core.processes.worker_requirements import read_requirements, requirements_file
     from ..core.setup.commands import (
         CPU,
@@ -73,7 +88,7 @@ def _set_up_worker(options: Namespace) -> int:
     from ..core.setup.pythons import find_pythons, probe
 
     known = [e.root for e in known_environments() if e.is_ours()]
-    change = options.repair or options.remove
+    change = options.repair or options.remove or options.add
     root = (options.to or (known[0] if change and known else default_root())).absolute()
     environment = WorkerEnvironment(root)
     if options.remove:
@@ -81,20 +96,24 @@ def _set_up_worker(options: Namespace) -> int:
         _logger.info("removed %s", root)
         return EXIT_DONE
     name, torch = options.python, options.torch
-    if options.repair:
+    extras = read_extra_names(options.add or options.extras)
+    if options.repair or options.add:
         marker = environment.marker()
         if not marker:
-            raise UsageError(f"{root} holds no worker environment.", "Omit --repair.")
+            raise UsageError(f"{root} holds no worker environment.", _OMIT[bool(options.add)])
+        extras = extras or environment.extras()
         name, torch = name or str(marker.get("python", "")), str(marker.get("torch", torch))
     python = probe(name) if name else next(iter(find_pythons(sys.executable)), None)
     if python is None:
         raise UsageError("No Python 3.11 or newer was found.", "Name one with --python.")
     requirements = (options.requirements or requirements_file()).absolute()
     wheels = str(Path(options.find_links).absolute()) if options.find_links else ""
-    request = SetupRequest(str(root), python.path, str(requirements), torch, wheels)
+    request = SetupRequest(
+        str(root), python.path, str(requirements), torch, wheels, extras, bool(options.add)
+    )
     read_requirements(requirements)
     check_folders(request)
-    if torch == CPU and cuda_present():
+    if torch == CPU and not options.add and cuda_present():
         _logger.info("An NVIDIA driver was found. With --torch cuda: %s.", CUDA_BRINGS)
     for command in all_commands(request, python):
         _logger.info("$ %s", as_line(command))

@@ -7,14 +7,18 @@ import logging
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..core.settings import declared
 from .bake_command import follow_bake
 from .common import Commands, add_device, add_no_blend, add_out
 from .follow import follow, require_bpy
 from .options.meshing_options import add_method_options, add_region_options, region_settings
-from .options.setting_options import add_option
+from .options.setting_options import add_option, option_of
 from .options.training_options import add_training_options, training_settings
+
+if TYPE_CHECKING:
+    from ..core.jobs.store.job_file import JobFile
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -22,7 +26,7 @@ _logger = logging.getLogger("gaussian_wrapping")
 def add_wrap(commands: Commands) -> None:
     """Add ``wrap``."""
     parser = commands.add_parser(
-        "wrap", help="make a textured mesh of photos, a COLMAP project or a transforms.json"
+        "wrap", help="make a textured mesh of photos, with or without cameras, or of a video"
     )
     parser.add_argument("input", type=Path)
     add_training_options(parser)
@@ -36,7 +40,7 @@ def add_wrap(commands: Commands) -> None:
 def _wrap(options: Namespace) -> int:
     from ..core.dataset.loading.check import check_input
     from ..core.errors import DatasetError
-    from ..core.jobs.client import JobClient, worker_python
+    from ..core.jobs.client import JobClient, worker_if_any, worker_python
     from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import make_job
 
@@ -44,12 +48,26 @@ def _wrap(options: Namespace) -> int:
     job = make_job("wrap", options.input, region_settings(settings, options))
     require_bpy(job, options)
     require_device(job.settings.device)
-    for finding in check_input(options.input):
+    for finding in check_input(options.input, worker=worker_if_any()):
         if finding.severity == "error":
             raise DatasetError(finding.message, finding.hint)
         if finding.severity == "warning":
             _logger.warning("warning: %s %s", finding.message, finding.hint)
+    _reject_frames_of_photos(job)
     return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+
+
+def _reject_frames_of_photos(job: JobFile) -> None:
+    """Raise for options of videos where the input is none: they would do nothing."""
+    from ..core.errors import UsageError
+    from ..core.jobs.video.frames_stage import frames_request
+
+    for path in ("video_frames", "video_fps"):
+        if getattr(job.settings, path) and frames_request(job) is None:
+            raise UsageError(
+                f"{option_of(path)} has no effect: {Path(job.source).name} is no video.",
+                "Omit it, or give the video.",
+            )
 
 
 def add_continue_training(commands: Commands) -> None:
@@ -134,6 +152,7 @@ def _estimate(options: Namespace) -> int:
     from ..core.jobs.store.job_file import make_job
 
     job = make_job("wrap", options.input, training_settings(options))
+    _reject_frames_of_photos(job)
     require_device(job.settings.device)
     return run_in_worker(
         job.to_json(),

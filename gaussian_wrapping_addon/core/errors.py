@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Sequence
 from pathlib import Path
 
 EXIT_DONE = 0
@@ -109,6 +110,22 @@ class Cancelled(WrapError):  # noqa: N818 - a request, not an error
 
 class WorkerError(WrapError):
     """A worker or helper process failed; the message contains its last output."""
+
+
+class MissingExtraError(WorkerError):
+    """The worker lacks optional packages that the input needs.
+
+    Parameters
+    ----------
+    extras : sequence of str
+        Their names, as ``set-up-worker --add`` takes them.
+    """
+
+    exit_code = EXIT_BAD_DATA
+
+    def __init__(self, message: str, hint: str = "", extras: Sequence[str] = ()) -> None:
+        super().__init__(message, hint)
+        self.extras = tuple(extras)
 
 
 class MeshingError(WrapError):

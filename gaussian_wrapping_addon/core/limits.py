@@ -10,6 +10,11 @@ MAX_POINTS = 50_000_000
 MAX_GAUSSIANS = 20_000_000
 MAX_IMAGE_PIXELS = 100_000_000
 MAX_IMAGE_SIDE_PX = 50_000
+MAX_VIDEO_S = 3600.0
+"""Longest video: an hour; reading it takes about as long."""
+MAX_VIDEO_FRAMES = 250_000
+"""More than an hour at 60 frames a second."""
+MAX_CHOSEN_FRAMES = 2000
 MAX_JSON_BYTES = 64 * 1024 * 1024
 MAX_STATUS_BYTES = 1024 * 1024
 """Largest status or lock file: Blender's main thread reads them."""
@@ -17,6 +22,8 @@ MAX_JSON_DEPTH = 32
 MAX_LINE_BYTES = 1024 * 1024
 MAX_NAME_BYTES = 1024
 MAX_REGION_VERTICES = 10_000
+MAX_MODEL_BYTES = 2 * 1024**3
+"""Largest segmentation model: that of one ONNX file."""
 MAX_MESH_POINTS = 5_000_000
 MAX_TILES = 4096
 MAX_TEXTURE_SIDE_PX = 8192

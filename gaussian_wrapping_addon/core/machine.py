@@ -17,7 +17,7 @@ from typing import Any
 
 PACKAGES = (
     "numpy", "torch", "numba", "scipy", "pycolmap", "xatlas", "shull", "pillow", "trimesh",
-    "libigl",
+    "libigl", "av",
 )  # fmt: skip
 
 _PROC = Path("/proc")

@@ -36,6 +36,7 @@ class GWRAP_PG_finding(bpy.types.PropertyGroup):
     severity: StringProperty()  # type: ignore[valid-type]
     message: StringProperty()  # type: ignore[valid-type]
     hint: StringProperty()  # type: ignore[valid-type]
+    extra: StringProperty()  # type: ignore[valid-type]
 
 
 @with_settings("scene")
@@ -45,8 +46,8 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     source: StringProperty(  # type: ignore[valid-type]
         name="Input",
         description=(
-            "Folder of photos, of a COLMAP project, or with a transforms.json; or the PLY of a "
-            "3D Gaussian splat"
+            "Folder of photos, of a COLMAP project, or with a transforms.json; a video, the camera "
+            "file of another program, or the PLY of a 3D Gaussian splat"
         ),
     )
     output: StringProperty(  # type: ignore[valid-type]
@@ -65,6 +66,11 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
         description="Decimate the mesh; it stays closed and keeps its parts and holes",
         default=False,
     )
+    show_points: BoolProperty(  # type: ignore[valid-type]
+        name="Points in 3D View",
+        description="Draw the Gaussians of the running training as points in the 3D view",
+        default=True,
+    )
     training: PointerProperty(type=GWRAP_PG_training)  # type: ignore[valid-type]
     job_folder: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     job_command: EnumProperty(  # type: ignore[valid-type]
@@ -74,6 +80,7 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     bake: PointerProperty(type=GWRAP_PG_bake)  # type: ignore[valid-type]
     checked_source: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     checked_text: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
+    checked_kind: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     findings: CollectionProperty(type=GWRAP_PG_finding, options={"HIDDEN"})  # type: ignore[valid-type]
 
 

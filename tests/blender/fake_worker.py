@@ -18,6 +18,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from gaussian_wrapping_addon.core.gaussians.preview_points import POINT, POINTS_FILE, points_file
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     JobFolder,
@@ -43,6 +44,17 @@ def picture() -> np.ndarray:
     disc = np.hypot(x - 80, y - 60) < 45
     photo = np.where(disc[..., None], (220, 120, 40), (90, 110, 130)).astype(np.uint8)
     return np.concatenate([photo, np.zeros((120, 4, 3), np.uint8), photo // 8 * 7], axis=1)
+
+
+def ball_points() -> np.ndarray:
+    """Return the points of a ball of radius 1, coloured by their place."""
+    ball = np.random.default_rng(0).normal(size=(20_000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    points = np.zeros(len(ball), POINT)
+    points["position"] = ball
+    points["color"] = 255
+    points["color"][:, :3] = 127.5 * (1.0 + ball)
+    return points
 
 
 def main() -> int:
@@ -84,6 +96,7 @@ def main() -> int:
         trained = folder.stages / "train-now"
         trained.mkdir(exist_ok=True)
         (trained / "preview-training.npy").write_bytes(npy_bytes(picture()))
+        (trained / POINTS_FILE).write_bytes(points_file(ball_points()))
     while mode == "slow":
         time.sleep(0.02)
         if not folder.root.is_dir():

@@ -15,12 +15,16 @@ from pathlib import Path
 import bpy
 import pytest
 
+from gaussian_wrapping_addon.core.dataset.loading import check
+from gaussian_wrapping_addon.core.dataset.video.probe import ProbedVideo
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.ops.common import background, tags
 from gaussian_wrapping_addon.ops.dataset import photo_check
 from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer, panel_state
+from gaussian_wrapping_addon.ops.jobs.panel_settings import choices_key, job_settings
 from gaussian_wrapping_addon.ops.jobs.panel_state import PRIMARY, Stage
+from gaussian_wrapping_addon.ops.jobs.scene_folders import output_of
 from gaussian_wrapping_addon.ops.results.report_data import ReportData, report_of
 from gaussian_wrapping_addon.ops.training import training_estimate
 from tests.blender.fake_layout import FakeLayout, draw
@@ -218,7 +222,8 @@ def check_locks(state: State, panels: dict[str, FakeLayout]) -> None:
     for name in names:
         fields = panels[name].fields
         assert fields
-        assert all(field.enabled != running for field in fields if field.name != "more_iterations")
+        others = ("more_iterations", "show_points")  # shown only when they can be changed
+        assert all(field.enabled != running for field in fields if field.name not in others)
 
 
 @every_state
@@ -319,7 +324,8 @@ def test_a_clicked_photo_stands_for_its_folder_and_files_for_themselves(tmp_path
     folder = Path(properties.source)
     bpy.ops.gwrap.choose_input(filepath=str(folder / "1.png"))
     assert properties.source == str(folder)
-    for name in ("transforms.json", "splat.PLY"):
+    files = ("cameras.xml", "cameras.csv", "cameras.sfm", "0.xmp", "shots.geojson")
+    for name in (*files, "transforms.json", "clip.MP4", "splat.PLY"):
         (folder / name).write_text("x")
         bpy.ops.gwrap.choose_input(filepath=str(folder / name))
         assert properties.source == str(folder / name)
@@ -327,6 +333,38 @@ def test_a_clicked_photo_stands_for_its_folder_and_files_for_themselves(tmp_path
         with pytest.raises(RuntimeError, match=r"chosen|does not exist"):
             bpy.ops.gwrap.choose_input(filepath=wrong)
     assert properties.source == str(folder / "splat.PLY")
+
+
+def test_a_video_shows_how_its_frames_are_chosen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training_estimate, "start", lambda *_: None)
+    probed = ProbedVideo(320, 240, 30, 1.0, "h264", False, False)
+    monkeypatch.setattr(check, "probe_video", lambda *_: probed)
+    choose_photos(tmp_path)
+    properties = bpy.context.scene.gwrap
+
+    def fields() -> set[str]:
+        return {field.name for field in tab()["Dataset"].fields}
+
+    assert not fields() & {"video_frames", "video_fps"}
+    video = tmp_path / "clip.mp4"
+    video.write_bytes(b"\0\0\0\x18ftypisom")
+    assert bpy.ops.gwrap.choose_input(filepath=str(video)) == {"FINISHED"}
+    play(background.poll)
+    assert properties.source == str(video)
+    assert output_of(bpy.context.scene, video) == tmp_path / "clip_wrap"
+    assert properties.checked_kind == "video"
+    assert tab()["Dataset"].header == "1 s of video"
+    assert fields() >= {"video_frames", "video_fps"}
+    key = choices_key(bpy.context.scene)
+    properties.video_fps = 2.0
+    assert choices_key(bpy.context.scene) != key, "the estimate is another one"
+    assert job_settings(bpy.context.scene, 1).video_fps == 2.0
+    properties.video_frames = 50
+    assert "video_fps" not in fields()
+    chosen = job_settings(bpy.context.scene, 1)
+    assert (chosen.video_frames, chosen.video_fps) == (50, 0.0)
 
 
 def test_other_photos_begin_anew_beside_the_earlier_result(tmp_path: Path) -> None:

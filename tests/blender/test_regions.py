@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -16,6 +17,7 @@ from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS, CUBE_TRIANGLE
 from gaussian_wrapping_addon.core.regions.region_file import parse_region_file, region_to_json
 from gaussian_wrapping_addon.ops.common import tags
 from gaussian_wrapping_addon.ops.regions.region_objects import create_region
+from gaussian_wrapping_addon.ops.regions.region_operators import GWRAP_OT_export_region
 from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult, import_result
 from tests.blender.region_shapes import region_from_object
 from tests.blender.synthetic_result import WORLD_FROM_SCENE, write_result
@@ -251,6 +253,46 @@ def test_our_file_is_what_the_worker_reads(result: ImportedResult, tmp_path: Pat
     bpy.ops.gwrap.export_region(filepath=str(path))
     region = read_region(path)
     assert same_set(np.asarray(region.vertices), region_from_object(result.regions[0]))
+
+
+def test_a_region_goes_to_realityscan_and_back(result: ImportedResult, tmp_path: Path) -> None:
+    box = result.regions[0]
+    bpy.context.view_layer.objects.active = box
+    box.location, box.rotation_euler, box.scale = (0.1, 0.2, 0.3), (0.2, -0.4, 1.9), (1, 2, 0.5)
+    bpy.context.view_layer.update()
+    path = tmp_path / "box.rsbox"
+    bpy.ops.gwrap.export_region(filepath=str(path))
+    assert path.read_text().startswith("<ReconstructionRegion ")
+    expected = region_from_object(box)
+    bpy.ops.gwrap.import_region(filepath=str(path))
+    again = bpy.context.view_layer.objects.active
+    assert again != box
+    assert again.type == "EMPTY"
+    assert again.parent == result.frame
+    assert same_set(region_from_object(again), expected)
+
+
+def test_only_a_box_goes_to_realityscan(result: ImportedResult, tmp_path: Path) -> None:
+    bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=1)
+    path = tmp_path / "ball.rsbox"
+    with pytest.raises(RuntimeError, match=r"no box.*Export it as \.json"):
+        bpy.ops.gwrap.export_region(filepath=str(path))
+    assert list(tmp_path.glob("ball*")) == []
+
+
+@pytest.mark.parametrize(
+    ("file_format", "before", "after"),
+    [
+        ("RSBOX", "a.json", "a.rsbox"),
+        ("JSON", "a.rsbox", "a.json"),
+        ("RSBOX", "a.b", "a.b.rsbox"),
+        ("JSON", "a.json", "a.json"),
+    ],
+)
+def test_the_name_follows_the_format(file_format: str, before: str, after: str) -> None:
+    dialog = SimpleNamespace(file_format=file_format, filepath=f"/tmp/{before}")
+    GWRAP_OT_export_region.check(dialog, bpy.context)  # type: ignore[arg-type]
+    assert Path(dialog.filepath) == Path("/tmp") / after
 
 
 GOOD = region_to_json("x", CUBE_CORNERS, CUBE_TRIANGLES)

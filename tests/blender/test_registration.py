@@ -14,6 +14,7 @@ import gaussian_wrapping_addon
 from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.ops.common import background
 from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer
+from gaussian_wrapping_addon.ui.jobs import points_drawing
 
 REPOSITORY = Path(gaussian_wrapping_addon.__file__).resolve().parents[1]
 
@@ -25,6 +26,9 @@ def left_behind() -> list[str]:
         handlers = getattr(bpy.app.handlers, name)
         if isinstance(handlers, list):
             found += [name for h in handlers if "gaussian_wrapping" in h.__module__]
+    bar = bpy.types.STATUSBAR_HT_header._dyn_ui_initialize()
+    found += [f.__name__ for f in bar if "gaussian_wrapping" in f.__module__]
+    found += ["points"] if points_drawing._drawing.handle is not None else []
     if bpy.app.timers.is_registered(background.poll):
         found.append("poll")
     return found
@@ -36,6 +40,7 @@ BASES = (
     bpy.types.PropertyGroup,
     bpy.types.AddonPreferences,
     bpy.types.GizmoGroup,
+    bpy.types.Menu,
 )
 
 

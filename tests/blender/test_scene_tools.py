@@ -242,6 +242,22 @@ def test_a_parent_scaled_unevenly_is_refused_and_reset_helps(result: ImportedRes
     assert same_matrix(result.frame, Similarity())
 
 
+def test_reset_leads_back_to_metres(job: Path, result: ImportedResult) -> None:
+    path = job / "result" / "scene.json"
+    values = json.loads(path.read_text())
+    record = {"metric_from_world": Similarity(0.5).to_json(), "applied": True, "z_up": True}
+    path.write_text(json.dumps({**values, "georeference": record}))
+    assert bpy.ops.gwrap.reset_placement() == {"FINISHED"}
+    wanted = Similarity(0.5).after(WORLD_FROM_SCENE)
+    far = np.round(wanted.translation) if np.abs(wanted.translation).max() > 1e3 else 0.0
+    moved = Similarity(wanted.scale, wanted.rotation, wanted.translation - far)
+    assert same_matrix(result.frame, moved)
+    assert stored(result) is not None
+    path.write_text(json.dumps({**values, "georeference": {**record, "applied": False}}))
+    assert bpy.ops.gwrap.reset_placement() == {"FINISHED"}
+    assert same_matrix(result.frame, Similarity())
+
+
 def test_a_parent_that_is_held_is_refused(result: ImportedResult) -> None:
     result.frame.constraints.new("LIMIT_SCALE").use_max_x = True
     result.frame.constraints[0].max_x = 0.5

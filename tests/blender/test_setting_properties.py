@@ -12,6 +12,7 @@ import pytest
 from gaussian_wrapping_addon.core.settings import JobSettings, declarations, declared
 from gaussian_wrapping_addon.ops.worker import preferred_worker
 from gaussian_wrapping_addon.ui import preferences
+from gaussian_wrapping_addon.ui.dataset import dataset_panel
 from gaussian_wrapping_addon.ui.meshing import mesh_panel, texture_panel
 from gaussian_wrapping_addon.ui.training import train_advanced_panel, train_panel
 from tests.blender.fake_layout import draw
@@ -47,6 +48,9 @@ STORED = {
     "training.turntable": ["AUTO", "ON", "OFF"],
     "training.mask_invert": None,
     "training.mask_grow_px": None,
+    "training.georeference": ["AUTO", "ON", "OFF"],
+    "training.markers": None,
+    "training.control_points": None,
     "training.iterations": None,
     "training.max_gaussians": None,
     "training.max_image_px": None,
@@ -104,9 +108,12 @@ def test_numbers_have_the_limits_of_their_checks() -> None:
 def test_every_declared_property_is_there_and_drawn() -> None:
     properties = bpy.context.scene.gwrap
     drawn: set[str] = set(preferences.GWRAP_preferences.__annotations__)
+    properties.source = properties.checked_source = "clip.mp4"
+    properties.checked_kind = "video"
     for method, resolution in (("PAM", "EDGE_LENGTH"), ("PIVOTS", "POINTS")):
         properties.method, properties.resolution, properties.decimate = method, resolution, True
         for panel in (
+            dataset_panel.GWRAP_PT_dataset,
             train_panel.GWRAP_PT_train,
             train_advanced_panel.GWRAP_PT_train_advanced,
             mesh_panel.GWRAP_PT_mesh,

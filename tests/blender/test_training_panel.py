@@ -103,6 +103,38 @@ def test_each_choice_changes_its_setting_and_no_other(tmp_path: Path) -> None:
     assert to_json(panel_settings.job_settings(bpy.context.scene, 0)) == base
 
 
+def test_metres_are_asked_for_in_the_panel(tmp_path: Path) -> None:
+    points = tmp_path / "gcp.txt"
+    points.write_text("LOCAL\n")
+    base = to_json(panel_settings.job_settings(bpy.context.scene, 0))
+    changes = (
+        ("georeference", "OFF"),
+        ("markers", "DICT_4X4_50:0.05"),
+        ("control_points", str(points)),
+    )
+    for name, value in changes:
+        setattr(training(), name, value)
+    found = to_json(panel_settings.job_settings(bpy.context.scene, 0).validated())
+    wanted = {"georeference": "off", "markers": "4x4_50:0.05", "control_points": str(points)}
+    assert found == {**base, **wanted}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("markers", "4x4_51:0.05", "no marker dictionary '4x4_51'"),
+        ("markers", "4x4_50:0", "marker size '0' is not a length"),
+        ("markers", "4x4_50", "have no size"),
+        ("control_points", "/nowhere/gcp.txt", "does not exist"),
+        ("control_points", r"\\server\share\gcp.txt", "another computer"),
+    ],
+)
+def test_metres_that_cannot_be_had_are_refused(name: str, value: str, words: str) -> None:
+    setattr(training(), name, value)
+    with pytest.raises(UsageError, match=words):
+        panel_settings.job_settings(bpy.context.scene, 0)
+
+
 @pytest.mark.parametrize(
     ("path", "words"),
     [

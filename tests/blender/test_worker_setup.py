@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from gaussian_wrapping_addon.core.jobs import client as job_client
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
 from gaussian_wrapping_addon.core.processes import worker_environment
 from gaussian_wrapping_addon.core.processes.worker_environment import WorkerEnvironment
+from gaussian_wrapping_addon.core.processes.worker_extras import EXTRAS
 from gaussian_wrapping_addon.core.processes.worker_requirements import requirements_file
 from gaussian_wrapping_addon.core.setup.commands import SetupRequest
 from gaussian_wrapping_addon.core.setup.install import SetupTask
@@ -128,14 +130,18 @@ def test_the_dialog_shows_the_commands(
     monkeypatch.setattr(worker_setup_operators, "wheel_folder", lambda _context: "/wheels")
     worker_setup.state.has_cuda = cuda
     layout = FakeLayout()
-    layout_prop = SimpleNamespace(properties={"python", "torch"})
-    fake = SimpleNamespace(layout=layout, python=PYTHON.path, torch="cpu", bl_rna=layout_prop)
+    layout_prop = SimpleNamespace(properties={"python", "torch", "extras"})
+    fake = SimpleNamespace(
+        layout=layout, python=PYTHON.path, torch="cpu", extras={"raw"}, bl_rna=layout_prop
+    )
     worker_setup_operators.GWRAP_OT_set_up_worker.draw(fake, bpy.context)
     text = " ".join(layout.texts.split())
     made = f"{PYTHON.path} -I -m venv --clear {root / 'env'}"
     assert made.replace(" ", "") in text.replace(" ", ""), "a long path is broken at its hyphens"
     assert "--no-index --find-links /wheels" in text
     assert f"-r {requirements_file()}" in text
+    assert "rawpy==" in text
+    assert "pillow-heif" not in text
     assert "gwrap.copy_setup_commands" in layout.operators
     choices = [item[0] for item in worker_setup_operators._torch_items(None, None)]
     assert choices == (["cpu", "cuda", "index"] if cuda else ["cpu", "index"])
@@ -143,6 +149,33 @@ def test_the_dialog_shows_the_commands(
     fake.layout, fake.torch = FakeLayout(), "cuda"
     worker_setup_operators.GWRAP_OT_set_up_worker.draw(fake, bpy.context)
     assert "Training and vacancy on the GPU, for several GiB more" in fake.layout.texts
+
+
+def test_extras_have_a_button_each_until_they_are_there(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "gwrap.add_extra" not in drawn().operators, "there is nothing to add to"
+    assert not bpy.ops.gwrap.add_extra.poll()
+    environment = WorkerEnvironment(root)
+    python = worker_environment.venv_python(root / "env")
+    python.parent.mkdir(parents=True)
+    python.touch()
+    environment.ready_path.write_text("{}")
+    marker = {"made_by": "gaussian_wrapping_addon", "python": PYTHON.path, "kind": "venv"}
+    environment.marker_path.write_text(json.dumps({**marker, "extras": ["heif"]}))
+    layout = drawn()
+    assert "HEIC Photos: installed" in layout.texts
+    assert layout.operators.count("gwrap.add_extra") == len(EXTRAS) - 1
+    assert "Add Camera RAW…" in layout.texts
+    assert not bpy.ops.gwrap.add_extra.poll(), "Blender may not go online"
+    monkeypatch.setattr(worker_setup_operators, "wheel_folder", lambda _context: "/wheels")
+    assert bpy.ops.gwrap.add_extra.poll()
+    shown = FakeLayout()
+    fake = SimpleNamespace(layout=shown, extra="raw")
+    worker_setup_operators.GWRAP_OT_add_extra.draw(fake, bpy.context)
+    text = "".join(shown.texts.split())
+    assert f"{python}-I-mpip--isolatedinstall" in text
+    assert "--find-links/wheels--no-depsrawpy==" in text
 
 
 def test_a_set_up_from_start_to_end_in_blender(

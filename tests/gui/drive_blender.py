@@ -40,11 +40,22 @@ def steps() -> Iterator[float]:
     press(bpy.ops.gwrap.wrap_scene)
     yield from until(lambda: state_of_job() == "RUNNING", "the job runs")
     yield from until(lambda: fraction_of_job() > 0.2, "the timer sees progress")
-    yield 0.6
+    points = driving.module("ui.jobs.points_drawing")
+    yield from until(lambda: points._drawing.batch is not None, "the training's points are drawn")
+    check(not points._drawing.failed, "without an error")
+    bar = driving.module("ui.jobs.status_bar")
+    check(len(bar.running_jobs()) == 1 and not bar._failed, "the status bar shows the job")
+    driving.execute(bpy.ops.view3d.view_axis, type="FRONT")
+    yield 1.0
     screenshot("2-running")
+    bpy.context.scene.gwrap.show_points = False
+    yield from until(lambda: points._drawing.batch is None, "the points are switched off")
+    bpy.context.scene.gwrap.show_points = True
     press(bpy.ops.gwrap.cancel_job)
     yield from until(lambda: state_of_job() == "CANCELLED", "the job is cancelled")
     yield 0.5
+    check(points._drawing.batch is None, "the points have gone with the job")
+    check(bar.running_jobs() == [], "the status bar is empty")
     screenshot("3-cancelled")
 
     os.environ["GW_FAKE"] = "refuse"

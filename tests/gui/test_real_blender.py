@@ -21,15 +21,28 @@ pytestmark = [pytest.mark.gui, pytest.mark.slow]
 SCREENSHOTS = ("1-start", "2-running", "3-cancelled", "4-failed", "5-result", "6-camera")
 
 
-def test_every_button_with_a_fake_worker(visit: Visit) -> None:
-    (visit.folder / "photos").mkdir()
-    worker = visit.folder / "fake-python"
+def fake_worker(folder: Path) -> str:
+    """Write a program that stands for the worker's Python, and an empty folder of photos."""
+    (folder / "photos").mkdir()
+    worker = folder / "fake-python"
     fake = REPOSITORY / "tests" / "blender" / "fake_worker.py"
     worker.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{fake}" "$@"\n')
     worker.chmod(0o755)
-    outcome = visit.run("drive_blender.py", deadline_s=240, GAUSSIAN_WRAPPING_PYTHON=str(worker))
+    return str(worker)
+
+
+def test_every_button_with_a_fake_worker(visit: Visit) -> None:
+    worker = fake_worker(visit.folder)
+    outcome = visit.run("drive_blender.py", deadline_s=240, GAUSSIAN_WRAPPING_PYTHON=worker)
     assert len(outcome["checks"]) >= 12
     for name in SCREENSHOTS:
+        assert colours_of(visit.folder / f"{name}.png") > 100, f"{name} is (nearly) empty"
+
+
+def test_the_panel_in_other_languages(visit: Visit) -> None:
+    worker = fake_worker(visit.folder)
+    visit.run("drive_languages.py", deadline_s=240, GAUSSIAN_WRAPPING_PYTHON=worker)
+    for name in ("1-de_DE", "2-de_DE", "1-ja_JP", "2-ja_JP"):
         assert colours_of(visit.folder / f"{name}.png") > 100, f"{name} is (nearly) empty"
 
 

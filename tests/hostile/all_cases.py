@@ -12,6 +12,7 @@ from tests.hostile.cases import (
     findings,
     job_folders,
     job_places,
+    masks,
     meshes,
     photos,
     regions,
@@ -32,6 +33,7 @@ GROUPS: tuple[Group, ...] = (
     meshes.GROUP,
     commands.GROUP,
     findings.GROUP,
+    masks.GROUP,
 )
 
 

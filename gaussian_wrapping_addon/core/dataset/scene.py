@@ -25,7 +25,10 @@ def usable_points(points: np.ndarray) -> np.ndarray:
 
 
 BACKGROUND_SHARE = 0.75
-"""Share of the photos that must be masked to what turns for masks to mean background."""
+"""Share of the photos whose mask was made, of what turns or of an object, for masks to mean
+background."""
+MASKS_MADE = "photos_masked_to_object"
+"""Fact of a scene: photos with a mask made of a region or by a model."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,8 @@ class Scene:
     def mask_mode(self, chosen: str) -> Literal["ignore", "background"]:
         """Return what the masks exclude, for a setting of :class:`~..settings.TrainingSettings`."""
         if chosen == "auto":
-            masked = self.facts.get("photos_masked_as_turning") or 0
+            turning = self.facts.get("photos_masked_as_turning") or 0
+            masked = max(turning, self.facts.get(MASKS_MADE) or 0)
             return "background" if masked > BACKGROUND_SHARE * len(self.views) else "ignore"
         return "background" if chosen == "background" else "ignore"
 

@@ -58,7 +58,8 @@ def load_saved_scene(folder: Path) -> Scene:
 def scene_to_json(scene: Scene, folder: Path | None = None) -> dict[str, Any]:
     """Return the scene without its points as plain JSON values.
 
-    Paths inside ``folder`` are written relative to it, so that a job folder can be moved.
+    Paths inside ``folder``, or in a folder beside it, are written relative to it, so that a job
+    folder can be moved.
     """
     return {
         "version": VERSION,
@@ -90,8 +91,8 @@ def scene_from_json(values: Any, folder: Path) -> Scene:
         views = tuple(
             View(
                 Camera.from_json(entry["camera"]),
-                folder / entry["photo"],
-                None if entry["mask"] is None else folder / entry["mask"],
+                _read(entry["photo"], folder),
+                None if entry["mask"] is None else _read(entry["mask"], folder),
             )
             for entry in values["views"]
         )
@@ -112,7 +113,14 @@ def scene_from_json(values: Any, folder: Path) -> Scene:
 def _written(path: Path, folder: Path | None) -> str:
     if folder is not None and path.is_relative_to(folder):
         return path.relative_to(folder).as_posix()
+    if folder is not None and path.is_relative_to(folder.parent):  # frames of a video
+        return f"../{path.relative_to(folder.parent).as_posix()}"
     return str(path)
+
+
+def _read(written: str, folder: Path) -> Path:
+    """Return the path that :func:`_written` wrote, without ``..``."""
+    return Path(os.path.normpath(folder / written))
 
 
 def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..dataset.camera import Camera
-from ..dataset.readers.source_kind import read_poses, source_kind
+from ..dataset.loading.source_kind import read_poses, source_kind
 from ..dataset.similarity import Similarity
 from ..errors import DatasetError, ParseError, UsageError
 from ..files import read_json
@@ -117,7 +117,7 @@ def find_layout(request: EvaluationRequest) -> str:
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """Read the cameras of a COLMAP project or transforms.json, in the frame of the file.
+    """Read the cameras of an input that has them, in the frame of the file.
 
     Lens distortion is ignored; focal length and principal point suffice for alignment and for the
     virtual scan, which only needs visibility.
@@ -130,7 +130,8 @@ def read_cameras(path: Path) -> list[Camera]:
     for photo in read_poses(source_kind(path)).photos:
         if photo.lens is None:
             raise DatasetError(
-                f"The camera of {photo.name} has no photo size.", "Add w and h to transforms.json."
+                f"The camera of {photo.name} has no photo size.",
+                "Give cameras with photo sizes: a COLMAP project, or a transforms.json with w, h.",
             )
         (fx, fy), (cx, cy) = photo.lens.focal, photo.lens.principal_point
         size = photo.lens.width, photo.lens.height

@@ -89,6 +89,14 @@ def worker_python(preference: str = "") -> str:
     return found
 
 
+def worker_if_any(preference: str = "") -> str:
+    """Return :func:`worker_python`'s answer, ``""`` where there is none."""
+    try:
+        return worker_python(preference)
+    except UsageError:
+        return ""
+
+
 def _has_torch() -> bool:
     """Tell whether the running Python could be a worker; imports nothing."""
     try:

@@ -17,6 +17,7 @@ from ..processes.peak_memory import peak_memory_bytes
 from ..progress import Progress, ProgressEvent
 from ..settings import to_json
 from .baking.bake_stage import require_training, run_bake
+from .masking.masks_stage import check_mask_model, run_masks
 from .stages.cameras_stage import run_cameras
 from .stages.mesh_stage import run_mesh
 from .stages.region_field import reject_short_edges
@@ -30,6 +31,8 @@ _logger = logging.getLogger(__name__)
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 STAGE_SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
+MASKS_SHARE = 0.1
+"""Of the time of a job that makes masks; taken from the training's."""
 BAKE_BEGINS = 0.02
 """Share of the overall bar before the bake stage."""
 
@@ -96,9 +99,16 @@ def run_job(
     if job.command == "bake":  # both are finished
         train_begin, begin = BAKE_BEGINS / 2, BAKE_BEGINS
     progress = overall.stage("cameras", _Span(0.0, train_begin))
+    check_mask_model(job, folder, progress)  # refused before photos are read
     cameras = run_cameras(folder, job, progress, threads=threads)
     if cameras.reused:
         overall.skip_to(train_begin)
+    if job.settings.masks_are_made:
+        masks_begin, train_begin = train_begin, train_begin + (begin - train_begin) * MASKS_SHARE
+        progress = overall.stage("masks", _Span(masks_begin, train_begin))
+        cameras = run_masks(folder, job, cameras, progress, threads=threads, device=device)
+        if cameras.reused:
+            overall.skip_to(train_begin)
     reject_short_edges(job, cameras.folder)
     if job.command == "bake":
         require_training(folder, job, cameras)

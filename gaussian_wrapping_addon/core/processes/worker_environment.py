@@ -77,6 +77,11 @@ class WorkerEnvironment:
         """Return the content of the marker; empty if there is none."""
         return _read_object(self.marker_path, "made_by", _ADDON)
 
+    def extras(self) -> tuple[str, ...]:
+        """Return the names of the extras that were installed."""
+        names = self.marker().get("extras")
+        return tuple(map(str, names)) if isinstance(names, list) else ()
+
     def worker(self) -> str:
         """Return the ``python`` for :func:`~.helper_process.child_command`; ``""`` if missing.
 

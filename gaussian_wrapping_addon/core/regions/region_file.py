@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Read and write region files: bounding-volume JSON, version 1 (docs/file-formats.md)."""
+"""Read and write region files (docs/file-formats.md): bounding-volume JSON, version 1, and the
+reconstruction regions of RealityScan.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +16,8 @@ from .. import limits
 from ..errors import DatasetError, MeshingError, ParseError
 from ..files import read_json, write_json
 from ..names import printable_name
+from .box import CUBE_TRIANGLES
+from .rsbox import is_rsbox, read_rsbox, write_rsbox
 from .volume import check_volume
 
 CLASS_NAME = "GaussianWrappingBoundingVolume"
@@ -48,6 +52,8 @@ def read_region_file(path: Path) -> RegionFile:
 def read_region_body(path: Path) -> Any:
     """Read the JSON values of a region file; :func:`parse_region_file` validates them.
 
+    A reconstruction region of RealityScan becomes the values that its JSON would have.
+
     Raises
     ------
     DatasetError
@@ -57,6 +63,8 @@ def read_region_body(path: Path) -> Any:
         raise DatasetError(f"{path} is a folder, not a region file.", "Give a file in it.")
     if not path.is_file():
         raise DatasetError(f"Region file {path} does not exist.", "Check the path.")
+    if is_rsbox(path):
+        return region_to_json(path.stem, read_rsbox(path), CUBE_TRIANGLES)
     try:
         return read_json(path, follow_links=True)
     except OSError as error:
@@ -139,5 +147,16 @@ def region_to_json(
 def write_region_file(
     path: Path, name: str, vertices: np.ndarray, simplices: Iterable[Iterable[int]] | None = None
 ) -> None:
-    """Write a region file atomically; the parameters are those of :func:`region_to_json`."""
-    write_json(path, region_to_json(name, vertices, simplices))
+    """Write a region file atomically; the parameters are those of :func:`region_to_json`.
+
+    The suffix decides the format: JSON, or the box of a reconstruction region.
+
+    Raises
+    ------
+    UsageError
+        A body that is no box cannot be a reconstruction region.
+    """
+    if is_rsbox(path):
+        write_rsbox(path, np.asarray(vertices, np.float64), name)
+    else:
+        write_json(path, region_to_json(name, vertices, simplices))

@@ -12,9 +12,15 @@ DEVICE = r"auto|cpu|cuda(:[0-9]{1,3})?"
 """Pattern of the devices that a job can be given."""
 
 MASK_MODES = ("ignore", "background", "auto")
-"""``"auto"``: background where the masks were made of a turntable, else ignore."""
+"""``"auto"``: background where the masks were made of a turntable, a region or by a model, else
+ignore."""
+MASKS_MADE = ("off", "region")
+MODEL_RANGES = ("imagenet", "half", "unit")
+"""Colours of a segmentation model: mean and deviation of ImageNet, -0.5 to 0.5, 0 to 1."""
 MAX_MASK_GROW_PX = 200
+GEOREFERENCES = ("auto", "on", "off")
 TURNTABLE_MODES = ("auto", "on", "off")
+PANORAMA_MODES = ("auto", "on", "off")
 CORRELATIONS = ("signed", "squared")
 SPACINGS = ("adaptive", "uniform")
 MESH_METHODS = ("pam", "pivots")

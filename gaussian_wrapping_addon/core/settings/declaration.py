@@ -35,7 +35,9 @@ and resolution (all that an estimate needs); other options of regions; the comma
 Owner = Literal["scene", "training", "preferences"]
 """Owner of a property in Blender: ``Scene.gwrap``, ``Scene.gwrap.training``, or the add-on."""
 
-PanelName = Literal["train", "train_advanced", "mesh", "mesh_advanced", "texture", "preferences"]
+PanelName = Literal[
+    "dataset", "train", "train_advanced", "mesh", "mesh_advanced", "texture", "preferences"
+]
 """A panel in Blender."""
 
 JOB = "job"
@@ -114,7 +116,7 @@ class PanelProperty:
     """Shorter label in the panel, if its title provides the context."""
     expand: bool = False
     """Whether all entries of an enum are shown side by side."""
-    shown_if: tuple[str, str | bool] | None = None
+    shown_if: tuple[str, str | bool | int] | None = None
     """Property of the scene and its value for which this one is shown."""
     default_if_hidden: bool = False
     """Whether the setting takes its default while the property is hidden."""

@@ -10,8 +10,19 @@ from typing import Any
 
 from ..errors import UsageError
 from ..export_formats import JOB_FORMATS
+from ..limits import MAX_CHOSEN_FRAMES, MIN_IMAGES
 from .checks import Choices, Condition, Range, Subset
-from .choices import DEVICE, MAX_MASK_GROW_PX, PRESETS, SWITCH, TURNTABLE_MODES
+from .choices import (
+    DEVICE,
+    GEOREFERENCES,
+    MASKS_MADE,
+    MAX_MASK_GROW_PX,
+    MODEL_RANGES,
+    PANORAMA_MODES,
+    PRESETS,
+    SWITCH,
+    TURNTABLE_MODES,
+)
 from .declaration import (
     Declaration,
     Item,
@@ -21,6 +32,7 @@ from .declaration import (
     setting,
     with_values,
 )
+from .markers import MARKERS_WANTED, are_markers, checked_markers
 from .meshing import MeshingSettings
 from .texture import TextureSettings
 from .training import TrainingSettings
@@ -123,7 +135,8 @@ class JobSettings:
     )
     regions: tuple[str, ...] = setting(
         ("auto",),
-        help="What is meshed: auto, all, or the paths of region files.",
+        help="What is meshed: auto, all, or the paths of region files (JSON, or .rsbox of "
+        "RealityScan).",
         check=Condition(lambda value: len(value) > 0, "at least one region"),
         option=Option(
             "--region",
@@ -188,6 +201,29 @@ class JobSettings:
             panel_name="train_advanced",
         ),
     )
+    equirectangular: str = setting(
+        "auto",
+        help="Whether photos without cameras are 360 degree panoramas, which are cut into pinhole "
+        "views. Auto: where all are exactly twice as wide as high.",
+        check=Choices(PANORAMA_MODES),
+        since="0.2.0",
+        option=Option(
+            "--equirectangular",
+            help="photos without cameras are 360 degree panoramas: cut them into views",
+            scope="training",
+        ),
+        panel=PanelProperty(
+            "360° Photos",
+            "Photos without cameras are equirectangular panoramas: each is cut into 14 views",
+            items=(
+                Item("auto", "Auto", "Where all photos are exactly twice as wide as high"),
+                Item("on", "On", "All photos are panoramas"),
+                Item("off", "Off", "Photos are used as they are"),
+            ),
+            owner="training",
+            panel_name="train_advanced",
+        ),
+    )
     mask_invert: str = setting(
         "off",
         help="Masks are white where photos are left out.",
@@ -223,9 +259,190 @@ class JobSettings:
             panel_name="train_advanced",
         ),
     )
+    georeference: str = setting(
+        "auto",
+        help="Whether GPS positions in the photos give metres, place on the earth and up. Auto: "
+        "where the photos come without cameras and the positions determine these; with cameras "
+        "the place is written into sidecars only. On: also with cameras, or the job is refused.",
+        check=Choices(GEOREFERENCES),
+        option=Option(
+            "--georeference",
+            help="metres, place and up by the photos' GPS; auto: where it is good",
+            scope="training",
+        ),
+        panel=PanelProperty(
+            "Georeference",
+            "Metres, place on the earth and up direction from the GPS of the photos",
+            items=(
+                Item("auto", "Auto", "Photos without cameras, if GPS is good enough"),
+                Item("on", "On", "Also photos with cameras; refused if GPS is not good enough"),
+                Item("off", "Off", "GPS is not read"),
+            ),
+            owner="training",
+            panel_name="train_advanced",
+        ),
+        since="0.2.0",
+    )
+    markers: str = setting(
+        "",
+        help="Printed ArUco or AprilTag markers in the photos, as dictionary and side of the black "
+        "square in metres, such as 4x4_50:0.05: the scene gets metres. Needs OpenCV in the "
+        "worker's Python.",
+        check=Condition(are_markers, f"empty, or {MARKERS_WANTED}"),
+        option=Option(
+            "--markers",
+            "DICTIONARY:SIZE",
+            "printed markers in the photos, such as 4x4_50:0.05, side in metres: gives the scale",
+            scope="training",
+            parse=checked_markers,
+        ),
+        panel=PanelProperty(
+            "Markers",
+            "Printed markers in the photos: dictionary and side in metres, such as 4x4_50:0.05",
+            owner="training",
+            panel_name="train_advanced",
+        ),
+        since="0.2.0",
+    )
+    control_points: str = setting(
+        "",
+        help="Text file of control points: known places and the pixels that show them. The scene "
+        "gets their frame, in metres.",
+        option=Option(
+            "--control-points",
+            "FILE.txt",
+            "known places and the pixels that show them: gives scale, place and up",
+            scope="training",
+            parse=lambda text: str(Path(text)),
+        ),
+        panel=PanelProperty(
+            "Control Points",
+            "Text file of known places and the pixels of photos that show them",
+            subtype="FILE_PATH",
+            owner="training",
+            panel_name="train_advanced",
+        ),
+        since="0.2.0",
+    )
+    make_masks: str = setting(
+        "off",
+        help="Masks made for the photos. region: a short training shows which part of each photo "
+        "is what stands in the job's region files; all else counts as background.",
+        check=Choices(MASKS_MADE),
+        option=Option(
+            "--make-masks",
+            help="region: mask the photos to what stands in the region files (--region)",
+            scope="training",
+        ),
+        since="0.2.0",
+    )
+    mask_regions: str = setting(
+        "",
+        help="JSON list of the region bodies that masks are made of, world coordinates. Written "
+        "when a job that trains is made with `make_masks`; other regions are meshed from the same "
+        "training.",
+        since="0.2.0",
+    )
+    mask_model: str = setting(
+        "",
+        help="ONNX file of a model that tells an object from its background; masks the photos to "
+        "what it finds. Nothing is downloaded. Empty uses none.",
+        option=Option(
+            "--mask-model",
+            "FILE.onnx",
+            "segmentation model that masks the photos; needs onnxruntime in the worker",
+            scope="training",
+            parse=lambda text: str(Path(text)),
+        ),
+        panel=PanelProperty(
+            "Mask Model",
+            "ONNX file of a segmentation model, such as U2-Net, IS-Net or BiRefNet: photos are "
+            "masked to the object that it finds; empty uses none",
+            subtype="FILE_PATH",
+            owner="training",
+            panel_name="train_advanced",
+        ),
+        since="0.2.0",
+    )
+    mask_model_range: str = setting(
+        "imagenet",
+        help="Colours that the mask model was trained with. imagenet: less the mean of ImageNet, "
+        "over its deviation (U2-Net, BiRefNet); half: -0.5 to 0.5 (IS-Net); unit: 0 to 1.",
+        check=Choices(MODEL_RANGES),
+        option=Option(
+            "--mask-model-range",
+            help="colours that the mask model wants: imagenet (U2-Net, BiRefNet), half (IS-Net) "
+            "or unit",
+            scope="training",
+        ),
+        panel=PanelProperty(
+            "Model Colors",
+            "Range of colours that the mask model expects; no effect without one",
+            items=(
+                Item("imagenet", "ImageNet", "Mean and deviation of ImageNet: U2-Net, BiRefNet"),
+                Item("half", "-0.5 to 0.5", "Range that IS-Net expects"),
+                Item("unit", "0 to 1", "Colours as the photos have them"),
+            ),
+            owner="training",
+            panel_name="train_advanced",
+        ),
+        since="0.2.0",
+    )
+    video_frames: int = setting(
+        0,
+        help="Frames of a video that are used: the sharpest of so many stretches of equal motion, "
+        "fewer where a stretch is blurred. 0 chooses 40 to 200 by how far the picture moves.",
+        check=Range(MIN_IMAGES, MAX_CHOSEN_FRAMES, zero="by the motion"),
+        unit="frames",
+        option=Option(
+            "--frames",
+            help="frames of a video that are used; 0: by its motion",
+            scope="training",
+            exclusive="video frames",
+        ),
+        panel=PanelProperty(
+            "Frames",
+            "Number of frames used, the sharpest ones; 0 chooses by the motion in the video",
+            owner="scene",
+            panel_name="dataset",
+            soft_high=300,
+        ),
+        since="0.2.0",
+    )
+    video_fps: float = setting(
+        0.0,
+        help="Frames of a video that are used for each of its seconds, the sharpest of each "
+        "stretch, whatever the motion; 0 chooses by the motion. Applies where no number of frames "
+        "is given.",
+        check=Range(0.05, 240.0, zero="by the motion"),
+        unit="frames per second",
+        option=Option(
+            "--fps",
+            "X",
+            help="frames of a video that are used for each of its seconds; 0: by its motion",
+            scope="training",
+            exclusive="video frames",
+        ),
+        panel=PanelProperty(
+            "Frames per Second",
+            "Frames used per second of the video; 0 chooses by the motion",
+            owner="scene",
+            panel_name="dataset",
+            soft_high=10,
+            precision=2,
+            shown_if=("video_frames", 0),
+            default_if_hidden=True,
+        ),
+        since="0.2.0",
+    )
     training: TrainingSettings = field(default_factory=TrainingSettings)
     meshing: MeshingSettings = field(default_factory=MeshingSettings)
     texture: TextureSettings = field(default_factory=TextureSettings)
+
+    @property
+    def masks_are_made(self) -> bool:
+        """Whether the job makes masks of its own."""
+        return self.make_masks != "off" or bool(self.mask_model)
 
     def validated(self) -> JobSettings:
         """Return self, or raise :class:`~..errors.SettingError` naming the first bad setting."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import typing
 from typing import Any, cast
 
@@ -35,6 +36,16 @@ def key_values(settings: Any) -> dict[str, Any]:
     return {name: value for name, value in to_json(settings).items() if name not in left_out}
 
 
+def has_kind(kind: Any, value: Any) -> bool:
+    """Return whether a JSON value is one of a setting of type ``int``, ``float`` or ``str``."""
+    if kind is float:
+        try:
+            return not isinstance(value, bool) and math.isfinite(value)
+        except (TypeError, OverflowError):
+            return False
+    return kind in (int, str) and type(value) is kind
+
+
 def from_json(kind: type, values: Any, location: str = "settings") -> Any:
     """Build a settings dataclass from JSON values.
 
@@ -62,7 +73,7 @@ def from_json(kind: type, values: Any, location: str = "settings") -> Any:
                 arguments[name] = float(value)
             except OverflowError:
                 raise UsageError(f"{where} is too large.", "Give a smaller number.") from None
-        elif wanted in (int, str) and type(value) is wanted:
+        elif wanted is not float and has_kind(wanted, value):
             arguments[name] = value
         elif typing.get_origin(wanted) is tuple and isinstance(value, (list, tuple)):
             if not all(isinstance(v, str) for v in value):

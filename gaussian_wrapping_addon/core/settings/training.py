@@ -238,12 +238,12 @@ class TrainingSettings(MethodSettings):
         "auto",
         help="What masks exclude. ignore: these pixels are not trained on, and anything may be "
         "there; background: the space behind them is empty; auto: background where the masks were "
-        "made of a turntable, else ignore.",
+        "made of a turntable, of a region or by a model, else ignore.",
         check=Choices(MASK_MODES),
         option=Option(
             "--mask-mode",
             help="masked pixels: ignore them, or treat them as empty background; auto: background "
-            "where the masks were made of a turntable",
+            "where the masks were made of a turntable, of a region or by a model",
         ),
         panel=PanelProperty(
             "Masks",
@@ -259,7 +259,7 @@ class TrainingSettings(MethodSettings):
                     "Background",
                     "Masked pixels show empty space: only the subject is modelled",
                 ),
-                Item("auto", "Auto", "Background for a turntable, else Ignore"),
+                Item("auto", "Auto", "Background for a turntable and for made masks, else Ignore"),
             ),
         ),
     )

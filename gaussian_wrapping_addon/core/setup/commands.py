@@ -18,7 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import UsageError
-from ..processes.worker_environment import MARKER, WorkerEnvironment, venv_python
+from ..processes.worker_environment import MARKER, PACKAGES, WorkerEnvironment, venv_python
+from ..processes.worker_extras import extra_hashes_file, extra_named
 from ..processes.worker_requirements import hashes_file, read_requirements
 from .pythons import FoundPython
 
@@ -29,7 +30,11 @@ CUDA_BRINGS = "Training and vacancy on the GPU, for several GiB more on the disk
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
 
+TEMPORARY = "tmp"
+"""Folder in an environment for a set-up that runs."""
+
 Command = tuple[str, ...]
+_INSTALL = ("install", "--disable-pip-version-check", "--no-input", "--only-binary", ":all:")
 
 
 @dataclass(frozen=True)
@@ -44,11 +49,20 @@ class SetupRequest:
     torch: str = CPU
     find_links: str = ""
     """Folder of wheels; if given, no package index is used."""
+    extras: tuple[str, ...] = ()
+    """Names of optional packages (``core/processes/worker_extras.py``)."""
+    adds: bool = False
+    """Add the extras to the present environment, and leave all else as it is."""
 
     @property
     def environment(self) -> WorkerEnvironment:
         """The environment to create."""
         return WorkerEnvironment(Path(self.root))
+
+    @property
+    def target(self) -> Path:
+        """Folder that packages are added from, once pip has ended."""
+        return self.environment.root / TEMPORARY / "added"
 
 
 def as_line(command: Command) -> str:
@@ -86,6 +100,8 @@ def all_commands(request: SetupRequest, python: FoundPython) -> list[Command]:
         The Python or the build of torch cannot be used.
     """
     folder = request.environment.next_folder()
+    if request.adds:
+        return _additions(request, python)
     if not python.can_install:
         version = f"{python.version[0]}.{python.version[1]}"
         raise UsageError(
@@ -104,24 +120,71 @@ def all_commands(request: SetupRequest, python: FoundPython) -> list[Command]:
 
 def _installs(request: SetupRequest) -> list[Command]:
     """Return the arguments of pip, one call after the other."""
-    options = ("install", "--disable-pip-version-check", "--no-input", "--only-binary", ":all:")
+    options, extras = _INSTALL, _extra_installs(request)
     index = torch_index(request.torch)
     if request.find_links:
-        # Isolated: pip's configured indexes and folders are ignored.
-        only_there = ("--no-index", "--find-links", request.find_links)
-        return [("--isolated", *options, *only_there, "-r", request.requirements)]
+        return [(*_only_wheels(request), "-r", request.requirements), *extras]
     also = ("--extra-index-url", index) if index else ()
     requirements = Path(request.requirements)
     hashes = hashes_file(requirements)
     if hashes is None:
-        return [(*options, *also, "-r", request.requirements)]
+        return [(*options, *also, "-r", request.requirements), *extras]
     (torch,) = (r for r in read_requirements(requirements) if r.name == "torch")
     # What the build for the processor needs is in the list with hashes.
     alone = ("--no-deps",) if request.torch == CPU else ()
     return [
         (*options, "--require-hashes", "-r", str(hashes)),
         (*options, *also, *alone, f"{torch.name}{torch.versions}"),
+        *extras,
     ]
+
+
+def _only_wheels(request: SetupRequest) -> Command:
+    """Return the words of pip that install from the folder of wheels and nowhere else."""
+    # Isolated: pip's configured indexes and folders are ignored.
+    return ("--isolated", *_INSTALL, "--no-index", "--find-links", request.find_links)
+
+
+def _extra_installs(request: SetupRequest) -> list[Command]:
+    """Return the arguments of pip for the extras, without what they need: it is there already."""
+    found: list[Command] = []
+    for extra in map(extra_named, request.extras):
+        hashes = extra_hashes_file(Path(request.requirements), extra)
+        if request.find_links:
+            found.append((*_only_wheels(request), "--no-deps", *extra.pins))
+        elif hashes is None:
+            found.append((*_INSTALL, "--no-deps", *extra.pins))
+        else:
+            found.append((*_INSTALL, "--no-deps", "--require-hashes", "-r", str(hashes)))
+    return found
+
+
+def _additions(request: SetupRequest, python: FoundPython) -> list[Command]:
+    """Return the commands that put the extras into a folder, from where they are moved later."""
+    check_addition(request)
+    environment = request.environment
+    pip: Command = (environment.worker(), "-I", "-m", "pip")
+    if environment.marker().get("kind") == PACKAGES:
+        pip = (python.path, "-I", *python.pip)
+    # Compiled when first imported: a folder of compiled files would replace the environment's.
+    target = ("--no-compile", "--target", str(request.target))
+    return [(*pip, *words, *target) for words in _extra_installs(request)]
+
+
+def check_addition(request: SetupRequest) -> None:
+    """Raise if there is no complete environment to add to, or nothing to add.
+
+    Raises
+    ------
+    UsageError
+        Says which, and the next step.
+    """
+    if not request.extras:
+        raise UsageError("No extra is named.", "Name what to add.")
+    if not request.environment.is_ready():
+        raise UsageError(
+            f"There is no complete worker in {request.root} to add to.", "Set it up first."
+        )
 
 
 def check_folders(request: SetupRequest) -> None:

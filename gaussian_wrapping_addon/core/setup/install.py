@@ -44,8 +44,18 @@ from ..processes.worker_environment import (
     register_environment,
     unregister_environment,
 )
+from ..processes.worker_extras import installed_extras
 from ..processes.worker_requirements import read_requirements
-from .commands import CUDA, Command, SetupRequest, all_commands, as_line, check_folders
+from .commands import (
+    CUDA,
+    TEMPORARY,
+    Command,
+    SetupRequest,
+    all_commands,
+    as_line,
+    check_addition,
+    check_folders,
+)
 from .pythons import probe
 
 _logger = logging.getLogger(__name__)
@@ -53,7 +63,6 @@ _logger = logging.getLogger(__name__)
 NEEDED_GIB = 3
 """Disk space for download and installation with torch for the CPU (1.5 GB remain used)."""
 NEEDED_CUDA_GIB = 12
-_TEMPORARY = "tmp"
 _SEE_LOG = "See log.txt in the worker's folder, then press Set Up Worker."
 
 # Settings of pip that would install packages outside of the environment.
@@ -93,6 +102,8 @@ class SetupTask(threading.Thread):
         try:
             if self.removes:
                 remove(self.request.environment)
+            elif self.request.adds:
+                self._add()
             else:
                 self._set_up()
             self.status = JobStatus("DONE", self.status.stage, 1.0, exit_code=EXIT_DONE)
@@ -129,6 +140,7 @@ class SetupTask(threading.Thread):
             "version": python.version_text,
             "torch": request.torch,
             "folder": folder.name,
+            "extras": list(request.extras),
         }
         check_folders(request)
         environment.root.mkdir(parents=True, exist_ok=True)
@@ -141,16 +153,10 @@ class SetupTask(threading.Thread):
         replaced = environment.folder if environment.is_ready() else None
         try:
             _delete_unused(environment)
-            (environment.root / _TEMPORARY).mkdir()
-            with (environment.root / "log.txt").open("a", encoding="utf-8") as log:
-                log.write(f"--- {time.strftime('%Y-%m-%d %H:%M:%S')} {platform.platform()}\n")
-                for command in commands:
-                    self._run_command(command, python.path, log, 2 * len(names))
-            sites = [*folder.glob("lib/python3*/site-packages"), *folder.glob("Lib/site-packages")]
-            found = importlib.metadata.distributions(path=[str(p) for p in sites or [folder]])
-            versions = {d.metadata["Name"]: d.version for d in found}
+            (environment.root / TEMPORARY).mkdir()
+            self._run_all(commands, python.path, 2 * len(names))
             write_json(environment.marker_path, marker)
-            write_json(environment.ready_path, versions)
+            write_json(environment.ready_path, installed_versions(folder))
             register_environment(environment.root)
         finally:
             with contextlib.suppress(OSError):  # the next set-up deletes the rest
@@ -161,13 +167,43 @@ class SetupTask(threading.Thread):
                 with contextlib.suppress(OSError):
                     remove(environment)
 
+    def _add(self) -> None:
+        """Add the extras to the environment in use; stopped before the end, it stays as it is."""
+        request, environment = self.request, self.request.environment
+        check_folders(request)
+        check_addition(request)
+        python = probe(str(environment.marker().get("python", "")))
+        commands = all_commands(request, python)
+        lock = JobFolder(environment.root)
+        lock.lock()
+        temporary = environment.root / TEMPORARY
+        try:
+            shutil.rmtree(temporary, ignore_errors=True)
+            temporary.mkdir()
+            self._run_all(commands, python.path, 1 + len(commands))
+            place_packages(request.target, site_folder(environment.folder))
+            versions = installed_versions(environment.folder)
+            extras = list(installed_extras(versions))
+            write_json(environment.marker_path, {**environment.marker(), "extras": extras})
+            write_json(environment.ready_path, versions)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+            lock.unlock()
+
+    def _run_all(self, commands: list[Command], python: str, expected: int) -> None:
+        """Run commands one after the other; their output goes to ``log.txt``."""
+        with (self.request.environment.root / "log.txt").open("a", encoding="utf-8") as log:
+            log.write(f"--- {time.strftime('%Y-%m-%d %H:%M:%S')} {platform.platform()}\n")
+            for command in commands:
+                self._run_command(command, python, log, expected)
+
     def _run_command(self, command: Command, python: str, log: IO[str], expected: int) -> None:
         """Run a command to its end; the progress is the share of ``expected`` packages named."""
         log.write(f"$ {as_line(command)}\n")
         last: deque[str] = deque(maxlen=40)
         self._process = process = start_process(
             child_command("setup.install", *command, python=python),
-            self.request.environment.root / _TEMPORARY,
+            self.request.environment.root / TEMPORARY,
         )
         assert process.stdin is not None
         assert process.stdout is not None
@@ -192,6 +228,33 @@ class SetupTask(threading.Thread):
             raise Cancelled("The set-up was cancelled.", "Press Set Up Worker to start again.")
         if process.returncode != 0:
             raise error_from_output(process.returncode, list(last))
+
+
+def site_folder(folder: Path) -> Path:
+    """Return where packages are in an environment's folder: a venv, or packages alone."""
+    sites = [*folder.glob("lib/python3*/site-packages"), *folder.glob("Lib/site-packages")]
+    return sites[0] if sites else folder
+
+
+def installed_versions(folder: Path) -> dict[str, str]:
+    """Return the packages in an environment's folder: the version of each name."""
+    found = importlib.metadata.distributions(path=[str(site_folder(folder))])
+    return {d.metadata["Name"]: d.version for d in found}
+
+
+def place_packages(added: Path, site: Path) -> None:
+    """Move installed packages into an environment on the same disk, in place of other versions."""
+    for info in added.glob("*.dist-info"):
+        for other in site.glob(f"{info.name.split('-')[0]}-*.dist-info"):
+            shutil.rmtree(other)
+    # The metadata last: what they list is there by then.
+    for entry in sorted(added.iterdir(), key=lambda p: p.name.endswith(".dist-info")):
+        if entry.name in ("bin", "Scripts"):  # no program of an extra is called
+            continue
+        target = site / entry.name
+        if target.is_dir():
+            shutil.rmtree(target)
+        os.replace(entry, target)
 
 
 def _check_disk(root: Path, needed_gib: int) -> None:
@@ -258,7 +321,7 @@ def _delete_unused(environment: WorkerEnvironment, keep: Path | None = None) -> 
     in_use = environment.folder if environment.is_ready() else None
     if in_use is None:
         environment.ready_path.unlink(missing_ok=True)
-    for folder in (environment.root / name for name in (*FOLDERS, _TEMPORARY)):
+    for folder in (environment.root / name for name in (*FOLDERS, TEMPORARY)):
         if folder.is_symlink():
             folder.unlink()
         elif folder.exists() and folder not in (in_use, keep):

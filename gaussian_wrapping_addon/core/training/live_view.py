@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Preview picture of a running training; metrics of held-out photos, during it and at the end.
+"""Preview picture and points of a running training; metrics of held-out photos.
 
 Nothing here affects a training's result: the renderer is a separate one, no random numbers are
 drawn, and the clock only decides when to update.
@@ -19,6 +19,7 @@ from ..dataset.photo_source import PhotoSource
 from ..dataset.view_split import evenly_spaced
 from ..files import write_bytes
 from ..gaussians.model import OrientedGaussians
+from ..gaussians.preview_points import POINTS_FILE, points_file, preview_points
 from ..imaging.lpips import lpips_if_ready
 from ..imaging.view_metrics import psnr, score_images
 from ..progress import Progress
@@ -136,7 +137,8 @@ class LiveView:
     held_out : sequence of int
         Held-out views. The middle one is shown; without any, the first view of the scene.
     folder : Path
-        Receives :data:`PREVIEW_FILE` and :data:`PIXELS_FILE`, each replaced atomically.
+        Receives :data:`PREVIEW_FILE`, :data:`PIXELS_FILE` and
+        :data:`~..gaussians.preview_points.POINTS_FILE`, each replaced atomically.
     settings : TrainingSettings
         ``preview_every_s`` is the time between two updates; 0 disables them.
     threads : int
@@ -210,6 +212,8 @@ class LiveView:
         try:
             write_bytes(self._folder / PREVIEW_FILE, png(picture))
             write_bytes(self._folder / PIXELS_FILE, npy(picture))
+            points = preview_points(raw.means, raw.opacity_logits, raw.sh)
+            write_bytes(self._folder / POINTS_FILE, points_file(points))
         except OSError as error:
             # The training goes on without pictures; a full disk is reported by the checkpoints.
             self._every_s = 0.0

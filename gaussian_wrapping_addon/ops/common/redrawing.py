@@ -17,6 +17,15 @@ def redraw(*kinds: str) -> None:
                 area.tag_redraw()
 
 
+def redraw_status_bars() -> None:
+    """Let the status bars of all windows be drawn again; they are in no screen's areas.
+
+    They listen to the name of the view layer, which nothing here changes.
+    """
+    if not bpy.app.background:
+        bpy.msgbus.publish_rna(key=(bpy.types.ViewLayer, "name"))
+
+
 @contextmanager
 def waiting(context: bpy.types.Context) -> Iterator[None]:
     """Show the wait cursor while Blender is blocked."""

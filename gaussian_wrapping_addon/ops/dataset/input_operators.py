@@ -7,16 +7,20 @@ from typing import Final
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
+from ...core.dataset.photos.image_formats import PHOTO_SUFFIXES
+from ...core.dataset.readers.programs.program_files import CAMERA_FILE_SUFFIXES
+from ...core.dataset.video.video_file import VIDEO_SUFFIXES
 from ...core.errors import UsageError, WrapError
 from ..common.addon import properties_of
 from ..common.error_reporting import OperatorResult, ReportsErrors
+from ..common.translate import tr
 from ..jobs import watched_jobs
 from ..jobs.job_guards import no_job_runs
 from ..training import training_estimate
 from ..worker import preferred_worker
 from . import photo_check
 
-_INPUT_FILES: Final = (".ply", ".json")
+_INPUT_FILES: Final = (".ply", *CAMERA_FILE_SUFFIXES, *VIDEO_SUFFIXES)
 """Files that are inputs themselves; for any other file, its folder is the input."""
 
 
@@ -24,8 +28,8 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.choose_input"
     bl_label = "Choose Photos"
     bl_description = (
-        "Choose the folder of the photos, of a COLMAP project or with a transforms.json, or the "
-        "PLY of a splat; it is checked at once"
+        "Choose the folder of the photos, of a COLMAP project or with a transforms.json, a video, "
+        "the camera file of another program, or the PLY of a splat; it is checked at once"
     )
     bl_options = {"UNDO"}  # noqa: RUF012 - Blender's convention
 
@@ -33,7 +37,8 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
     filter_folder: BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_image: BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_glob: StringProperty(  # type: ignore[valid-type]
-        default="*.ply;*.json;*.jpg;*.jpeg;*.png;*.tif;*.tiff;*.webp;*.heic", options={"HIDDEN"}
+        default=";".join(f"*{suffix}" for suffix in (*_INPUT_FILES, *PHOTO_SUFFIXES)),
+        options={"HIDDEN"},
     )
 
     @classmethod
@@ -49,8 +54,9 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
 
     def draw(self, _context: bpy.types.Context) -> None:
         column = self.layout.column(align=True)
-        column.label(text="Open the folder with the photos,")
-        column.label(text="then press Choose Photos.")
+        column.label(text=tr("Open the folder with the photos,"), translate=False)
+        column.label(text=tr("or select a video,"), translate=False)
+        column.label(text=tr("then press Choose Photos."), translate=False)
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
         if not self.filepath:
@@ -67,7 +73,8 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
             watched_jobs.detach(context.scene)
         properties.source = str(path)
         training_estimate.forget()
-        photo_check.start(context.scene, preferred_worker.worker_choice(context))
+        choice = preferred_worker.worker_choice(context)
+        photo_check.start(context.scene, choice, python=choice.python)
         return {"FINISHED"}
 
 
@@ -89,7 +96,8 @@ class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         """Check in a thread: Blender must not wait for a slow disk."""
         try:
-            photo_check.start(context.scene)
+            python = preferred_worker.worker_choice(context).python
+            photo_check.start(context.scene, python=python)
         except WrapError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -97,7 +105,7 @@ class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
         properties = properties_of(context.scene)
-        photo_check.check_now(context.scene)
+        photo_check.check_now(context.scene, preferred_worker.worker_choice(context).python)
         errors = sum(row.severity == "error" for row in properties.findings)
         warnings = sum(row.severity == "warning" for row in properties.findings)
         self.report(

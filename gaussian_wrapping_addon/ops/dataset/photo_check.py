@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ...core.dataset.loading.source_kind import WITHOUT_PHOTOS
 from ...core.errors import WrapError
+from ...core.jobs.client import worker_if_any
 from ..common import tags
 from ..common.addon import properties_of
 from ..common.background import Lane
@@ -16,7 +18,8 @@ from ..common.redrawing import redraw
 from ..jobs import panel_state
 from ..jobs.scene_folders import source_of
 from ..training import training_estimate
-from ..worker.preferred_worker import WorkerChoice
+from ..worker.preferred_worker import WorkerChoice, worker_choice
+from . import photo_look
 
 if TYPE_CHECKING:
     from ...core.dataset.loading.check import Finding
@@ -31,8 +34,13 @@ def is_busy() -> bool:
     return _checks.busy
 
 
-def check_now(scene: bpy.types.Scene) -> None:
+def check_now(scene: bpy.types.Scene, python: str = "") -> None:
     """Check a scene's input and store the findings; blocks Blender.
+
+    Parameters
+    ----------
+    python : str
+        The worker's Python in the preferences, which opens videos.
 
     Raises
     ------
@@ -42,16 +50,18 @@ def check_now(scene: bpy.types.Scene) -> None:
     from ...core.dataset.loading.check import check_input
 
     stop()
-    _keep(scene, check_input(source_of(scene)))
+    _keep(scene, check_input(source_of(scene), worker=worker_if_any(python)))
 
 
-def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None) -> None:
+def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None, *, python: str = "") -> None:
     """Begin to check a scene's input.
 
     Parameters
     ----------
     choice : WorkerChoice, optional
         If there are no errors, request an estimate of the training from this worker.
+    python : str
+        As for :func:`check_now`.
 
     Raises
     ------
@@ -65,14 +75,19 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None) -> None:
 
     source = source_of(scene)
     stop()
+    photo_look.get_ready()
     if choice is not None:
         training_estimate.get_ready()
+    looks_with = choice or worker_choice(bpy.context)
     uid, chosen = scene.session_uid, properties_of(scene).source
 
     def keep(found: list[Finding]) -> None:
         scene = tags.scene_of_uid(uid)
         if scene is not None and properties_of(scene).source == chosen:
             _keep(scene, found)
+            has_photos = properties_of(scene).checked_kind not in WITHOUT_PHOTOS
+            if has_photos and not panel_state.has_errors(scene):
+                photo_look.start(scene, looks_with)
             if choice is not None:
                 _estimate(scene, choice)
         redraw()
@@ -82,7 +97,10 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None) -> None:
         text = f"{type(error).__name__}: {error}"
         keep([Finding("error", text, "See the system console.")])
 
-    _checks.submit(lambda: check_input(source), keep, failed=keep_failure)
+    def check() -> list[Finding]:
+        return check_input(source, worker=worker_if_any(python))
+
+    _checks.submit(check, keep, failed=keep_failure)
 
 
 def _keep(scene: bpy.types.Scene, found: list[Finding]) -> None:
@@ -90,6 +108,7 @@ def _keep(scene: bpy.types.Scene, found: list[Finding]) -> None:
     properties.findings.clear()
     properties.checked_source = properties.source
     properties.checked_text = ", ".join(f.short for f in found if f.short)
+    properties.checked_kind = next((f.kind for f in found if f.kind), "")
     for finding in found:
         row = properties.findings.add()
         row.severity = finding.severity
@@ -109,3 +128,4 @@ def _estimate(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
 def stop() -> None:
     """Cancel a running check."""
     _checks.cancel()
+    photo_look.stop()

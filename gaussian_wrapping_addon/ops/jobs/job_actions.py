@@ -40,7 +40,7 @@ def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     source = source_of(scene)
     folder = output_of(scene, source)
     job = make_job("wrap", source, job_settings(scene, choice.threads, choice.device))
-    _refuse_running(folder)
+    refuse_running(folder)
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
     )
@@ -68,17 +68,11 @@ def start_mesh(
     frame = common_frame(regions)
     folder = job_folder_of(frame)
     _require_training(folder)
-    _refuse_running(folder)
+    refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
-    _refuse_linked(regions)
     properties = properties_of(scene)
     own = own_lengths(scene, regions, frame)
-    requests = []
-    for region in regions:
-        path = folder / "regions" / f"{region.session_uid}.json"
-        path.parent.mkdir(exist_ok=True)
-        export_region(region, path, _result_name(region, frame))
-        requests.append(str(path))
+    requests = export_requests(regions, frame, folder)
     settings = with_values(
         earlier.settings,
         {
@@ -120,7 +114,7 @@ def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerCh
         The job folder contains no finished training, or too many iterations are requested.
     """
     folder = job_folder_of(frame)
-    _refuse_running(folder)
+    refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
     job = continue_training_job(
         JobFolder(folder), earlier, properties_of(scene).training.more_iterations
@@ -139,13 +133,33 @@ def resume(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     if not properties_of(scene).job_folder:
         raise UsageError("This scene has no job.", "Wrap the scene first.")
     folder = Path(bpy.path.abspath(properties_of(scene).job_folder))
-    _refuse_running(folder)
+    refuse_running(folder)
     client = JobClient.resume(
         folder, python=worker_python(choice.python), keep_running=choice.keep_running,
         device=choice.device,
     )  # fmt: skip
     job_timer.watch(scene, folder, client)
     return folder
+
+
+def export_requests(
+    regions: list[bpy.types.Object], frame: bpy.types.Object, folder: Path
+) -> list[str]:
+    """Write the files of regions into their job's folder; return their paths.
+
+    Raises
+    ------
+    WrapError
+        A region is linked from a library, or has no body.
+    """
+    _refuse_linked(regions)
+    requests = []
+    for region in regions:
+        path = folder / "regions" / f"{region.session_uid}.json"
+        path.parent.mkdir(exist_ok=True)
+        export_region(region, path, _result_name(region, frame))
+        requests.append(str(path))
+    return requests
 
 
 def _require_training(folder: Path) -> None:
@@ -193,7 +207,8 @@ def _stored_name(frame: bpy.types.Object, folder: str) -> str:
     return stored if region_name(stored, {"blender_object_name": stored}) == folder else folder
 
 
-def _refuse_running(folder: Path) -> None:
+def refuse_running(folder: Path) -> None:
+    """Raise :class:`UsageError` where a job runs in a folder."""
     if watched_jobs.is_running(str(folder)):
         raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
 

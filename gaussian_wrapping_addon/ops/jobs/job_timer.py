@@ -21,10 +21,10 @@ from ..baking.baked_files import BakedFiles, read_baked
 from ..baking.baked_objects import apply_bake
 from ..common import background, known_jobs, tags
 from ..common.background import Lane, Task
-from ..common.redrawing import redraw
+from ..common.redrawing import redraw, redraw_status_bars
 from ..results.result_files import ResultFiles, read_result
 from ..results.scene_objects import import_result
-from . import live_preview, watched_jobs
+from . import live_points, live_preview, watched_jobs
 from .watched_jobs import WatchedJob, jobs
 
 _logger = logging.getLogger(__name__)
@@ -97,6 +97,7 @@ def start_timer() -> None:
     _status_reads.start()
     _readings.start()
     live_preview.start()
+    live_points.start()
     background.watch(tick)
 
 
@@ -126,12 +127,15 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
         if not job.status.active:
             job.release()
             live_preview.forget(folder)
+            live_points.forget(folder)
         elif job.status.stage == "train":
             changed = live_preview.refresh(folder, now_s) or changed
+            changed = live_points.refresh(folder, now_s) or changed
         busy = busy or job.status.active or job.waits_for_mode
         changed = changed or before != (job.status, job.waits_for_mode)
     if changed:
         redraw()
+        redraw_status_bars()
     return busy
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from ...core.evaluation.report.text import duration, measured, number, part
 from ...core.jobs.store.job_folder import JobStatus
+from ..common.translate import tr
 
 RATE = "iterations_per_s"
 
@@ -46,4 +47,6 @@ def _add(rows: list[Row], name: str, value: Any, unit: str = "", *, digits: int)
 
 def _of(done: Any, total: Any) -> str:
     text = number(done, digits=0)
-    return f"{text} of {number(total, digits=0)}" if measured(total) else text
+    if not measured(total):
+        return text
+    return tr("{done} of {total}", done=text, total=number(total, digits=0))

@@ -66,10 +66,10 @@ def icons_of(folder: str) -> tuple[int, ...]:
     return shown.icons if shown else ()
 
 
-def newest_picture(folder: Path) -> Stamp | None:
-    """Return the image file of the running training, or None."""
+def newest_picture(folder: Path, name: str = PICTURE) -> Stamp | None:
+    """Return the image of the running training, or another of its files, or None."""
     found = []
-    for path in (folder / "stages").glob(f"train-*/{PICTURE}"):
+    for path in (folder / "stages").glob(f"train-*/{name}"):
         try:
             state = path.stat()
             if path.is_symlink() or (path.parent / "done.json").exists():

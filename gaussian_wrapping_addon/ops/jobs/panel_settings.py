@@ -12,8 +12,10 @@ import bpy
 from ...core.errors import UsageError
 from ...core.files import real_path
 from ...core.settings import Declaration, JobSettings, declarations, preset, with_values
+from ...core.settings.markers import checked_markers
 from ..common import known_jobs
 from ..common.addon import properties_of
+from ..common.translate import tr
 
 
 def settings_of_scene() -> list[Declaration]:
@@ -70,11 +72,14 @@ def job_settings(scene: bpy.types.Scene, threads: int, device: str = "auto") -> 
     Raises
     ------
     UsageError
-        The splat to start from does not exist.
+        The splat to start from or the control points do not exist, or the markers are none.
     """
     settings = [declared for declared in settings_of_scene() if declared.group != "meshing"]
     values = chosen_values(properties_of(scene), settings)
     values["start_splat"] = _splat(values["start_splat"])
+    values["markers"] = checked_markers(values["markers"])
+    values["control_points"] = _control_points(values["control_points"])
+    values["mask_model"] = _mask_model(values["mask_model"])
     name = values.pop("preset")
     decided = {
         declared.path
@@ -122,18 +127,40 @@ def texture_choices(scene: bpy.types.Scene) -> dict[str, Any]:
     return chosen_values(properties_of(scene), settings)
 
 
-def _splat(stored: str) -> str:
+def _mask_model(stored: str) -> str:
     if not stored:
         return ""
     path = Path(bpy.path.abspath(stored))
-    # A path in the open file may come from elsewhere: no server name is resolved.
-    if known_jobs.is_remote(path):
-        raise UsageError(f"{path} is on another computer.", "Copy the splat to this one.")
+    if known_jobs.is_remote(path):  # as of a splat
+        raise UsageError(f"{path} is on another computer.", "Copy the mask model to this one.")
+    return str(path)
+
+
+def _splat(stored: str) -> str:
+    if not stored:
+        return ""
+    path = _local(stored, "splat")
     if path.suffix.lower() != ".ply":
         raise UsageError(f"{path.name} is not a PLY file.", "Choose a splat saved as PLY, or none.")
+    return _existing(path, "splat")
+
+
+def _control_points(stored: str) -> str:
+    return _existing(_local(stored, "file"), "file of control points") if stored else ""
+
+
+def _local(stored: str, what: str) -> Path:
+    path = Path(bpy.path.abspath(stored))
+    # A path in the open file may come from elsewhere: no server name is resolved.
+    if known_jobs.is_remote(path):
+        raise UsageError(f"{path} is on another computer.", f"Copy the {what} to this one.")
+    return path
+
+
+def _existing(path: Path, what: str) -> str:
     if not path.is_file():
         raise UsageError(
-            f"The splat {path} does not exist.",
+            f"The {what} {path} does not exist.",
             "Choose it again in Train, Advanced, or clear the field.",
         )
     return str(real_path(path))
@@ -143,14 +170,24 @@ def preset_lines(name: str) -> tuple[str, ...]:
     """Return lines on the preset's values, which apply where a number is 0."""
     training = preset(name.lower()).training
     return (
-        f"0 takes {name.capitalize()}'s: {training.iterations:,},",
-        f"{training.max_gaussians:,} and {training.max_image_px:,} px",
-    )
+        tr(
+            "0 takes {preset}'s: {iterations},",
+            preset=tr(name.capitalize()), iterations=f"{training.iterations:,}",
+        ),
+        tr(
+            "{gaussians} and {pixels} px",
+            gaussians=f"{training.max_gaussians:,}", pixels=f"{training.max_image_px:,}",
+        ),
+    )  # fmt: skip
 
 
 def choices_key(scene: bpy.types.Scene) -> tuple[object, ...]:
     """Return what an estimate of time and memory depends on; reads no file, for panels."""
     properties = properties_of(scene)
     own = (properties.source, properties.preset, properties.texture_size)
-    training = [d for d in settings_of_scene() if d.property_owner == "training"]
-    return (*own, *(_stored(declared, properties) for declared in training))
+    decisive = [
+        d
+        for d in settings_of_scene()
+        if d.property_owner == "training" or d.panel_name == "dataset"
+    ]
+    return (*own, *(_stored(declared, properties) for declared in decisive))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import bpy
 
+from ...core.dataset.video.video_file import is_video_path
 from ...core.errors import UsageError, WrapError
 from ...core.files import real_path
 from ...core.jobs.store.job_file import read_job
@@ -37,8 +38,8 @@ def output_of(scene: bpy.types.Scene, source: Path) -> Path:
         It lies inside the photo folder, which is never written to.
     """
     text = "" if _is_of_other_photos(scene, source) else properties_of(scene).output
-    if source.suffix.lower() == ".ply":
-        base = source.with_suffix("")  # a splat: other files in its folder are not its input
+    if source.suffix.lower() == ".ply" or (is_video_path(source) and not source.is_dir()):
+        base = source.with_suffix("")  # other files in its folder are not its input
     else:
         base = source.parent if source.is_file() else source
     if not text and not base.name:  # a memory card, or the root of a disk

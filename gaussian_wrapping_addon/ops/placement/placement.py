@@ -16,8 +16,9 @@ from mathutils import Matrix
 from ...core.dataset.frames.placement import check_scale, similarity_of_matrix
 from ...core.dataset.frames.placement_file import FILE_NAME, write_placement
 from ...core.dataset.similarity import Similarity
-from ...core.errors import UsageError
-from ...core.files import real_path
+from ...core.dataset.units.real_units import blender_start
+from ...core.errors import ParseError, UsageError
+from ...core.files import read_json, real_path
 from ..cameras.camera_objects import cameras_under, scale_display
 from ..common import known_jobs, tags
 from ..regions.region_objects import matrix_of
@@ -84,6 +85,16 @@ def place(frame: bpy.types.Object, placement: Similarity) -> str:
         scale_display(camera, placement.scale)
     frame[tags.PLACEMENT] = json.dumps(placement.to_json())
     return _keep(frame, placement)
+
+
+def first_placement(frame: bpy.types.Object) -> Similarity:
+    """Return where the frame's result lies before it is placed: in metres where it has them."""
+    with contextlib.suppress(OSError, UsageError, ParseError, AttributeError):
+        folder = real_path(tags.result_folder(frame))
+        if known_jobs.is_trusted(folder.parent):
+            record = read_json(folder / "scene.json").get("georeference")
+            return blender_start(record, tags.world_from_scene(frame)) or Similarity()
+    return Similarity()
 
 
 def restore(frame: bpy.types.Object, placement: Similarity) -> None:

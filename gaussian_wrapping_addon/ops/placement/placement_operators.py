@@ -20,7 +20,7 @@ from ..common import tags
 from ..common.error_reporting import NeedsResult, OperatorResult, ReportsErrors
 from .automatic_ground import automatic_plane, camera_poses
 from .picked_points import add_point, picked_points, release
-from .placement import place, placement_of
+from .placement import first_placement, place, placement_of
 
 _TARGETS: Final = (
     ("POINTS", "At Picked Points", "The middle of the selected vertices or points"),
@@ -188,13 +188,16 @@ class GWRAP_OT_keep_placement(_Tool, bpy.types.Operator):
 class GWRAP_OT_reset_placement(_Tool, bpy.types.Operator):
     bl_idname = "gwrap.reset_placement"
     bl_label = "Reset Placement"
-    bl_description = "Undo scale, ground and origin: place the result as trained"
+    bl_description = (
+        "Undo scale, ground and origin: place the result as trained, or in the metres that GPS, "
+        "markers or control points gave it"
+    )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = self.frame(context)
         release(context)
-        note = place(frame, Similarity())
+        note = place(frame, first_placement(frame))
         if note:
             self.report({"WARNING"}, note)
         return {"FINISHED"}

@@ -12,9 +12,8 @@ import numpy as np
 from mathutils import Matrix
 
 from ...core.errors import UsageError
-from ...core.files import write_json
 from ...core.regions.box import CUBE_CORNERS, CUBE_TRIANGLES, box_matrix
-from ...core.regions.region_file import region_to_json
+from ...core.regions.region_file import region_to_json, write_region_file
 from ...core.regions.volume import check_volume
 from ..common import tags
 from ..common.mesh_data import evaluated, values_of
@@ -148,9 +147,12 @@ def region_body(thing: bpy.types.Object, name: str = "") -> dict[str, Any]:
 
 
 def export_region(thing: bpy.types.Object, path: Path, name: str = "") -> None:
-    """Write a region object as bounding-volume JSON in world coordinates."""
+    """Write a region object in world coordinates, in the format that the suffix names."""
+    body = region_body(thing, name)
     try:
-        write_json(path, region_body(thing, name))
+        write_region_file(
+            path, body["blender_object_name"], body["vertices"], body["hull_simplices"]
+        )
     except OSError as error:
         raise UsageError(
             f"{path} cannot be written: {error.strerror}.", "Choose another."

@@ -13,6 +13,7 @@ from ...core.errors import UsageError
 from ...core.names import file_stem
 from ...core.regions.box import CUBE_CORNERS
 from ...core.regions.region_file import read_region_file
+from ...core.regions.rsbox import SUFFIXES
 from ..common import tags
 from ..common.error_reporting import NeedsObjectMode, OperatorResult, ReportsErrors
 from .region_objects import (
@@ -33,6 +34,12 @@ _AROUND: Final = (
     ("SELECTED", "Around Selected", "The box around the selected objects"),
     ("RESULT", "Around Result", "A copy of the region of the first mesh"),
 )
+
+_FORMATS: Final = (
+    ("JSON", "JSON", "Any convex body"),
+    ("RSBOX", "RealityScan Box", "Reconstruction region of RealityScan; boxes only"),
+)
+_PATTERN: Final = "*.json;*.rsbox;*.rcbox"
 
 
 def _select_only(context: bpy.types.Context, thing: bpy.types.Object) -> None:
@@ -145,11 +152,12 @@ class GWRAP_OT_select_region(NeedsObjectMode, bpy.types.Operator):
 class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.export_region"
     bl_label = "Export Region"
-    bl_description = "Write the active region as a bounding-volume JSON in world coordinates"
+    bl_description = "Write the active region in world coordinates, as JSON or for RealityScan"
 
     filepath: StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
     check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
-    filter_glob: StringProperty(default="*.json", options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_glob: StringProperty(default=_PATTERN, options={"HIDDEN"})  # type: ignore[valid-type]
+    file_format: EnumProperty(name="Format", items=_FORMATS, default="JSON")  # type: ignore[valid-type]
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -162,8 +170,19 @@ class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         name = file_stem(_active(context).name, 0)
         self.filepath = str(Path(self.filepath).parent / f"{name}.json")
+        self.check(context)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
+
+    def check(self, _context: bpy.types.Context) -> bool:
+        """Let the file's suffix follow the chosen format; Blender calls this."""
+        path = Path(self.filepath)
+        suffix = f".{self.file_format.lower()}"
+        if not path.name or path.suffix.lower() == suffix:
+            return False
+        known = path.suffix.lower() in (".json", *SUFFIXES)
+        self.filepath = str(path.with_suffix(suffix) if known else path) + ("" if known else suffix)
+        return True
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
         path = Path(bpy.path.abspath(self.filepath))
@@ -175,11 +194,11 @@ class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
 class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.import_region"
     bl_label = "Import Region"
-    bl_description = "Read a bounding-volume JSON in world coordinates as a region"
+    bl_description = "Read a region in world coordinates: JSON, or .rsbox of RealityScan"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     filepath: StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
-    filter_glob: StringProperty(default="*.json", options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_glob: StringProperty(default=_PATTERN, options={"HIDDEN"})  # type: ignore[valid-type]
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         context.window_manager.fileselect_add(self)

@@ -43,7 +43,10 @@ _DECISIONS = {
 }
 """Labels of what was decided, as the panel Training has them."""
 
-_STAGES = {"cameras": "Cameras", "train": "Training", "mesh": "Mesh", "texture": "Texture"}
+_STAGES = {
+    "cameras": "Cameras", "masks": "Masks", "masked": "Masked Photos", "train": "Training",
+    "mesh": "Mesh", "texture": "Texture",
+}  # fmt: skip
 
 Row = tuple[str, str]
 

@@ -12,6 +12,7 @@ import logging
 import os
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,10 +22,11 @@ from ...core.errors import UsageError, WrapError
 from ...core.jobs.client import PYTHON_VARIABLE, worker_python
 from ...core.processes import worker_environment
 from ...core.processes.worker_environment import WorkerEnvironment
+from ...core.processes.worker_extras import read_extra_names
 from ...core.processes.worker_requirements import requirements_file
-from ...core.setup.commands import SetupRequest, cuda_present
+from ...core.setup.commands import SetupRequest, all_commands, as_line, cuda_present
 from ...core.setup.install import SetupTask
-from ...core.setup.pythons import FoundPython, find_pythons
+from ...core.setup.pythons import OLDEST, FoundPython, find_pythons
 from ..common import background
 from ..common.addon import addon_package
 from ..common.background import Lane
@@ -115,8 +117,15 @@ def _keep_search(found: tuple[bool, list[FoundPython]]) -> None:
     redraw("PREFERENCES", "VIEW_3D")
 
 
-def request_for(python: str, torch: str, wheel_folder: str) -> SetupRequest:
-    """Return the request of a set-up with these choices.
+def request_for(
+    python: str,
+    torch: str,
+    wheel_folder: str,
+    extras: Iterable[str] = (),
+    *,
+    adds: bool = False,
+) -> SetupRequest:
+    """Return the request of a set-up with these choices, or of adding extras to the present one.
 
     Raises
     ------
@@ -124,7 +133,24 @@ def request_for(python: str, torch: str, wheel_folder: str) -> SetupRequest:
         The add-on's list of packages is missing.
     """
     folder = bpy.path.abspath(wheel_folder) if wheel_folder else ""
-    return SetupRequest(str(environment().root), python, str(requirements_file()), torch, folder)
+    root, requirements = str(environment().root), str(requirements_file())
+    names = read_extra_names(",".join(extras))
+    return SetupRequest(root, python, requirements, torch, folder, names, adds)
+
+
+def lines_that_add(extra: str, wheel_folder: str) -> list[str]:
+    """Return the commands that add an extra to the present environment; starts no process.
+
+    Raises
+    ------
+    UsageError
+        There is no environment to add to.
+    """
+    path = str(environment().marker().get("python", ""))
+    unknown = FoundPython(path, (*OLDEST, 0))
+    python = next((p for p in state.pythons or () if p.path == path), unknown)
+    request = request_for(path, "cpu", wheel_folder, (extra,), adds=True)
+    return [as_line(command) for command in all_commands(request, python)]
 
 
 def start(request: SetupRequest, *, removes: bool = False) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import bpy
 
+from ...ops.common.translate import tr
 from ...ops.jobs import panel_state
 
 CATEGORY: Final = "Gaussian Wrapping"
@@ -46,7 +47,7 @@ class TabPanel(_Panel):
         ready = self.readiness(context)
         row: Any = self.layout.row()
         row.active = ready.icon != "NONE"
-        row.label(text=ready.text, icon=ready.icon, translate=False)
+        row.label(text=tr(ready.text), icon=ready.icon, translate=False)
         row.separator(factor=0.25)
 
 
@@ -70,7 +71,7 @@ def table(layout: Any, rows: tuple[tuple[str, str], ...]) -> None:
     column.scale_y = 0.9
     for name, value in rows:
         split = column.split(factor=0.55)
-        split.label(text=name, translate=False)
+        split.label(text=tr(name), translate=False)
         right = split.row()
         right.alignment = "RIGHT"
-        right.label(text=value, translate=False)
+        right.label(text=tr(value), translate=False)

@@ -5,12 +5,16 @@ from typing import Any, Final
 
 import bpy
 
+from ...core.dataset.loading.source_kind import VIDEO
+from ...core.processes.worker_extras import EXTRAS
 from ...ops.common.addon import properties_of
-from ...ops.dataset import photo_check
+from ...ops.common.translate import tr
+from ...ops.dataset import photo_check, photo_look
 from ...ops.jobs import panel_state, watched_jobs
 from ..common.panel_base import Readiness, TabPanel, button, plain
+from ..common.setting_properties import draw_settings, settings_in
 from ..common.text import characters_of, wrapped_label
-from ..worker.worker_setup_view import draw_worker_missing
+from ..worker.worker_setup_view import draw_add_extra, draw_worker_missing
 
 _MAX_FINDINGS: Final = 12
 _ICONS: Final = {"error": "CANCEL", "warning": "ERROR"}
@@ -39,7 +43,7 @@ class GWRAP_PT_dataset(TabPanel, bpy.types.Panel):
         characters = characters_of(context)
         draw_worker_missing(layout, characters)
         if not properties.source:
-            text = "Photos of one object from all sides, in a folder of their own."
+            text = "Photos of one object from all sides, in a folder of their own, or a video."
             wrapped_label(layout, text, characters)
         column = layout.column()
         column.enabled = not watched_jobs.is_running(properties.job_folder)
@@ -56,12 +60,18 @@ class GWRAP_PT_dataset(TabPanel, bpy.types.Panel):
             layout.operator("gwrap.check_photos", text=text, icon="VIEWZOOM")
         elif properties.source:
             self._findings(layout, context, characters)
+            if properties.checked_kind == VIDEO:
+                rows = layout.column()
+                rows.enabled = column.enabled
+                draw_settings(rows, properties, settings_in("dataset"))
 
     def _findings(self, layout: Any, context: bpy.types.Context, characters: int) -> None:
         properties = properties_of(context.scene)
         row = layout.row()
-        row.label(text=properties.checked_text or "Checked", translate=False)
+        row.label(text=properties.checked_text or tr("Checked"), translate=False)
         row.operator("gwrap.check_photos", text="", icon="FILE_REFRESH", emboss=False)
+        if photo_look.is_busy():
+            layout.label(text=tr("Looking at the photos…"), icon="TIME", translate=False)
         told = [f for f in properties.findings if f.severity in _ICONS]
         told.sort(key=lambda finding: finding.severity != "error")
         for finding in told[:_MAX_FINDINGS]:
@@ -71,8 +81,12 @@ class GWRAP_PT_dataset(TabPanel, bpy.types.Panel):
             wrapped_label(words, finding.message, characters - 4, icon=_ICONS[finding.severity])
             if finding.hint:
                 wrapped_label(box, finding.hint, characters - 4, icon="BLANK1")
+            for extra in EXTRAS:
+                if extra.name in finding.extra.split(","):
+                    draw_add_extra(box, extra)
         if len(told) > _MAX_FINDINGS:
-            layout.label(text=f"and {len(told) - _MAX_FINDINGS} more", translate=False)
+            more = tr("and {count} more", count=len(told) - _MAX_FINDINGS)
+            layout.label(text=more, translate=False)
 
 
 class GWRAP_PT_dataset_details(TabPanel, bpy.types.Panel):

@@ -9,6 +9,7 @@ import bpy
 
 from ...core.jobs.store.job_folder import JobStatus
 from ...ops.common.addon import properties_of
+from ...ops.common.translate import tr
 from ...ops.jobs import watched_jobs
 from ...ops.jobs.panel_state import Stage, stage_of
 from ..common.panel_base import Readiness, button
@@ -69,7 +70,7 @@ def _draw_running(layout: Any, context: bpy.types.Context, status: JobStatus) ->
     column.enabled = not cancelling
     text = "Cancelling…" if cancelling else "Cancel"
     button(column, context, "gwrap.cancel_job", text=text, icon="X")
-    live = draw_live(layout, properties_of(context.scene).job_folder, status)
+    live = draw_live(layout, properties_of(context.scene), status)
     if status.message and not live and not cancelling:
         message = status.message[:1].upper() + status.message[1:]
         wrapped_label(layout, message, characters_of(context))
@@ -78,7 +79,8 @@ def _draw_running(layout: Any, context: bpy.types.Context, status: JobStatus) ->
 def _draw_ended(layout: Any, context: bpy.types.Context, status: JobStatus) -> None:
     characters = characters_of(context)
     if status.state == "CANCELLED":
-        text = f"Cancelled at {100 * status.fraction:.0f} %. {status.hint}"
+        share = f"{100 * status.fraction:.0f} %"
+        text = f"{tr('Cancelled at {share}.', share=share)} {tr(status.hint)}"
         wrapped_label(layout, text, characters, icon="PAUSE")
     elif status.state != "DONE" or status.put_back:
         box = layout.box()

@@ -13,13 +13,14 @@ from ..common.panel_base import table
 _PICTURE_SCALE = 9.0  # of an icon's size: about the width of the panel as Blender starts
 
 
-def draw_live(layout: Any, folder: str, status: JobStatus) -> bool:
+def draw_live(layout: Any, properties: Any, status: JobStatus) -> bool:
     """Draw figures and image of the running training; return whether there were any."""
     rows = live_rows(status)
     if not rows:
         return False
     table(layout, rows)
-    icons = live_preview.icons_of(watched_jobs.key_of(folder))
+    layout.prop(properties, "show_points")
+    icons = live_preview.icons_of(watched_jobs.key_of(properties.job_folder))
     if icons:
         row = layout.row(align=True)
         for icon in icons:

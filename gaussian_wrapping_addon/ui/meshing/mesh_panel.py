@@ -7,11 +7,12 @@ import bpy
 
 from ...ops.common import tags
 from ...ops.common.addon import properties_of
+from ...ops.common.translate import tr
 from ...ops.jobs import watched_jobs
 from ...ops.jobs.job_guards import selected_regions
 from ..common.panel_base import CATEGORY, Readiness, TabPanel, button, plain
 from ..common.setting_properties import draw_settings, settings_in
-from ..common.text import characters_of, wrapped_label
+from ..common.text import characters_of, count_of_regions, wrapped_label
 from ..jobs.job_view import draw_job, job_readiness
 
 
@@ -27,7 +28,7 @@ class GWRAP_PT_mesh(TabPanel, bpy.types.Panel):
         count = len(selected_regions(context))
         if not count:
             return Readiness("No region selected")
-        return Readiness("1 region" if count == 1 else f"{count} regions", "CHECKMARK")
+        return Readiness(count_of_regions(count), "CHECKMARK")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, properties = self.layout, properties_of(context.scene)
@@ -44,12 +45,13 @@ class GWRAP_PT_mesh(TabPanel, bpy.types.Panel):
             wrapped_label(layout, "Needs a finished training.", characters, icon="INFO")
         elif selected:
             names = ", ".join(region.name for region in selected)
-            word = "Region" if len(selected) == 1 else "Regions"
-            wrapped_label(layout, f"{word}: {names}", characters)
+            text = "Region: {names}" if len(selected) == 1 else "Regions: {names}"
+            wrapped_label(layout, tr(text, names=names), characters)
         else:
             text = "Select a region above, or add a region box."
             wrapped_label(layout, text, characters, icon="INFO")
-        text = "Mesh Region" if len(selected) < 2 else f"Mesh {len(selected)} Regions"
+        count = len(selected)
+        text = "Mesh Region" if count < 2 else tr("Mesh {count} Regions", count=count)
         button(layout, context, "gwrap.mesh_region", text=text, icon="MESH_DATA")
 
 

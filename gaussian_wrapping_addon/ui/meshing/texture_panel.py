@@ -6,6 +6,7 @@ from typing import Final
 import bpy
 
 from ...ops.common.addon import properties_of
+from ...ops.common.translate import tr
 from ...ops.jobs import watched_jobs
 from ..common.panel_base import Readiness, TabPanel, plain
 from ..common.setting_properties import draw_settings, settings_in
@@ -19,7 +20,9 @@ class GWRAP_PT_texture(TabPanel, bpy.types.Panel):
     def readiness(self, context: bpy.types.Context) -> Readiness:
         properties = properties_of(context.scene)
         size = f"{properties.texture_size} px" if properties.texture_size != "0" else "Automatic"
-        return Readiness(f"{size}, {properties.texture_source.lower()}", "TEXTURE")
+        photos = properties.texture_source == "PHOTOS"
+        text = "{size}, photos" if photos else "{size}, gaussians"
+        return Readiness(tr(text, size=tr(size)), "TEXTURE")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, properties = self.layout, properties_of(context.scene)

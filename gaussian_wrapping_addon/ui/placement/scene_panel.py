@@ -10,6 +10,7 @@ from ...core.dataset.frames.placement import similarity_of_matrix
 from ...core.errors import WrapError
 from ...ops.cameras.camera_objects import cameras_under
 from ...ops.common import tags
+from ...ops.common.translate import tr
 from ...ops.placement.picked_points import point_empties
 from ...ops.results.scene_objects import cameras_of
 from ..common.text import characters_of, wrapped_label
@@ -25,7 +26,7 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
         layout = self.layout
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
         if frame is None:
-            layout.label(text="No result yet", icon="INFO")
+            layout.label(text=tr("No result yet"), icon="INFO", translate=False)
             return
         self._cameras(context, frame)
         self._points(context)
@@ -41,7 +42,11 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
         collection = cameras_of(frame.users_collection[0]) if frame.users_collection else None
         if collection is not None:
             self.layout.prop(
-                collection, "hide_viewport", text="Show Photo Cameras", invert_checkbox=True
+                collection,
+                "hide_viewport",
+                text=tr("Show Photo Cameras"),
+                translate=False,
+                invert_checkbox=True,
             )
         if not cameras_under(frame):
             return
@@ -71,10 +76,11 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
                 (second - first).length * context.scene.unit_settings.scale_length,
                 precision=4,
             )
-            layout.label(text=f"2 points selected, {distance} apart", translate=False)
+            text = tr("2 points selected, {distance} apart", distance=distance)
+            layout.label(text=text, translate=False)
         else:
-            word = "point" if len(points) == 1 else "points"
-            layout.label(text=f"{len(points)} {word} selected", translate=False)
+            text = "1 point selected" if len(points) == 1 else "{count} points selected"
+            layout.label(text=tr(text, count=len(points)), translate=False)
 
     def _placement(self, context: bpy.types.Context, frame: bpy.types.Object) -> None:
         layout = self.layout
@@ -84,7 +90,8 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
         except WrapError as error:
             wrapped_label(layout, str(error), characters_of(context), icon="ERROR")
         else:
-            layout.label(text=f"Scale {placement.scale:.6g}", translate=False)
+            text = tr("Scale {factor}", factor=f"{placement.scale:.6g}")
+            layout.label(text=text, translate=False)
         row = layout.row(align=True)
         row.operator("gwrap.keep_placement", text="Keep", icon="FILE_TICK")
         row.operator("gwrap.reset_placement", text="Reset", icon="LOOP_BACK")

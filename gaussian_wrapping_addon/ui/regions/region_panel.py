@@ -7,10 +7,12 @@ import bpy
 
 from ...ops.common import tags
 from ...ops.common.addon import properties_of
+from ...ops.common.translate import tr
 from ...ops.meshing import region_estimate
 from ...ops.regions.region_resolution import edge_length_in_blender
 from ..common.panel_base import Readiness, TabPanel
-from ..common.text import characters_of, wrapped_label
+from ..common.text import characters_of, count_of_regions, wrapped_label
+from ..masks.mask_view import draw_masks
 
 MOST_ROWS: Final = 40
 _RESOLUTIONS: Final = {"AUTOMATIC": "automatic", "POINTS": "by number of points"}
@@ -23,7 +25,7 @@ class GWRAP_PT_region(TabPanel, bpy.types.Panel):
         count = sum(1 for _ in tags.objects_of_kind(context.scene, "region"))
         if not count:
             return Readiness("No regions yet")
-        return Readiness("1 region" if count == 1 else f"{count} regions", "CHECKMARK")
+        return Readiness(count_of_regions(count), "CHECKMARK")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
@@ -37,20 +39,22 @@ class GWRAP_PT_region(TabPanel, bpy.types.Panel):
             for region in regions[:MOST_ROWS]:
                 _draw_row(box, region)
             if len(regions) > MOST_ROWS:
-                box.label(text=f"and {len(regions) - MOST_ROWS} more", translate=False)
+                more = tr("and {count} more", count=len(regions) - MOST_ROWS)
+                box.label(text=more, translate=False)
         else:
-            layout.label(text="No regions yet", icon="INFO")
+            layout.label(text=tr("No regions yet"), icon="INFO", translate=False)
         if active is not None and tags.kind_of(active) == "region":
             _draw_active(layout, context, active)
         checked = [region for region in regions if properties_of(region).checked]
         if checked:
             row = layout.row(align=True)
-            text = f"Estimate {len(checked)} Checked"
+            text = tr("Estimate {count} Checked", count=len(checked))
             estimate: Any = row.operator("gwrap.estimate_regions", text=text, icon="TIME")
             estimate.checked = True
-            text = f"Mesh {len(checked)} Checked"
+            text = tr("Mesh {count} Checked", count=len(checked))
             mesh: Any = row.operator("gwrap.mesh_region", text=text, icon="MESH_DATA")
             mesh.checked = True
+        draw_masks(layout, characters_of(context))
         if active is not None and active.type == "MESH" and not tags.kind_of(active):
             layout.operator("gwrap.use_as_region", icon="MESH_ICOSPHERE")
         row = layout.row(align=True)
@@ -95,15 +99,17 @@ def _draw_active(layout: Any, context: bpy.types.Context, region: bpy.types.Obje
 
 def _scene_resolution(scene: bpy.types.Scene, region: bpy.types.Object) -> str:
     if properties_of(scene).method == "PIVOTS":
-        return "none with pivots"
+        return tr("none with pivots")
     length = edge_length_in_blender(scene, region)
-    return f"{length:.4g} (Mesh panel)" if length else _RESOLUTIONS[properties_of(scene).resolution]
+    if length:
+        return tr("{length} (Mesh panel)", length=f"{length:.4g}")
+    return tr(_RESOLUTIONS[properties_of(scene).resolution])
 
 
 def _draw_estimate(layout: Any, context: bpy.types.Context, region: bpy.types.Object) -> None:
     characters = characters_of(context) - 4
     if region_estimate.is_waiting(region):
-        layout.label(text="Estimating…", icon="SORTTIME")
+        layout.label(text=tr("Estimating…"), icon="SORTTIME", translate=False)
         return
     estimate, holds = region_estimate.estimate_for(context.scene, region)
     if estimate is not None:

@@ -6,6 +6,7 @@ from typing import Any, Final
 import bpy
 
 from ...ops.common import tags
+from ...ops.common.translate import tr
 from ...ops.results.report_data import report_of
 from ..common.panel_base import table
 from ..common.text import characters_of, wrapped_label
@@ -29,18 +30,18 @@ class GWRAP_PT_report(bpy.types.Panel):
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
         report = report_of(tags.figures_of(frame))
         if not report.known:
-            layout.label(text="No report yet", icon="INFO")
+            layout.label(text=tr("No report yet"), icon="INFO", translate=False)
             return
         table(layout, report.rows)
         if report.device_reason:
             wrapped_label(layout, report.device_reason, characters_of(context))
         if report.stages:
             box = layout.box()
-            box.label(text="Time of the Stages", icon="TIME")
+            box.label(text=tr("Time of the Stages"), icon="TIME", translate=False)
             table(box, report.stages)
         if report.decisions:
             box = layout.box()
-            box.label(text="Model Selection", icon="OPTIONS")
+            box.label(text=tr("Model Selection"), icon="OPTIONS", translate=False)
             table(box, report.decisions)
         for region in report.regions:
             box = layout.box()
@@ -55,14 +56,14 @@ class GWRAP_PT_report(bpy.types.Panel):
 
     def _warnings(self, layout: Any, warnings: tuple[str, ...], characters: int) -> None:
         if not warnings:
-            layout.label(text="No warnings", icon="CHECKMARK")
+            layout.label(text=tr("No warnings"), icon="CHECKMARK", translate=False)
             return
         box = layout.box()
         for text in warnings[:_MAX_WARNINGS]:
             wrapped_label(box, text, characters - 4, icon="ERROR")
         more = len(warnings) - _MAX_WARNINGS
         if more > 0:
-            box.label(text=f"and {more} more in the report", translate=False)
+            box.label(text=tr("and {count} more in the report", count=more), translate=False)
 
 
 CLASSES: Final = (GWRAP_PT_report,)

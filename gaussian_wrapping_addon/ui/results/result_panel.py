@@ -6,6 +6,7 @@ from typing import Any, Final
 import bpy
 
 from ...ops.common import tags
+from ...ops.common.translate import tr
 from ...ops.results.import_operators import materials_of
 from ...ops.results.materials import images_of, shading_of
 from ..common.panel_base import Readiness, TabPanel
@@ -19,7 +20,8 @@ class GWRAP_PT_result(TabPanel, bpy.types.Panel):
         if frame is None:
             return Readiness("No result")
         count = sum(tags.kind_of(child) == "mesh" for child in frame.children)
-        return Readiness("1 mesh" if count == 1 else f"{count} meshes", "CHECKMARK")
+        text = "1 mesh" if count == 1 else tr("{count} meshes", count=count)
+        return Readiness(text, "CHECKMARK")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout

@@ -7,6 +7,7 @@ import bpy
 
 from ...core.settings.declaration import JOB
 from ...ops.common.addon import addon_preferences, properties_of
+from ...ops.common.translate import tr
 from ...ops.jobs import watched_jobs
 from ...ops.jobs.panel_settings import preset_lines
 from ..common.panel_base import CATEGORY, plain
@@ -33,7 +34,7 @@ class GWRAP_PT_train_advanced(bpy.types.Panel):
         limits = [d for d in shown if d.panel is not None and d.panel.preset_if_zero]
         start = [d for d in shown if d.group == JOB]
         others = [d for d in shown if d not in (*selection, *limits, *start)]
-        column.label(text="Model Selection")
+        column.label(text=tr("Model Selection"), translate=False)
         for declared in selection:
             column.row().prop(training, declared.property_name, expand=True)
         column.separator()

@@ -7,6 +7,7 @@ import bpy
 
 from ...ops.common import tags
 from ...ops.common.addon import properties_of
+from ...ops.common.translate import tr
 from ...ops.jobs import watched_jobs
 from ...ops.jobs.panel_state import Stage, primary_of, stage_of
 from ...ops.results.report_data import report_of
@@ -40,7 +41,7 @@ class GWRAP_PT_train(TabPanel, bpy.types.Panel):
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
         if frame is not None:
             training = report_of(tags.figures_of(frame)).training
-            words = f"Trained: {training}" if training else "Trained"
+            words = tr("Trained: {figures}", figures=training) if training else "Trained"
             wrapped_label(layout, words, characters)
         running = watched_jobs.is_running(properties.job_folder)
         column = layout.column()
@@ -48,6 +49,7 @@ class GWRAP_PT_train(TabPanel, bpy.types.Panel):
         row = column.row()
         row.use_property_split = False  # no label: it would cut off the names of the presets
         row.prop(properties, "preset", expand=True)
+        column.menu("GWRAP_MT_presets", icon="PRESET")
         column.prop(properties, "output")
         if not running and stage_of(context) not in _NOT_YET:
             self._estimate(layout, context, characters)

@@ -7,7 +7,9 @@ from typing import Any
 
 import bpy
 
+from ...core.processes.worker_extras import EXTRAS, Extra
 from ...core.setup.install import SetupTask
+from ...ops.common.translate import tr
 from ...ops.worker import worker_check, worker_setup
 from ...ops.worker.worker_setup import state
 from ..common.text import characters_of, wrapped_label
@@ -19,7 +21,7 @@ def draw_setup(layout: Any, context: Any) -> None:
     characters = characters_of(context)
     environment = worker_setup.environment()
     if environment.is_ready():
-        text, icon = f"A worker is set up in {environment.root}", "CHECKMARK"
+        text, icon = tr("A worker is set up in {folder}", folder=environment.root), "CHECKMARK"
     elif worker_setup.worker_ready():
         text, icon = "Jobs use a Python that was set up by hand", "INFO"
     else:
@@ -30,6 +32,8 @@ def draw_setup(layout: Any, context: Any) -> None:
     row = layout.row()
     row.operator("gwrap.set_up_worker", text="Set Up Worker…", icon="IMPORT")
     row.operator("gwrap.remove_worker", icon="TRASH")
+    if environment.is_ready():
+        _draw_extras(layout, environment.extras())
     if not bpy.app.online_access:
         text = (
             "Blender may not go online. Turn on Allow Online Access in Preferences, System, "
@@ -38,18 +42,36 @@ def draw_setup(layout: Any, context: Any) -> None:
         wrapped_label(layout, text, characters, icon="INTERNET_OFFLINE")
 
 
+def _draw_extras(layout: Any, installed: tuple[str, ...]) -> None:
+    """Draw which optional packages are there, and a button for each of the others."""
+    column = layout.column(align=True)
+    for extra in EXTRAS:
+        if extra.name in installed:
+            text = tr("{extra}: installed", extra=tr(extra.title))
+            column.label(text=text, icon="CHECKMARK", translate=False)
+        else:
+            draw_add_extra(column, extra)
+
+
+def draw_add_extra(layout: Any, extra: Extra) -> None:
+    """Draw the button that adds an optional package."""
+    text = tr("Add {extra}…", extra=tr(extra.title))
+    button: Any = layout.operator("gwrap.add_extra", text=text, icon="ADD")
+    button.extra = extra.name
+
+
 def _draw_status(layout: Any, characters: int, task: SetupTask) -> None:
     status = task.status
     if status.active:
-        text = f"{status.stage.capitalize()} · {100 * status.fraction:.0f} %"
+        text = f"{tr(status.stage.capitalize())} · {100 * status.fraction:.0f} %"
         layout.progress(factor=status.fraction, text=text, type="BAR")
         wrapped_label(layout, status.message, characters)
         if not task.removes:
             text = "Cancelling…" if task.is_cancelling else "Cancel"
             layout.operator("gwrap.cancel_setup", text=text, icon="X")
     elif status.state == "DONE":
-        text = f"The worker is {'removed' if task.removes else 'ready'}"
-        layout.label(text=text, icon="CHECKMARK")
+        text = "The worker is removed" if task.removes else "The worker is ready"
+        layout.label(text=tr(text), icon="CHECKMARK", translate=False)
     else:
         icon = "PAUSE" if status.state == "CANCELLED" else "ERROR"
         wrapped_label(layout, f"{status.error} {status.hint}", characters, icon=icon)
@@ -61,7 +83,7 @@ def draw_doctor(layout: Any, context: Any) -> None:
     row.operator("gwrap.check_worker", icon="VIEWZOOM")
     row.operator("gwrap.copy_findings", icon="COPYDOWN")
     if worker_check.is_busy():
-        layout.label(text="Checking…", icon="TIME")
+        layout.label(text=tr("Checking…"), icon="TIME", translate=False)
     characters = characters_of(context)
     column = layout.column(align=True)
     for finding in worker_check.findings():

@@ -37,7 +37,7 @@ sys.exit(40 + len(asked) + 10 * len(failed))
 """
 PYCOLMAP = """
 def load():
-    from gaussian_wrapping_addon.core.dataset.loading.undistort import _native
+    from gaussian_wrapping_addon.core.dataset.lenses.undistort import _native
     from gaussian_wrapping_addon.core.dataset.readers.source_model import LensCamera
     _native(LensCamera("PINHOLE", 8, 8, (1.0, 1.0, 4.0, 4.0)))
 """

@@ -12,6 +12,11 @@ import pytest
 from PIL import Image
 
 from gaussian_wrapping_addon.core.errors import Cancelled
+from gaussian_wrapping_addon.core.gaussians.preview_points import (
+    POINTS_FILE,
+    VISIBLE_OPACITY,
+    parse_points,
+)
 from gaussian_wrapping_addon.core.imaging.view_metrics import psnr
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.reference.reference import render_reference
@@ -46,7 +51,10 @@ def test_looks_only_when_due_and_writes_photo_and_render(tmp_path: Path) -> None
     assert live.update(gaussians, 8) is None
     now_s = 120.0
     assert live.update(gaussians, 9) is not None
-    assert {path.name for path in tmp_path.iterdir()} == {PREVIEW_FILE, PIXELS_FILE}
+    assert {path.name for path in tmp_path.iterdir()} == {PREVIEW_FILE, PIXELS_FILE, POINTS_FILE}
+    positions, _ = parse_points((tmp_path / POINTS_FILE).read_bytes())
+    opaque = 1 / (1 + np.exp(-gaussians.opacity_logits.numpy())) > VISIBLE_OPACITY
+    assert (positions == gaussians.means.numpy()[opaque].astype(np.float32)).all()
     picture = np.asarray(Image.open(tmp_path / PREVIEW_FILE))
     assert (np.load(tmp_path / PIXELS_FILE, allow_pickle=False) == picture).all()
     width = photos.camera(4).width

@@ -101,6 +101,23 @@ _LINES = Case(
             ("evaluate", "a.off", "--truth", "a.off", "--thresholds", "a,b"),
             "give numbers separated by commas",
         ),
+        _line(
+            "markers of no dictionary",
+            ("wrap", "set", "--markers", "4x4_51:0.05", *_OUT),
+            "no marker dictionary '4x4_51'.*Use one of 4x4_50",
+        ),
+        _line(
+            "markers of no size",
+            ("wrap", "set", "--markers", "4x4_50:0", *_OUT),
+            "marker size '0' is not a length.*in metres",
+        ),
+        _line(
+            "control points that do not exist",
+            ("wrap", "set", "--control-points", "gcp.txt", *_OUT),
+            "control points gcp.txt do not exist.*Check the path",
+            3,
+            colmap(),
+        ),
         Variant(
             "set-up-worker into a job",
             begun,

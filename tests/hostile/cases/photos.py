@@ -130,10 +130,10 @@ _FILES = Case(
             rf"6 of 6 photos cannot be read\. First: p00\.png is not a readable photo.*{_EXPORT}",
         ),
         Variant(
-            "a folder of RAW photos",
+            "a folder of RAW photos that are cut",
             steps(*(file(f"set/IMG_{i}.CR2", b"II*\0") for i in range(4))),
             3,
-            "set holds no photo that can be read, but 4 HEIC or RAW files.*Export them as JPEG",
+            rf"4 of 4 photos cannot be read\. First: IMG_0\.CR2 is not a readable photo.*{_EXPORT}",
         ),
     ),
 )

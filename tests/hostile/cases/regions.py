@@ -37,6 +37,18 @@ def _bad(name: str, place: str, says: str, **changes: Any) -> Variant:
     return _given(name, json_file("box.json", region(**changes)), rf"box\.json, {place}: {says}")
 
 
+_AGAIN_RSBOX = "Export the reconstruction region again"
+_RSBOX = (
+    '<ReconstructionRegion yawPitchRoll="0 0 0" widthHeightDepth="{}">'
+    '<CentreEuclid centre="0 0 0"/></ReconstructionRegion>'
+)
+
+
+def _box(name: str, text: str, says: str) -> Variant:
+    words = tuple("box.rsbox" if word == "box.json" else word for word in _WORDS)
+    return Variant(name, steps(folder_of("set"), file("box.rsbox", text)), 3, says, words)
+
+
 _FLAT = [[x, y, 0.0] for x, y, _ in CUBE]
 _FILES = Case(
     35,
@@ -116,6 +128,22 @@ _FILES = Case(
             json_file("box.json", region(blender_object_name="a\n\x1b[2J\0b")),
             _READ,
         ),
+        _box("a RealityScan box", _RSBOX.format("1 2 3"), _READ),
+        _box(
+            "a RealityScan box that is flat",
+            _RSBOX.format("1 0 3"),
+            rf"box\.rsbox, widthHeightDepth: a side is not above 0.*{_AGAIN_RSBOX}",
+        ),
+        _box(
+            "a RealityScan box with entities",
+            '<!DOCTYPE a [<!ENTITY b "bbbb">]>' + _RSBOX.format("&b; 2 3"),
+            rf"box\.rsbox, whole file: DOCTYPE is not allowed.*{_AGAIN_RSBOX}",
+        ),
+        _box(
+            "a RealityScan box of 70 kB",
+            _RSBOX.format("1 2 3") + " " * 70_000,
+            r"box\.rsbox, whole file: more than 65536 bytes.*Check that it is the right file",
+        ),
         Variant(
             "two of one name",
             steps(
@@ -126,7 +154,11 @@ _FILES = Case(
             (*_WORDS[:4], "b/box.json", *_WORDS[4:]),
         ),
     ),
-    (f"{_REGION}::test_bad_files_are_refused_with_their_place",),
+    (
+        f"{_REGION}::test_bad_files_are_refused_with_their_place",
+        "tests/core/regions/test_rsbox.py::test_bad_files_are_refused_by_name",
+        "tests/core/regions/test_rsbox.py::test_other_encodings_hide_nothing",
+    ),
 )
 
 

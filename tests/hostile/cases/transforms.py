@@ -13,9 +13,9 @@ import numpy as np
 
 from gaussian_wrapping_addon.core import limits
 from tests.hostile.case import Build, Case, Group, Variant
+from tests.hostile.cases import programs
 from tests.hostile.inputs import (
     file,
-    remove,
     steps,
     transforms,
     transforms_text,
@@ -252,10 +252,16 @@ _INTRINSICS = Case(
         ),
         Variant("twice the photos' size", _without(w=128, h=96, cx=64.0, cy=48.0), 0, _GOOD),
         Variant(
-            "EQUIRECTANGULAR",
+            "EQUIRECTANGULAR of ordinary photos",
             _without(camera_model="EQUIRECTANGULAR"),
             3,
-            rf"{_NAME}frames\[0\]\.camera_model: EQUIRECTANGULAR is not supported.*Use one of",
+            r"p00\.png is 64 x 48 pixels; a panorama is twice as wide as high.*Export the photos",
+        ),
+        Variant(
+            "an unknown model",
+            _without(camera_model="OMNI"),
+            3,
+            rf"{_NAME}frames\[0\]\.camera_model: OMNI is not supported.*Use one of",
         ),
     ),
 )
@@ -299,25 +305,11 @@ _FRAMES = Case(
     ),
 )
 
-_TABLE = "#name,x,y,alt,heading,pitch,roll,f,px,py\np00.png,1,2,3,0,0,0,35,0,0\n"
-_OTHER = "Give a folder of photos"
 _TABLES = Case(
     24,
-    "Poses in tables of other programs, which are not read",
+    "Poses in files of other programs",
     (
-        Variant(
-            "a CSV given alone",
-            file("set.csv", _TABLE),
-            3,
-            rf"set\.csv is a file, but not a transforms\.json.*{_OTHER}",
-            ("check", "set.csv"),
-        ),
-        Variant(
-            "a CSV beside photos",
-            steps(transforms(), remove("set/transforms.json"), file("set/poses.csv", _TABLE)),
-            0,
-            "The input has no camera poses; they will be solved from the photos",
-        ),
+        *programs.VARIANTS,
         Variant(
             "a cameras.json",
             file("cameras.json", "[]"),

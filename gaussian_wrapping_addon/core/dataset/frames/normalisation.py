@@ -29,6 +29,8 @@ _MAX_PLANE_THICKNESS = 0.05
 """Largest thickness over width of a planar camera path."""
 MEAN_UP = "mean camera up"
 """The rule of :func:`up_direction` that falls back to the mean."""
+KNOWN_UP = "metric frame"
+"""The rule where the world's up is known."""
 _MIN_AGREEMENT_COS = np.cos(np.radians(50.0))
 """Largest angle between the up direction and the cameras' mean up, as a cosine."""
 
@@ -49,7 +51,9 @@ class SceneFrame:
     """Whether all camera centres lie on one line."""
 
 
-def find_scene_frame(rotations: np.ndarray, centers: np.ndarray) -> SceneFrame:
+def find_scene_frame(
+    rotations: np.ndarray, centers: np.ndarray, *, z_up: bool = False
+) -> SceneFrame:
     """Compute the scene frame of posed cameras.
 
     Parameters
@@ -58,6 +62,8 @@ def find_scene_frame(rotations: np.ndarray, centers: np.ndarray) -> SceneFrame:
         ``cam_from_world`` rotations, camera axes x right, y down, z forward.
     centers : (n, 3) float64
         Camera centres, world frame; may be far from the origin.
+    z_up : bool
+        Whether the world's z is known to point up.
 
     Returns
     -------
@@ -93,7 +99,10 @@ def find_scene_frame(rotations: np.ndarray, centers: np.ndarray) -> SceneFrame:
             "All photos were taken from one place, so that no depth can be measured.",
             "Walk around the object while taking photos.",
         )
-    up, rule = up_direction(rotations[keep], offsets)
+    if z_up:
+        up, rule = np.array([0.0, 0.0, 1.0]), KNOWN_UP
+    else:
+        up, rule = up_direction(rotations[keep], offsets)
     # Rounded as seen by the first camera: no similarity of the input changes that view of the axes.
     first = rotations[keep][0]
     rotation = snapped_rotation(_rotation_to_z(up, rotations[keep]) @ first.T, FRAME_STEP) @ first

@@ -11,18 +11,28 @@ from typing import Literal
 
 import numpy as np
 
-from ...errors import DatasetError, WrapError, known_error
+from ...errors import DatasetError, WorkerError, WrapError, known_error
 from ...files import real_path
 from ...limits import MIN_IMAGES
 from ...ply.table import vertex_layout
 from ...report_warning import ReportWarning
 from ..frames.normalisation import find_scene_frame
-from ..photos.photo_finder import PhotoIndex, find_mask, list_photos, photo_root
+from ..lenses.lens_fit import MIN_PHOTO_SIDE_PX, fit_lens
+from ..panoramas.panorama_views import VIEWS, are_panoramas, check_panorama
+from ..photos.photo_finder import (
+    PhotoIndex,
+    find_mask,
+    list_photos,
+    list_second_copies,
+    photo_root,
+)
 from ..photos.photo_header import read_photo_header
-from ..readers.source_kind import SPLAT, SourceKind, read_poses, source_kind
-from ..readers.source_model import PosedPhoto
+from ..readers.source_model import PosedPhoto, counts_stored_pixels
 from ..readers.splat_header import read_splat_header
-from .lens_fit import MIN_PHOTO_SIDE_PX, fit_lens
+from ..video.probe import probe_video
+from ..video.video_file import container_of
+from ..video.video_warnings import hdr_warning, interlaced_warning
+from .source_kind import SPLAT, VIDEO, SourceKind, read_poses, source_kind
 from .sparse_points import nothing_in_common, points_in_scene
 from .splat_cameras import NO_PHOTOS_HINT, NO_PHOTOS_WARNING
 
@@ -30,7 +40,9 @@ Severity = Literal["error", "warning", "fact"]
 
 _MAX_UNREADABLE_SHARE = 0.2
 _MIN_GOOD_SIDE_PX = 200
-_SHORT_NAMES = {"photos": "cameras to be solved", SPLAT: "splat without photos"}
+_SHORT_NAMES = {
+    "photos": "cameras to be solved", SPLAT: "splat without photos", VIDEO: "cameras to be solved",
+}  # fmt: skip
 """Headings of kinds whose name is unsuitable."""
 
 
@@ -43,10 +55,25 @@ class Finding:
     hint: str = ""
     short: str = ""
     """Part of a heading: joined, the short texts of all findings describe the input."""
+    kind: str = ""
+    """Of the finding that names it: the input's kind."""
 
 
-def check_input(source: Path) -> list[Finding]:
+_PANORAMAS = Finding(
+    "fact",
+    f"The photos are 360 degree panoramas; each is cut into {len(VIEWS)} views "
+    "(--equirectangular off takes them for ordinary photos).",
+)
+
+
+def check_input(source: Path, *, worker: str = "") -> list[Finding]:
     """Check an input without decoding photos or solving cameras.
+
+    Parameters
+    ----------
+    source : Path
+    worker : str
+        The worker's Python, which opens videos; without, only their first bytes are looked at.
 
     Returns
     -------
@@ -62,10 +89,14 @@ def check_input(source: Path) -> list[Finding]:
                 "fact",
                 f"The input is of kind: {kind.kind}.",
                 short=_SHORT_NAMES.get(kind.kind, kind.kind),
+                kind=kind.kind,
             )
         )
         if kind.kind == SPLAT:
             _check_splat(source, findings)
+        elif kind.kind == VIDEO:
+            assert kind.video is not None
+            _check_video(kind.video, worker, findings)
         elif kind.kind == "photos":
             _check_photos(kind, findings)
         else:
@@ -95,14 +126,68 @@ def _check_splat(path: Path, findings: list[Finding]) -> None:
     findings.append(Finding("warning", NO_PHOTOS_WARNING, NO_PHOTOS_HINT))
 
 
+def _check_video(path: Path, worker: str, findings: list[Finding]) -> None:
+    container_of(path)
+    size = f"{path.stat().st_size / 1e6:,.1f} MB"
+    if not worker:
+        text = f"{path.name} ({size}) is opened when it is loaded; no worker is set up."
+        findings.insert(0, Finding("fact", text, short="video"))
+        return
+    try:
+        video = probe_video(path, worker)
+    except WorkerError as error:
+        findings.append(Finding("warning", f"{path.name}: {error.message}", error.hint))
+        return
+    length = f"{video.duration_s:.0f} s" if video.duration_s else "unknown length"
+    frames = f", {video.frames} frames" if video.frames else ""
+    text = (
+        f"{path.name}: {length}{frames}, {video.width} x {video.height}, {video.codec}, {size}. "
+        "Sharp frames are chosen when it is loaded."
+    )
+    # In front of the kind: "20 s of video, cameras to be solved".
+    findings.insert(0, Finding("fact", text, short=f"{length} of video"))
+    if 0 < video.frames < MIN_IMAGES:
+        raise DatasetError(
+            f"{path.name} has {video.frames} frames; at least {MIN_IMAGES} are needed.",
+            "Film longer.",
+        )
+    if min(video.width, video.height) < MIN_PHOTO_SIDE_PX:
+        raise DatasetError(
+            f"{path.name} has {video.width} x {video.height} pixels.", "Film larger pictures."
+        )
+    if max(video.width, video.height) < _MIN_GOOD_SIDE_PX:
+        findings.append(
+            Finding("warning", f"The frames are smaller than {_MIN_GOOD_SIDE_PX} pixels.")
+        )
+    told = [hdr_warning(path)] * video.is_hdr + [interlaced_warning(path)] * video.is_interlaced
+    findings += [Finding("warning", warning.text, warning.hint) for warning in told]
+
+
 def _check_photos(kind: SourceKind, findings: list[Finding]) -> None:
     root = photo_root(kind.folder)
     photos = list_photos(root)
     names = [path.relative_to(root).as_posix() for path in photos]
     _check_files(kind, photos, names, findings)
+    for warning in second_copies_warning(root):
+        findings.append(Finding("warning", warning.text, warning.hint))
     findings.append(
         Finding("fact", "The input has no camera poses; they will be solved from the photos.")
     )
+    if are_panoramas(photos):
+        findings.append(_PANORAMAS)
+
+
+def second_copies_warning(root: Path) -> list[ReportWarning]:
+    """Return the warning about photos that are there twice, as image and RAW; or none."""
+    second = list_second_copies(root)
+    if not second:
+        return []
+    listed = ", ".join(path.name for path in second[:3]) + (" ..." if len(second) > 3 else "")
+    text = (
+        f"{len(second)} HEIC or RAW files are left out, as the same photo is there as an image of "
+        f"the same name: {listed}."
+    )
+    return [ReportWarning("photos-twice", text, "To use the RAW photos, move the images away.")]
 
 
 def _check_poses(kind: SourceKind, findings: list[Finding]) -> None:
@@ -111,6 +196,8 @@ def _check_poses(kind: SourceKind, findings: list[Finding]) -> None:
             Finding("fact", f"{kind.transforms.name} is present too; the COLMAP model is used.")
         )
     model = read_poses(kind)
+    if any(photo.is_panorama for photo in model.photos):
+        findings.append(_PANORAMAS)
     findings += [Finding("warning", warning.text, warning.hint) for warning in model.warnings]
     findings.append(
         Finding("fact", f"{len(model.photos)} posed photos, {len(model.points)} sparse points.")
@@ -184,8 +271,10 @@ def _check_files(
                 DatasetError(f"{path.name} is {width} x {height} pixels.", "Use larger photos.")
             )
             continue
-        if posed is not None:
-            prefers_stored = kind.kind == "COLMAP model"
+        if posed is not None and posed[path].is_panorama:
+            check_panorama(header, path.name)
+        elif posed is not None:
+            prefers_stored = counts_stored_pixels(kind.kind)
             fit_lens(posed[path], header, path.name, prefers_stored=prefers_stored)
         sizes[f"{width} x {height}"] += 1
         small += max(width, height) < _MIN_GOOD_SIDE_PX

@@ -14,16 +14,24 @@ from ...files import real_path
 from ...limits import MIN_IMAGES
 from ...progress import Progress
 from ...report_warning import ReportWarning
-from ..camera import Camera
 from ..frames.normalisation import find_scene_frame
 from ..frames.scene_grid import snapped_camera
+from ..photos.image_formats import require_extras
 from ..photos.mask_reading import AS_WRITTEN, MaskReading
 from ..photos.photo_finder import list_photos, photo_root
 from ..poses.pose_solver import solve_poses
-from ..readers.source_kind import SourceKind, read_poses, source_kind
-from ..readers.source_model import SourceModel
+from ..readers.source_model import PHOTOS
 from ..scene import Scene, View
 from ..similarity import Similarity
+from .check import second_copies_warning
+from .coverage import coverage_warnings
+from .panorama_input import (
+    solve_views_of_panoramas,
+    takes_for_panoramas,
+    with_views_of_panoramas,
+)
+from .real_world import BY_GPS_IF_GOOD, UnitsRequest, camera_of, find_real_units, moved_views
+from .source_kind import read_poses, source_kind
 from .sparse_points import MIN_POINTS, nothing_in_common, points_in_scene
 from .start_points import make_start_points
 from .views import PreparedView, prepare_views
@@ -35,6 +43,18 @@ _CAMERAS_ARE_GIVEN = ReportWarning(
 )
 
 
+_NO_TURNTABLE_OF_PANORAMAS = ReportWarning(
+    "no-turntable",
+    "The photos are panoramas, of which no turntable is looked for.",
+    "Say --equirectangular off if they are ordinary photos.",
+)
+_NO_PANORAMAS = ReportWarning(
+    "no-panoramas",
+    "The input's cameras are no panoramas: its photos are not cut into views.",
+    "Give the photos alone, or cameras that say EQUIRECTANGULAR.",
+)
+
+
 def load_scene(
     source: Path,
     work_folder: Path,
@@ -43,7 +63,10 @@ def load_scene(
     seed: int = 0,
     threads: int = 0,
     turntable: str = "auto",
+    equirectangular: str = "auto",
     reading: MaskReading = AS_WRITTEN,
+    units: UnitsRequest = BY_GPS_IF_GOOD,
+    in_order: bool = False,
 ) -> Scene:
     """Load photos and cameras, solving and undistorting where needed.
 
@@ -60,8 +83,15 @@ def load_scene(
         0 uses every core.
     turntable : {"auto", "on", "off"}
         Of photos without poses; see :func:`~..poses.pose_solver.solve_poses`.
+    equirectangular : {"auto", "on", "off"}
+        Whether photos without poses are panoramas, which are cut into views; ``"auto"``: where
+        all are exactly twice as wide as high.
     reading : MaskReading
         How mask files are understood.
+    units : UnitsRequest
+        What is known about size and place. Where it is applied, the scene's world is metric.
+    in_order : bool
+        Photos without poses follow each other by name, as frames of a video do.
 
     Returns
     -------
@@ -72,41 +102,78 @@ def load_scene(
     ------
     DatasetError, ParseError
         The input cannot be used; names the problem and its location.
+    MissingExtraError
+        Photos need a package that the worker lacks.
     """
     source = real_path(source)
     work_folder = real_path(work_folder)
+    control = units.checked()  # before cameras are solved, which takes minutes
     kind = source_kind(source)
     work_folder.mkdir(parents=True, exist_ok=True)
     progress.update(0.0, "reading the input")
     warnings: list[ReportWarning] = []
     facts: dict[str, Any] = {"kind": kind.kind}
-    if kind.kind == "photos":
-        model = _solve(
-            kind, work_folder, progress.span(0.0, 0.8), seed, threads, turntable, reading
-        )
+    if kind.kind == PHOTOS:
+        solve_span = progress.span(0.0, 0.8)
+        root = photo_root(kind.folder)
+        photos = list_photos(root)
+        check_photo_count(len(photos))
+        require_extras(photos)
+        warnings += second_copies_warning(root)
+        if takes_for_panoramas(photos, equirectangular):
+            if turntable == "on":
+                warnings.append(_NO_TURNTABLE_OF_PANORAMAS)
+            model, kind = solve_views_of_panoramas(
+                photos, kind, work_folder, solve_span, reading, seed=seed, threads=threads
+            )
+        else:
+            model = solve_poses(
+                root, photos, kind.mask_roots, work_folder, solve_span, seed=seed, threads=threads,
+                turntable=turntable, reading=reading, in_order=in_order,
+            )  # fmt: skip
         prepare_span = progress.span(0.8, 1.0)
     else:
         model = read_poses(kind)
         if turntable == "on":
             warnings.append(_CAMERAS_ARE_GIVEN)
+        if any(photo.is_panorama for photo in model.photos):
+            check_photo_count(len(model.photos))
+            model, kind = with_views_of_panoramas(
+                model, kind, work_folder, progress.span(0.0, 0.3), reading, threads=threads
+            )
+        elif equirectangular == "on":
+            warnings.append(_NO_PANORAMAS)
         prepare_span = progress.span(0.0, 1.0 if len(model.points) >= MIN_POINTS else 0.3)
         if kind.kind == "COLMAP model" and kind.transforms is not None:
             facts["also_present"] = f"{kind.transforms.name} (not used: the COLMAP model is)"
     warnings.extend(model.warnings)
+    warnings.extend(coverage_warnings(model))
     facts.update(model.facts)
     check_photo_count(len(model.photos))
     views, notes, counts = prepare_views(
-        model, kind, work_folder, prepare_span, threads=threads, reading=reading
+        model, kind, work_folder, prepare_span.span(0.0, 0.9), threads=threads, reading=reading
     )
     warnings.extend(notes)
     facts.update(counts)
     check_photo_count(len(views), notes)
-    views, scene_from_world, frame_facts = _frame(views, warnings)
+    real, note = find_real_units(
+        units, control, views, kind, work_folder, prepare_span.span(0.9, 1.0), warnings,
+        threads=threads,
+    )  # fmt: skip
+    given_points, z_up = model.points, False
+    if real is not None:
+        facts["georeference"] = real.to_json()
+        if real.applied:
+            views = moved_views(views, real.metric_from_world)
+            given_points, z_up = real.metric_from_world.points(given_points), real.z_up
+    if note:
+        facts["georeference_note"] = note
+    views, scene_from_world, frame_facts = _frame(views, warnings, z_up)
     facts.update(frame_facts)
-    cameras = [snapped_camera(_camera(view).moved(scene_from_world)) for view in views]
+    cameras = [snapped_camera(camera_of(view).moved(scene_from_world)) for view in views]
     if (apart := nothing_in_common(model)) is not None:
         warnings.append(apart)
-    points, colors = points_in_scene(model.points, model.point_colors, scene_from_world, warnings)
+    points, colors = points_in_scene(given_points, model.point_colors, scene_from_world, warnings)
     if len(points) < MIN_POINTS:
         points, colors, facts["start_points"] = make_start_points(
             cameras,
@@ -149,32 +216,14 @@ def check_photo_count(count: int, left_out: Sequence[ReportWarning] = ()) -> Non
         )
 
 
-def _solve(
-    kind: SourceKind,
-    work_folder: Path,
-    progress: Progress,
-    seed: int,
-    threads: int,
-    turntable: str,
-    reading: MaskReading,
-) -> SourceModel:
-    root = photo_root(kind.folder)
-    photos = list_photos(root)
-    check_photo_count(len(photos))
-    return solve_poses(
-        root, photos, kind.mask_roots, work_folder, progress,
-        seed=seed, threads=threads, turntable=turntable, reading=reading,
-    )  # fmt: skip
-
-
 def _frame(
-    views: list[PreparedView], warnings: list[ReportWarning]
+    views: list[PreparedView], warnings: list[ReportWarning], z_up: bool
 ) -> tuple[list[PreparedView], Similarity, dict[str, Any]]:
     """Compute the scene frame and remove outlier cameras far from all others."""
     rotations = np.array([view.cam_from_world[:, :3] for view in views])  # (n, 3, 3)
     translations = np.array([view.cam_from_world[:, 3] for view in views])  # (n, 3)
     centers = -np.einsum("nji,nj->ni", rotations, translations)
-    frame = find_scene_frame(rotations, centers)
+    frame = find_scene_frame(rotations, centers, z_up=z_up)
     far = [view.name for view, keep in zip(views, frame.keep, strict=True) if not keep]
     if far:
         text = (
@@ -194,10 +243,3 @@ def _frame(
         )
     kept = [view for view, keep in zip(views, frame.keep, strict=True) if keep]
     return kept, frame.scene_from_world, {"up_from": frame.up_rule}
-
-
-def _camera(view: PreparedView) -> Camera:
-    fx, fy, cx, cy = view.pinhole.params
-    return Camera(
-        view.name, view.pinhole.width, view.pinhole.height, fx, fy, cx, cy, view.cam_from_world
-    )

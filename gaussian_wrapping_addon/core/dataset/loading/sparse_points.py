@@ -40,7 +40,7 @@ def nothing_in_common(model: SourceModel) -> ReportWarning | None:
     with np.errstate(over="ignore", invalid="ignore"):
         for photo in model.photos:
             local = points @ photo.cam_from_world[:, :3].T + photo.cam_from_world[:, 3]  # (n, 3)
-            seen += _in_field(local, photo)
+            seen += in_field(local, photo)
     if (seen >= 2).any():
         return None
     return ReportWarning(
@@ -50,7 +50,7 @@ def nothing_in_common(model: SourceModel) -> ReportWarning | None:
     )
 
 
-def _in_field(local: np.ndarray, photo: PosedPhoto) -> np.ndarray:
+def in_field(local: np.ndarray, photo: PosedPhoto) -> np.ndarray:
     """Tell which (n, 3) points in camera coordinates lie in the photo, with a margin."""
     ahead = local[:, 2] > 0.0
     if photo.lens is None:

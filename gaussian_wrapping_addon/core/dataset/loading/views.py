@@ -12,10 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DatasetError
+from ...files import real_path
 from ...imaging.bicubic import sample_bicubic
 from ...kernels.parallel import default_threads
 from ...progress import Progress
 from ...report_warning import UNREADABLE_HINT, ReportWarning
+from ..lenses.lens_fit import MIN_PHOTO_SIDE_PX, fit_lens, same_proportions
+from ..lenses.undistort import pinhole_of, sampling_map
+from ..photos.image_formats import require_extras
 from ..photos.mask_reading import AS_WRITTEN, MaskReading
 from ..photos.photo_file import (
     MASK_THRESHOLD,
@@ -30,10 +34,8 @@ from ..photos.photo_file import (
 from ..photos.photo_finder import PhotoIndex, find_mask, resolve_photo
 from ..photos.photo_header import PhotoHeader
 from ..poses.pose_solver import check_unreadable_share
-from ..readers.source_kind import SourceKind
-from ..readers.source_model import LensCamera, PosedPhoto, SourceModel
-from .lens_fit import MIN_PHOTO_SIDE_PX, fit_lens, same_proportions
-from .undistort import pinhole_of, sampling_map
+from ..readers.source_model import LensCamera, PosedPhoto, SourceModel, counts_stored_pixels
+from .source_kind import SourceKind
 
 _MAX_ONE_COLOUR_RANGE = 2
 """Levels of 255 between darkest and brightest pixel up to which a photo counts as of one colour: a
@@ -53,6 +55,12 @@ class PreparedView:
     cam_from_world: np.ndarray
     photo_path: Path
     mask_path: Path | None
+    source_path: Path
+    """The photo of the input."""
+    lens: LensCamera
+    """Of that photo, as stored or upright."""
+    stored_orientation: int
+    """EXIF orientation of the photo where ``lens`` is of its stored pixels, else 1."""
 
 
 @dataclass
@@ -68,6 +76,8 @@ class _Notes:
     one_colour: list[str] = field(default_factory=list)
     masked: int = 0
     undistorted: int = 0
+    photos: frozenset[Path] = frozenset()
+    """Real paths of all photos: none of them is the mask of another."""
     lock: threading.Lock = field(default_factory=threading.Lock)
 
 
@@ -96,6 +106,8 @@ def prepare_views(
     ------
     DatasetError
         No photo was found, more than a fifth cannot be decoded, or sizes do not match the cameras.
+    MissingExtraError
+        Photos need a package that the worker lacks.
     """
     threads = threads or default_threads()
     notes = _Notes()
@@ -116,6 +128,8 @@ def prepare_views(
             f"None of the {len(model.photos)} photos that the {model.kind} names was found.",
             f"Looked for {notes.missing[0]} in {searched}.",
         )
+    require_extras([path for _, path in found])
+    notes.photos = frozenset(real_path(path) for path in used)
     (work_folder / "images").mkdir(parents=True, exist_ok=True)
     (work_folder / "masks").mkdir(exist_ok=True)
     maps = _MapCache()
@@ -163,8 +177,7 @@ def _prepare(
         with notes.lock:
             notes.bad.append(f"{path.name} decodes to another size than its header says.")
         return None
-    # COLMAP reads pixels as stored; other programs apply the EXIF orientation first.
-    prefers_stored = model.kind == "COLMAP model"
+    prefers_stored = counts_stored_pixels(model.kind)
     lens, upright, rescaled = fit_lens(posed, header, path.name, prefers_stored=prefers_stored)
     color, alpha = photo.color, photo.alpha
     if upright:
@@ -197,7 +210,10 @@ def _prepare(
     if mask is not None:
         mask_path = work_folder / "masks" / f"{index:06d}.png"
         write_mask(mask_path, mask)
-    return PreparedView(posed.name, pinhole, posed.cam_from_world, photo_path, mask_path)
+    return PreparedView(
+        posed.name, pinhole, posed.cam_from_world, photo_path, mask_path, path, lens,
+        1 if upright else header.orientation,
+    )  # fmt: skip
 
 
 def _is_one_colour(color: np.ndarray) -> bool:
@@ -251,8 +267,12 @@ def _find_mask(
 def _mask_file(posed: PosedPhoto, path: Path, kind: SourceKind, notes: _Notes) -> Path | None:
     """Return the mask that the input names for a photo, or that is found for it."""
     if posed.mask_name is None:
-        named = find_mask(kind.mask_roots, posed.name, kind.photo_roots)
-        return named or find_mask(kind.mask_roots, path.name)
+        for name in (posed.name, path.name):
+            mask = find_mask(kind.mask_roots, name, kind.photo_roots)
+            # An input may name a.jpg and a_mask.jpg both as photos.
+            if mask is not None and real_path(mask) not in notes.photos:
+                return mask
+        return None
     found = resolve_photo(kind.folder, posed.mask_name)
     if found is not None and os.path.isfile(found):
         return found

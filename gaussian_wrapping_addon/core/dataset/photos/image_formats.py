@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Open images with Pillow, in the formats of photos only.
+"""Tell formats of photos apart by their content, and open images with Pillow in these only.
 
 Pillow goes by the content of a file, not by its name, and knows some forty formats: a PostScript
 file named ``.jpg`` would start Ghostscript.
@@ -10,29 +10,100 @@ from __future__ import annotations
 import contextlib
 import functools
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from ...processes.worker_extras import load_extra, load_extras
 
 if TYPE_CHECKING:
     from PIL import Image
 
-IMAGE_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
+IMAGE_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "AVIF")
 """Pillow's names; a JPEG with several pictures (MPO) is opened as JPEG."""
+PLAIN_FORMATS = IMAGE_FORMATS[:5]
+"""Those that Blender and other programs read as well."""
+
+IMAGE, HEIF, RAW = "image", "heif", "raw"
+"""Kinds of photo files. The last two need the extra of that name in the worker."""
+PLAIN_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".avif")
+HEIF_SUFFIXES = (".heic", ".heif", ".hif")
+RAW_SUFFIXES = (
+    ".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".srf", ".raf", ".orf",
+    ".rw2", ".rwl", ".pef", ".srw", ".x3f", ".3fr", ".fff", ".iiq", ".erf", ".kdc", ".dcr",
+    ".mrw", ".mos", ".mef", ".raw",
+)  # fmt: skip
+PHOTO_SUFFIXES = PLAIN_SUFFIXES + HEIF_SUFFIXES + RAW_SUFFIXES
+_HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+_AVIF_BRANDS = (b"avif", b"avis")
+_BRAND_BYTES = 64
+"""Of an ISO media file, in which its brands are looked for."""
+_NAMED_FILES = 3
+"""Files that an error of a missing extra names."""
+
+
+def photo_kind(path: Path) -> str:
+    """Return ``IMAGE``, ``HEIF`` or ``RAW``.
+
+    HEIF is told by the content (phones' files are often renamed), RAW by the name unless the
+    content is something else: many RAW formats are TIFF inside.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(_BRAND_BYTES)
+    if head[4:8] == b"ftyp":
+        if any(brand in head[8:] for brand in _AVIF_BRANDS):
+            return IMAGE
+        if head[8:12] in _HEIF_BRANDS:
+            return HEIF
+    is_image = head.startswith((b"\xff\xd8", b"\x89PNG"))
+    return RAW if path.suffix.lower() in RAW_SUFFIXES and not is_image else IMAGE
+
+
+def require_extras(photos: Sequence[Path]) -> None:
+    """Raise where the worker lacks the packages that photos need; decodes nothing.
+
+    Raises
+    ------
+    MissingExtraError
+        Names the photos and the next step.
+    """
+    of_kind: dict[str, list[str]] = {}
+    for path in photos:
+        with contextlib.suppress(OSError):  # reported where the photo is read
+            of_kind.setdefault(photo_kind(path), []).append(path.name)
+    needed_by = {}
+    for kind, names in of_kind.items():
+        if kind != IMAGE:
+            more = len(names) - _NAMED_FILES
+            others = f" and {more} other{'s' * (more > 1)}" if more > 0 else ""
+            needed_by[kind] = ", ".join(names[:_NAMED_FILES]) + others
+    load_extras(needed_by)
 
 
 def open_image(path: Path) -> Image.Image:
-    """Open an image, whose pixels are read later.
+    """Open an image, whose pixels are read later; for RAW see :mod:`.raw_photo`.
+
+    HEIF photos come upright, their own rotation and mirroring applied.
 
     Raises
     ------
     ImportError
         Pillow is not installed.
+    MissingExtraError
+        A HEIF photo, and its extra is not installed.
     PIL.UnidentifiedImageError, OSError, ValueError, SyntaxError, DecompressionBombError
         Of Pillow: no image in one of :data:`IMAGE_FORMATS`.
     """
     from PIL import Image
 
+    if photo_kind(path) == HEIF:
+        load_extra(HEIF, path.name).register_heif_opener(thumbnails=False)
+        return Image.open(path, formats=("HEIF",))
     return Image.open(path, formats=_formats())
 
 

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .image_formats import open_image, without_warnings
+from .image_formats import RAW, open_image, photo_kind, without_warnings
+from .raw_photo import raw_focal
 
 _EXIF_FOLDER = 0x8769
 _MAKE, _MODEL, _LENS = 0x010F, 0x0110, 0xA434
@@ -33,10 +35,11 @@ def read_lens_exif(path: Path, width: int, height: int) -> LensExif:
     from PIL import Image
 
     try:
-        with without_warnings(), open_image(path) as image:
-            exif = image.getexif()
-            tags: dict[int, Any] = {**exif, **exif.get_ifd(_EXIF_FOLDER)}
-    except (OSError, ValueError, SyntaxError, TypeError, KeyError, Image.DecompressionBombError):
+        tags = _raw_tags(path) if photo_kind(path) == RAW else _image_tags(path)
+    except (
+        OSError, ValueError, SyntaxError, TypeError, KeyError, RuntimeError,
+        Image.DecompressionBombError,
+    ):  # fmt: skip
         tags = {}
     focal_mm, focal_35 = _positive(tags.get(_FOCAL_MM)), _positive(tags.get(_FOCAL_35MM))
     names = [str(tags.get(tag, "")).strip("\0 ")[:80] for tag in (_MAKE, _MODEL, _LENS)]
@@ -53,6 +56,26 @@ def read_lens_exif(path: Path, width: int, height: int) -> LensExif:
         focal_px = focal_mm * pixels_per_mm * longest / stored
     good = _PLAUSIBLE[0] <= focal_px / longest <= _PLAUSIBLE[1]
     return LensExif(key, focal_px if good else None)
+
+
+def _image_tags(path: Path) -> dict[int, Any]:
+    with without_warnings(), open_image(path) as image:
+        exif = image.getexif()
+        return {**exif, **exif.get_ifd(_EXIF_FOLDER)}
+
+
+def _raw_tags(path: Path) -> dict[int, Any]:
+    """Return the tags of a RAW photo that is TIFF inside; else focal length and lens alone."""
+    from PIL import Image
+
+    tags: dict[int, Any] = {}
+    not_tiff = contextlib.suppress(OSError, ValueError, SyntaxError, TypeError, KeyError)
+    with not_tiff, without_warnings(), path.open("rb") as stream:
+        exif = Image.Exif()
+        exif.load_from_fp(stream)
+        tags = {**exif, **exif.get_ifd(_EXIF_FOLDER)}
+    focal_mm, lens = raw_focal(path)
+    return {_FOCAL_MM: focal_mm, _LENS: lens, **tags}
 
 
 def _positive(value: Any) -> float:

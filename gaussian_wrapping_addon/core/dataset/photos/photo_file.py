@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,8 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...errors import DatasetError
-from .image_formats import open_image, without_warnings
+from ...processes.worker_extras import load_extra
+from .image_formats import HEIF, IMAGE, PLAIN_FORMATS, RAW, open_image, photo_kind, without_warnings
 from .photo_header import PhotoHeader, read_photo_header
+from .raw_photo import develop
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -38,30 +41,50 @@ class DecodedPhoto:
 
 
 def photo_header(path: Path) -> PhotoHeader:
-    """Return the header of a photo; Pillow is needed for other formats than JPEG and PNG."""
+    """Return the header of a photo; Pillow is needed for other formats than JPEG and PNG.
+
+    Raises
+    ------
+    DatasetError
+        As :func:`~.photo_header.read_photo_header`, or Pillow is not installed.
+    MissingExtraError
+        The worker lacks the package for HEIF or RAW.
+    """
     header = read_photo_header(path)
     if header is None:
+        kind = photo_kind(path)
+        if kind != IMAGE:
+            load_extra(kind, path.name)
         raise DatasetError(f"{path.name} needs Pillow to be read.", "Install Pillow.")
     return header
 
 
-def read_photo(path: Path, *, upright: bool = True) -> DecodedPhoto:
+def read_photo(path: Path, *, upright: bool = True, enough_px: int = 0) -> DecodedPhoto:
     """Decode a photo.
 
     Parameters
     ----------
     path : Path
     upright : bool
-        Apply the EXIF orientation.
+        Apply the EXIF orientation. HEIF and RAW photos are upright always.
+    enough_px : int
+        If given, a RAW photo is developed at half its size where the long side of that still has
+        so many pixels.
 
     Raises
     ------
     DatasetError
         Names the file: not an image, cut, too large.
+    MissingExtraError
+        The worker lacks the package for HEIF or RAW.
     """
     header = photo_header(path)
+    if photo_kind(path) == RAW:
+        half = bool(enough_px) and max(header.width, header.height) >= 2 * enough_px
+        return DecodedPhoto(_developed(path, half=half), None, False)
     image = _open(path)
-    plain = image.mode in ("RGB", "L") and header.orientation == 1
+    is_common = image.format in PLAIN_FORMATS
+    plain = image.mode in ("RGB", "L") and header.orientation == 1 and is_common
     color, alpha = _to_arrays(image)
     if upright:
         color = apply_orientation(color, header.orientation)
@@ -96,6 +119,19 @@ def apply_orientation(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return np.ascontiguousarray(pixels)
 
 
+def stored_pixels(pixels: np.ndarray, orientation: int, width: int, height: int) -> np.ndarray:
+    """Return where the stored photo has (n, 2) positions x, y of the upright one.
+
+    ``width`` and ``height`` are those of the upright photo.
+    """
+    x, y = np.asarray(pixels, np.float64).reshape(-1, 2).T
+    if orientation in (3, 4, 7, 8):
+        y = height - y
+    if orientation in (2, 3, 6, 7):
+        x = width - x
+    return np.stack([y, x] if orientation in (5, 6, 7, 8) else [x, y], 1)
+
+
 def write_photo(path: Path, color: np.ndarray) -> None:
     """Write (h, w, 3) uint8 as JPEG of high quality, without metadata."""
     from PIL import Image
@@ -110,6 +146,13 @@ def write_mask(path: Path, mask: np.ndarray) -> None:
     Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path, compress_level=1)
 
 
+def _developed(path: Path, *, half: bool) -> np.ndarray:
+    try:
+        return develop(path, half=half)
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path.name} cannot be decoded ({error}).", _ANOTHER) from None
+
+
 def _open(path: Path) -> Image.Image:
     from PIL import Image, UnidentifiedImageError
 
@@ -118,11 +161,38 @@ def _open(path: Path) -> Image.Image:
         # lets nobody remove an open file.
         with without_warnings(), open_image(path) as image:
             image.load()
+            if photo_kind(path) == HEIF:
+                return in_srgb(image)
     except UnidentifiedImageError:
         raise DatasetError(f"{path.name} is not a photo that can be read.", _ANOTHER) from None
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+    except (
+        OSError, ValueError, SyntaxError, EOFError, RuntimeError, Image.DecompressionBombError,
+    ) as error:  # fmt: skip
         raise DatasetError(f"{path.name} cannot be decoded ({error}).", _ANOTHER) from None
     return image
+
+
+def in_srgb(image: Image.Image) -> Image.Image:
+    """Convert an image from its embedded profile to sRGB; as it is where that is not possible.
+
+    Phones store HEIF photos in the colours of their displays (P3): taken for sRGB, they look dull.
+    """
+    from PIL import Image, ImageCms
+
+    profile = image.info.get("icc_profile")
+    if not profile or image.mode not in ("RGB", "RGBA"):
+        return image
+    try:
+        theirs = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        converted = ImageCms.profileToProfile(
+            image.convert("RGB"), theirs, ImageCms.createProfile("sRGB")
+        )
+    except (ImageCms.PyCMSError, OSError):
+        return image
+    assert converted is not None
+    if image.mode == "RGBA":
+        return Image.merge("RGBA", (*converted.split(), image.getchannel("A")))
+    return converted
 
 
 def _to_arrays(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:

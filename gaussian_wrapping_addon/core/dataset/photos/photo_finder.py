@@ -13,23 +13,20 @@ from pathlib import Path, PurePosixPath
 from ... import limits
 from ...errors import DatasetError
 from ...files import resolve_inside
-from .photo_header import PHOTO_SUFFIXES
+from .image_formats import HEIF_SUFFIXES, PHOTO_SUFFIXES, RAW_SUFFIXES
 
 PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
 MASK_FOLDERS = ("masks", "mask")
 MASK_ENDINGS = ("_mask", "-mask", ".mask")
 """Of the stem of a mask's name, as other programs write it beside the photo or in a folder."""
-RAW_SUFFIXES = (
-    ".heic", ".heif", ".avif",
-    ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2",
-)  # fmt: skip
 _MAX_DEPTH = 8
 
 
 def list_photos(root: Path) -> list[Path]:
     """List photo files under ``root``, sorted by name, without masks and hidden folders.
 
-    ``x_mask.png`` is a mask where ``x.jpg`` lies beside it, else a photo.
+    ``x_mask.png`` is a mask where ``x.jpg`` lies beside it, else a photo. Of ``x.jpg``, ``x.heic``
+    and ``x.dng`` beside each other, the first that is there is taken (:func:`second_copies`).
 
     Links to files are followed, links to folders are not (they could form a loop).
 
@@ -38,7 +35,20 @@ def list_photos(root: Path) -> list[Path]:
     DatasetError
         More files than the limit.
     """
+    photos, _ = _walk(root)
+    return photos
+
+
+def list_second_copies(root: Path) -> list[Path]:
+    """List the files under ``root`` that :func:`second_copies` leaves out, sorted by name."""
+    _, left_out = _walk(root)
+    return left_out
+
+
+def _walk(root: Path) -> tuple[list[Path], list[Path]]:
+    """Return the photos under ``root``, and those left out for another copy; both sorted."""
     found: list[Path] = []
+    left_out: list[Path] = []
     base_depth = len(root.parts)
     for folder, subfolders, names in os.walk(root):
         here = Path(folder)
@@ -56,12 +66,43 @@ def list_photos(root: Path) -> list[Path]:
             if not name.startswith(".") and PurePosixPath(name).suffix.lower() in PHOTO_SUFFIXES
         ]
         masks = set(masks_among(shown).values())
-        found += [here / name for name in shown if name not in masks]
+        photos = [name for name in shown if name not in masks]
+        second = second_copies(photos)
+        found += [here / name for name in photos if name not in second]
+        left_out += [here / name for name in second]
         if len(found) > limits.MAX_IMAGES:
             raise DatasetError(
                 f"{root.name} holds more than {limits.MAX_IMAGES} photos.", "Choose a subfolder."
             )
-    return sorted(found, key=lambda p: p.relative_to(root).as_posix())
+
+    def name_of(path: Path) -> str:
+        return path.relative_to(root).as_posix()
+
+    return sorted(found, key=name_of), sorted(left_out, key=name_of)
+
+
+def second_copies(names: Iterable[str]) -> set[str]:
+    """Return the names of files that hold the same photo as another one.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Of the photos of one folder. Cameras write ``x.jpg`` and ``x.nef`` of the same photo: the
+        HEIC and RAW files are left out where an image of the same stem is there, the RAW files
+        where a HEIC is. An image is what the camera made of it, needs no package and no time.
+    """
+    rank_of: dict[str, list[tuple[int, str]]] = {}
+    for name in names:
+        pure = PurePosixPath(name)
+        suffix = pure.suffix.lower()
+        rank = 2 if suffix in RAW_SUFFIXES else 1 if suffix in HEIF_SUFFIXES else 0
+        rank_of.setdefault(pure.stem.casefold(), []).append((rank, name))
+    return {
+        name
+        for copies in rank_of.values()
+        for rank, name in copies
+        if rank > min(other for other, _ in copies)
+    }
 
 
 def masks_among(names: Iterable[str]) -> dict[str, str]:
@@ -84,15 +125,6 @@ def masks_among(names: Iterable[str]) -> dict[str, str]:
             photos.setdefault(base, []).append(name)
         marked += [(name, stem.removesuffix(e)) for e in MASK_ENDINGS if stem.endswith(e)]
     return {photo: mask for mask, base in marked for photo in photos.get(base, ())}
-
-
-def count_raw_photos(root: Path) -> int:
-    """Count the camera RAW and HEIC files under ``root``, which must be converted first."""
-    return sum(
-        PurePosixPath(name).suffix.lower() in RAW_SUFFIXES
-        for _, _, names in os.walk(root)
-        for name in names
-    )
 
 
 def photo_root(source: Path) -> Path:

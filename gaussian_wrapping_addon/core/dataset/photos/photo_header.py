@@ -2,7 +2,7 @@
 """Read size and EXIF orientation of a photo from its header, without decoding it.
 
 JPEG and PNG are parsed here, so that a Python with numpy alone (Blender's) can check an input;
-other formats are read by Pillow if it is installed.
+other formats are read by Pillow and the worker's extras if these are installed.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import IO
 
 from ... import limits
-from ...errors import DatasetError
-from .image_formats import open_image, without_warnings
-
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+from ...errors import DatasetError, MissingExtraError
+from .image_formats import HEIF, RAW, open_image, photo_kind, without_warnings
+from .raw_photo import raw_size
 
 _EXIF_ORIENTATION = 0x0112
 _JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
@@ -47,7 +46,7 @@ def read_photo_header(path: Path) -> PhotoHeader | None:
     Returns
     -------
     PhotoHeader or None
-        ``None`` where the format needs Pillow and Pillow is not installed.
+        ``None`` where the format needs Pillow or an extra that is not installed.
 
     Raises
     ------
@@ -163,17 +162,23 @@ def _exif_orientation(body: bytes) -> int:
 
 
 def _read_other(path: Path) -> PhotoHeader | None:
+    kind = photo_kind(path)
     try:
+        if kind == RAW:
+            return PhotoHeader(*raw_size(path))
         from PIL import Image, UnidentifiedImageError
-    except ImportError:
+    except (ImportError, MissingExtraError):
         return None
     try:
         with without_warnings(), open_image(path) as image:
             width, height = image.size
-            if image.format == "TIFF":  # Pillow turns these upright itself, size included
+            # These are turned upright when they are opened, size included.
+            if image.format == "TIFF" or kind == HEIF:
                 return PhotoHeader(width, height)
             orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+    except MissingExtraError:
+        return None
     except (UnidentifiedImageError, Image.DecompressionBombError):
-        raise ValueError("it is no JPEG, PNG, TIFF, WebP or BMP") from None
+        raise ValueError("it is no JPEG, PNG, TIFF, WebP, BMP, AVIF or HEIC") from None
     valid = isinstance(orientation, int) and 1 <= orientation <= 8
     return PhotoHeader(width, height, int(orientation) if valid else 1)

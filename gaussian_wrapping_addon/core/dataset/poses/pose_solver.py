@@ -26,10 +26,13 @@ from ...processes.helper_process import run_helper
 from ...progress import Progress
 from ...report_warning import UNREADABLE_HINT, ReportWarning
 from ..camera import Camera
+from ..matching.match_pairs import EXHAUSTIVE_LIMIT, pairs_by_pose
+from ..photos.gps_exif import GpsPosition, read_gps_exif
 from ..photos.mask_reading import AS_WRITTEN, MaskReading
 from ..photos.photo_exif import read_lens_exif
 from ..photos.photo_file import (
     DecodedPhoto,
+    photo_header,
     read_mask,
     read_photo,
     write_photo,
@@ -37,7 +40,7 @@ from ..photos.photo_file import (
 from ..photos.photo_finder import find_mask
 from ..readers.colmap_reader import ModelFiles, read_model
 from ..readers.source_model import PosedPhoto, SourceModel
-from .match_pairs import pairs_by_order, pairs_by_pose
+from .solution_findings import with_findings
 from .turntable_result import with_turntable
 
 MAX_SIFT_PX = 1600
@@ -46,7 +49,8 @@ MAX_UNREADABLE_SHARE = 0.2
 """Largest share of photos that cannot be decoded; with more, loading fails."""
 TURNTABLE_FOLDER = "turntable"
 """Masks of what turns, of the photos' full size."""
-_HELPER = "dataset.poses.pose_solver_helper"
+HELPER = "dataset.poses.pose_solver_helper"
+"""Module of the process that solves."""
 _MEMORY_SHARE = 0.9
 _MIN_MEMORY_BYTES = 8 << 30
 """The limit includes reserved address space; below this the solver's threads may not start."""
@@ -78,6 +82,7 @@ def solve_poses(
     threads: int = 0,
     turntable: str = "auto",
     reading: MaskReading = AS_WRITTEN,
+    in_order: bool = False,
 ) -> SourceModel:
     """Solve cameras and sparse points of photos without poses (structure from motion).
 
@@ -97,6 +102,9 @@ def solve_poses(
         masked, unless a photo has a mask.
     reading : MaskReading
         How mask files are understood.
+    in_order : bool
+        Photos sorted by name were taken one after the other, as of a video. Matters where there are
+        too many to match all pairs.
 
     Returns
     -------
@@ -114,17 +122,20 @@ def solve_poses(
     prepared: list[_SolverPhoto] = []
     names: list[str] = []
     bad: list[str] = []
+    positions: list[GpsPosition | None] = []
     for i, path in enumerate(photos):
         name = path.relative_to(root).as_posix()
         try:
-            decoded = read_photo(path)
+            decoded = read_photo(path, enough_px=MAX_SIFT_PX)
+            full_size = photo_header(path).upright_size
         except DatasetError as error:
             bad.append(error.message)
             check_unreadable_share(bad, len(photos))
             continue
         mask = find_mask(mask_roots, name, [root])
-        prepared.append(_write_solver_photo(folder, i, decoded, path, mask, reading))
+        prepared.append(_write_solver_photo(folder, i, decoded, full_size, path, mask, reading))
         names.append(name)
+        positions.append(read_gps_exif(path) if len(photos) > EXHAUSTIVE_LIMIT else None)
         progress.update(0.08 * (i + 1) / len(photos), f"reading photo {i + 1} of {len(photos)}")
     if len(prepared) < MIN_IMAGES:
         raise DatasetError(
@@ -149,14 +160,16 @@ def solve_poses(
             }
             for group in groups.values()
         ],
-        "pairs": [[prepared[i].name, prepared[j].name] for i, j in pairs_by_order(len(prepared))],
+        "in_order": in_order,
+        "positions": [p and [p.latitude_deg, p.longitude_deg] for p in positions],
     }
     write_json(folder / "task.json", task)
-    run_helper(_HELPER, folder, progress.span(0.08, 1.0), memory_bytes=_memory_limit_bytes())
+    run_helper(HELPER, folder, progress.span(0.08, 1.0), memory_bytes=memory_limit_bytes())
     model = read_model(ModelFiles(folder / "model", ".bin"))
     sizes = {p.name: (p.full_width, p.full_height) for p in prepared}
     target = work_folder / TURNTABLE_FOLDER
     model = with_turntable(model, folder, sizes, target, wanted=turntable == "on")
+    model = with_findings(model, folder, {p.name: n for p, n in zip(prepared, names, strict=True)})
     _save_model(folder, work_folder)
     return _with_source_names(model, prepared, names, bad, len(photos))
 
@@ -230,7 +243,8 @@ def triangulate_points(
     folder = _fresh_folder(work_folder)
     entries = []
     for i, (camera, path) in enumerate(zip(cameras, photos, strict=True)):
-        prepared = _write_solver_photo(folder, i, read_photo(path), None, masks[i])
+        size = (camera.width, camera.height)
+        prepared = _write_solver_photo(folder, i, read_photo(path), size, None, masks[i])
         small = camera.resized(prepared.width, prepared.height)
         entries.append(
             {
@@ -253,7 +267,7 @@ def triangulate_points(
         "pairs": [[entries[i]["name"], entries[j]["name"]] for i, j in pairs],
     }
     write_json(folder / "task.json", task)
-    run_helper(_HELPER, folder, progress.span(0.08, 1.0), memory_bytes=_memory_limit_bytes())
+    run_helper(HELPER, folder, progress.span(0.08, 1.0), memory_bytes=memory_limit_bytes())
     model = read_model(ModelFiles(folder / "model", ".bin"))
     shutil.rmtree(folder)
     return model.points, model.point_colors
@@ -272,18 +286,22 @@ def _write_solver_photo(
     folder: Path,
     index: int,
     decoded: DecodedPhoto,
+    full_size: tuple[int, int],
     source: Path | None,
     mask: Path | None,
     reading: MaskReading = AS_WRITTEN,
 ) -> _SolverPhoto:
-    """Write one upright photo of limited size; the lens is read from the EXIF of ``source``."""
+    """Write one upright photo of limited size; the lens is read from the EXIF of ``source``.
+
+    ``full_size`` is (width, height) of the whole photo, which may be decoded at less.
+    """
     from PIL import Image
 
-    full_height, full_width = decoded.color.shape[:2]
+    full_width, full_height = full_size
     factor = min(1.0, MAX_SIFT_PX / max(full_width, full_height))
     size = (max(1, round(full_width * factor)), max(1, round(full_height * factor)))
     color = decoded.color
-    if factor < 1.0:
+    if size != (color.shape[1], color.shape[0]):
         color = np.asarray(Image.fromarray(color).resize(size, Image.Resampling.LANCZOS))
     name = f"{index:06d}.jpg"
     write_photo(folder / "images" / name, color)
@@ -321,7 +339,7 @@ def _save_model(folder: Path, work_folder: Path) -> None:
     shutil.rmtree(folder)
 
 
-def _memory_limit_bytes() -> int | None:
+def memory_limit_bytes() -> int | None:
     """Return a share of the machine's memory, or ``None`` if unknown."""
     total = total_memory_bytes()
     return max(int(_MEMORY_SHARE * total), _MIN_MEMORY_BYTES) if total else None

@@ -2,7 +2,7 @@
 """Helper process of :mod:`.pose_solver`: feature extraction, matching, mapping, triangulation.
 
 Reads ``task.json``, ``images/`` and ``masks/`` of its folder, writes ``model/`` (COLMAP binary),
-and ``turntable.json`` and ``turning/`` where it solves.
+and ``turntable.json``, ``turning/`` and ``solution.json`` where it solves.
 """
 
 from __future__ import annotations
@@ -15,8 +15,14 @@ import numpy as np
 from ...errors import DatasetError
 from ...files import read_json, write_json
 from ...processes.helper_process import emit
+from ..matching.feature_steps import MATCH_END, extract, match, match_chosen, verify_again
+from ..matching.match_pairs import EXHAUSTIVE_LIMIT
 from ..photos.photo_file import write_mask
 from ..pycolmap_import import import_pycolmap
+from .mapping import joined, mapping_options, place_at_once, place_one_by_one
+from .mending import mended
+from .solution_check import check_solution
+from .solution_findings import SOLUTION_NAME
 from .standing_still import TURNING_FOLDER, TURNTABLE_NAME, are_turning
 from .turntable_features import (
     are_usable,
@@ -34,12 +40,11 @@ _MIN_REGISTERED_SHARE = 0.8
 _LENIENT_REGISTERED_SHARE = 0.5
 """Share of registered photos below which thresholds for the first pair and poses are relaxed."""
 _MAX_FEATURES = 8192
+_MAX_FEATURES_MANY = 2048
+"""Of a photo of a set whose pairs are chosen: matching time grows with its square."""
 _MAX_FEATURES_POSED = 4096
-_MATCHING_BLOCKS = 3
-_MATCHING_BLOCK_PAIRS = 1500
-"""Every block rebuilds the search index of each of its photos: few, large blocks are faster."""
-
-_EXTRACT_END, _MATCH_END = 0.5, 0.85
+_MAX_FEATURES_PANORAMA = 2048
+"""Of each of a panorama's views: there are 14, and each is matched with many."""
 
 
 def main(folder: Path) -> None:
@@ -51,6 +56,8 @@ def main(folder: Path) -> None:
     pycolmap.set_random_seed(task["seed"])
     if task["mode"] == "solve":
         _solve(folder, task)
+    elif task["mode"] == "panoramas":
+        _solve_panoramas(folder, task)
     else:
         _triangulate(folder, task)
 
@@ -77,14 +84,117 @@ def _solve(folder: Path, task: dict[str, Any]) -> None:
             names_of_camera[camera_id] = group["names"]
             if focal_px is None:
                 guessed.append(camera_id)
-    _extract(folder, database, names_of_camera, task["threads"], _MAX_FEATURES)
-    _match(folder, database, task)
+    total = sum(len(names) for names in names_of_camera.values())
+    is_small = total <= EXHAUSTIVE_LIMIT
+    features = _MAX_FEATURES if is_small else _MAX_FEATURES_MANY
+    extract(folder, database, names_of_camera, task["threads"], features)
+    names = sorted(name for group in names_of_camera.values() for name in group)
+    match_chosen(folder, database, task, names)
     _leave_out_background(folder, database, task)
-    best, total = None, sum(len(names) for names in names_of_camera.values())
+
+    accounts: list[dict[str, Any]] = []
+
+    def solve(database: Path) -> Any:
+        model, account = _place(folder, database, task, total, guessed)
+        accounts.append(account)
+        return model
+
+    best = solve(database)
+    if best is None:
+        raise DatasetError(
+            f"No two of the {total} photos could be placed relative to each other.",
+            "Take more photos with more overlap, from a textured object that does not move.",
+        )
+    verdict = check_solution(database, best)
+    is_mended = False
+    if verdict.is_doubtful:
+        best, verdict, is_mended = mended(database, folder, solve, best, verdict)
+    said = accounts[-1 if is_mended else 0]
+    if said["joined"] or said["mapper"] == "global":  # the incremental mapper has done so
+        best.extract_colors_for_all_images(folder / "images")
+        best.update_point_3d_errors()
+    placed = [best.image(number).name for number in sorted(best.reg_image_ids())]
+    said |= verdict.to_json(placed)
+    said |= {"is_doubtful": verdict.is_doubtful, "is_mended": is_mended}
+    said["pairs_matched"] = len(task["pairs"])
+    write_json(folder / SOLUTION_NAME, said)
+    _write(folder, best)
+
+
+def _solve_panoramas(folder: Path, task: dict[str, Any]) -> None:
+    """Solve views of panoramas as a rig whose directions and lens are known and stay."""
+    pycolmap = import_pycolmap()
+
+    database = folder / "database.db"
+    side, focal_px = task["side"], task["focal_px"]
+    rotations = [np.array(rows) for rows in task["cam_from_panorama"]]
+    names_of_camera: dict[int, list[str]] = {}
+    rig = []
+    with pycolmap.Database.open(database) as db:
+        for view, rotation in enumerate(rotations):
+            camera = pycolmap.Camera(
+                model="PINHOLE",
+                width=side,
+                height=side,
+                params=[focal_px, focal_px, side / 2, side / 2],
+            )
+            camera.has_prior_focal_length = True
+            names = [f"{view:02d}/{number:06d}.jpg" for number in range(task["panoramas"])]
+            names_of_camera[db.write_camera(camera)] = names
+            sensor = pycolmap.RigConfigCamera(ref_sensor=view == 0, image_prefix=f"{view:02d}/")
+            if view:
+                turned = rotation @ rotations[0].T
+                sensor.cam_from_rig = pycolmap.Rigid3d(np.c_[turned, np.zeros(3)])
+            rig.append(sensor)
+    extract(folder, database, names_of_camera, task["threads"], _MAX_FEATURES_PANORAMA)
+    with pycolmap.Database.open(database) as db:
+        pycolmap.apply_rig_config([pycolmap.RigConfig(cameras=rig)], db)
+    match(folder, database, task)
+    total = task["panoramas"] * len(rotations)
+    found = place_one_by_one(database, folder, task["seed"], total, known_lens=True)
+    if not found:
+        raise DatasetError(
+            f"No two of the {task['panoramas']} panoramas could be placed relative to each other.",
+            "Take more panoramas, a few steps apart.",
+        )
+    _write(folder, found[0])
+
+
+def _place(
+    folder: Path, database: Path, task: dict[str, Any], total: int, guessed: list[int]
+) -> tuple[Any, dict[str, Any]]:
+    """Return the best reconstruction or None, and how it was found.
+
+    Many photos are placed all at once first, which takes a fraction of the time.
+    """
+    if total > EXHAUSTIVE_LIMIT:
+        models = place_at_once(database, folder, task["seed"], total)
+        model, said = _best_of(folder, database, task, models, "global")
+        enough = model is not None and model.num_reg_images() >= _MIN_REGISTERED_SHARE * total
+        if enough and not check_solution(database, model).is_doubtful:
+            return model, said
+        one_by_one, other = _place_one_by_one(folder, database, task, total, guessed)
+        if model is None or (
+            one_by_one is not None
+            and check_solution(database, one_by_one).agreeing
+            > check_solution(database, model).agreeing
+        ):
+            return one_by_one, other
+        return model, said
+    return _place_one_by_one(folder, database, task, total, guessed)
+
+
+def _place_one_by_one(
+    folder: Path, database: Path, task: dict[str, Any], total: int, guessed: list[int]
+) -> tuple[Any, dict[str, Any]]:
+    """Try focal lengths, where EXIF gives none, until most photos can be placed."""
+    pycolmap = import_pycolmap()
+
+    best: list[Any] = []
     factors = DEFAULT_FOCAL_FACTORS if guessed else DEFAULT_FOCAL_FACTORS[:1]
     attempts = [(factor, False) for factor in factors] + [(factors[0], True)]
     for factor, lenient in attempts:
-        if best is not None and best.num_reg_images() >= total * (
+        if best and best[0].num_reg_images() >= total * (
             _LENIENT_REGISTERED_SHARE if lenient else _MIN_REGISTERED_SHARE
         ):
             break
@@ -94,91 +204,26 @@ def _solve(folder: Path, task: dict[str, Any]) -> None:
                 start_px = factor * max(camera.width, camera.height)
                 camera.params = [start_px, camera.width / 2, camera.height / 2, 0.0]
                 db.update_camera(camera)
-        found = _map(folder, database, task, total, lenient=lenient)
-        if found is not None and (best is None or found.num_reg_images() > best.num_reg_images()):
+        found = place_one_by_one(database, folder, task["seed"], total, lenient=lenient)
+        if found and (not best or found[0].num_reg_images() > best[0].num_reg_images()):
             best = found
-    if best is None:
-        raise DatasetError(
-            f"No two of the {total} photos could be placed relative to each other.",
-            "Take more photos with more overlap, from a textured object that does not move.",
-        )
-    _write(folder, best)
+    return _best_of(folder, database, task, best, "incremental")
 
 
-def _extract(
-    folder: Path,
-    database: Path,
-    names_of_camera: dict[int, list[str]],
-    threads: int,
-    max_features: int,
-) -> None:
-    pycolmap = import_pycolmap()
-
-    options = pycolmap.FeatureExtractionOptions()
-    options.num_threads = threads
-    options.use_gpu = False
-    options.sift.max_num_features = max_features
-    reader = pycolmap.ImageReaderOptions()
-    if any((folder / "masks").iterdir()):
-        reader.mask_path = folder / "masks"
-    total = sum(len(names) for names in names_of_camera.values())
-    done = 0
-    for camera_id, names in names_of_camera.items():
-        reader.existing_camera_id = camera_id
-        # Import in order first: extraction would number the photos as its threads finish.
-        pycolmap.import_images(
-            database,
-            folder / "images",
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            image_names=names,
-            options=reader,
-        )
-        for begin in range(0, len(names), 2 * threads):
-            block = names[begin : begin + 2 * threads]
-            emit(
-                fraction=_EXTRACT_END * done / total,
-                message=f"searching features, photo {done + 1} of {total}",
-            )
-            pycolmap.extract_features(
-                database,
-                folder / "images",
-                image_names=block,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=options,
-                device=pycolmap.Device.cpu,
-            )
-            done += len(block)
-
-
-def _match(
-    folder: Path, database: Path, task: dict[str, Any], *, is_turntable: bool = False
-) -> None:
-    pycolmap = import_pycolmap()
-
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = False
-    matching.num_threads = task["threads"]
-    verification = _verification_options(task, is_turntable=is_turntable)
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = folder / "pairs.txt"
-    pairs = task["pairs"]
-    step = max(1, min(-(-len(pairs) // _MATCHING_BLOCKS), _MATCHING_BLOCK_PAIRS))
-    for begin in range(0, len(pairs), step):
-        begun = _MATCH_END if is_turntable else _EXTRACT_END
-        emit(
-            fraction=begun + (_MATCH_END - begun) * begin / len(pairs),
-            message=f"matching photos, pair {begin + 1} of {len(pairs)}",
-        )
-        block = pairs[begin : begin + step]
-        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in block))
-        pycolmap.match_image_pairs(
-            database,
-            matching_options=matching,
-            pairing_options=pairing,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
+def _best_of(
+    folder: Path, database: Path, task: dict[str, Any], models: list[Any], mapper: str
+) -> tuple[Any, dict[str, Any]]:
+    """Join parts, and name the photos of those that stay apart."""
+    said: dict[str, Any] = {"mapper": mapper, "joined": 0, "apart": []}
+    if not models:
+        return None, said
+    model, said["joined"] = joined(database, folder, task["seed"], models)
+    placed = set(model.reg_image_ids())
+    for other in models[1:]:
+        apart = [other.image(k).name for k in sorted(set(other.reg_image_ids()) - placed)]
+        placed.update(other.reg_image_ids())
+        said["apart"] += [apart] if apart else []
+    return model, said
 
 
 def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) -> None:
@@ -192,92 +237,27 @@ def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) ->
     place = {name: number for number, group in enumerate(groups) for name in group}
     pairs = [(a, b) for a, b in task["pairs"] if a in place and place[a] == place.get(b)]
     if groups:
-        emit(fraction=_MATCH_END, message="separating what turns from what stands still")
-        _verify_again(database, task, is_turntable=True)
+        emit(fraction=MATCH_END, message="separating what turns from what stands still")
+        verify_again(database, task, is_turntable=True)
         turn = are_turning(most_inliers(database, names, pairs))
         if task["turntable"] == "auto" and not turn:
-            _verify_again(database, task, is_turntable=False)
+            verify_again(database, task, is_turntable=False)
             groups, names = [], []
     found: dict[str, Any] = {"photos": len(names), "is_masked": False}
     if groups:
 
         def step(share: float) -> None:
-            emit(fraction=_MATCH_END, message=f"masking what stands still, {100 * share:.0f} %")
+            emit(fraction=MATCH_END, message=f"masking what stands still, {100 * share:.0f} %")
 
         masks = turning_masks(folder / "images", groups, step, threads=task["threads"])
         if are_usable(masks, matches_inside(database, masks, pairs)):
             found["is_masked"] = True
             drop_still_features(database, masks)
-            _match(folder, database, task, is_turntable=True)
+            match(folder, database, task, begin=MATCH_END, is_turntable=True)
             (folder / TURNING_FOLDER).mkdir()
             for name, mask in masks.items():
                 write_mask(folder / TURNING_FOLDER / f"{name}.png", mask)
     write_json(folder / TURNTABLE_NAME, found)
-
-
-def _verify_again(database: Path, task: dict[str, Any], *, is_turntable: bool) -> None:
-    pycolmap = import_pycolmap()
-
-    with pycolmap.Database.open(database) as db:
-        db.clear_two_view_geometries()
-    verifier = pycolmap.GeometricVerifierOptions()
-    verifier.num_threads = task["threads"]
-    pycolmap.geometric_verification(
-        database,
-        verifier_options=verifier,
-        two_view_geometry_options=_verification_options(task, is_turntable=is_turntable),
-    )
-
-
-def _verification_options(task: dict[str, Any], *, is_turntable: bool) -> Any:
-    options = import_pycolmap().TwoViewGeometryOptions()
-    options.ransac.random_seed = task["seed"]
-    options.filter_stationary_matches = is_turntable
-    return options
-
-
-def _mapping_options(seed: int) -> Any:
-    pycolmap = import_pycolmap()
-
-    options = pycolmap.IncrementalPipelineOptions()
-    for part in (options, options.mapper, options.triangulation):
-        part.random_seed = seed
-    # One thread: the order of sums in bundle adjustment, and so the result, stays the same.
-    options.num_threads = 1
-    options.mapper.num_threads = 1
-    return options
-
-
-def _map(folder: Path, database: Path, task: dict[str, Any], total: int, *, lenient: bool) -> Any:
-    """Return the largest reconstruction, or ``None``."""
-    pycolmap = import_pycolmap()
-
-    options = _mapping_options(task["seed"])
-    options.min_model_size = 3
-    if lenient:
-        options.mapper.init_min_num_inliers = 40
-        options.mapper.init_min_tri_angle = 5.0
-        options.mapper.abs_pose_min_num_inliers = 15
-    registered = 2
-
-    def next_photo() -> None:
-        nonlocal registered
-        registered += 1
-        share = min(registered / total, 1.0)
-        emit(
-            fraction=_MATCH_END + (1.0 - _MATCH_END) * share,
-            message=f"placing photo {min(registered, total)} of {total}",
-        )
-
-    output = folder / "models"
-    output.mkdir(exist_ok=True)
-    emit(fraction=_MATCH_END, message="choosing the first two photos")
-    found = pycolmap.incremental_mapping(
-        database, folder / "images", output, options, next_image_callback=next_photo
-    )
-    # Of equally large models, take the first, independent of the dictionary's order.
-    ordered = [found[key] for key in sorted(found)]
-    return max(ordered, key=lambda model: model.num_reg_images(), default=None)
 
 
 def _triangulate(folder: Path, task: dict[str, Any]) -> None:
@@ -296,8 +276,8 @@ def _triangulate(folder: Path, task: dict[str, Any]) -> None:
             )
             camera.has_prior_focal_length = True
             names_of_camera[db.write_camera(camera)] = names
-    _extract(folder, database, names_of_camera, task["threads"], _MAX_FEATURES_POSED)
-    _match(folder, database, task)
+    extract(folder, database, names_of_camera, task["threads"], _MAX_FEATURES_POSED)
+    match(folder, database, task)
     pose_of_name = {p["name"]: np.array(p["cam_from_world"]) for p in task["photos"]}
     posed = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as db:
@@ -309,8 +289,8 @@ def _triangulate(folder: Path, task: dict[str, Any]) -> None:
             )
             pose = pycolmap.Rigid3d(pose_of_name[stored.name])
             posed.add_image_with_trivial_frame(image, pose)
-    emit(fraction=_MATCH_END, message="triangulating points")
-    options = _mapping_options(task["seed"])
+    emit(fraction=MATCH_END, message="triangulating points")
+    options = mapping_options(task["seed"])
     # Keep the poses of the input: bundle adjustment may move points only.
     solved = pycolmap.triangulate_points(
         posed, database, folder / "images", folder, clear_points=True, options=options

@@ -45,6 +45,8 @@ class RawImage:
     camera_id: int
     name: str
     place: str
+    observed: int = 0
+    """Sparse points that it sees."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,8 @@ _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
 _POINT = struct.Struct("<Q3d3Bd")
+_POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+_NO_POINT = -1
 
 
 def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[ReportWarning]]:
@@ -167,7 +171,7 @@ def add_camera(
 
 
 def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
-    """Read ``images.bin``; the 2D points are skipped.
+    """Read ``images.bin``; of the 2D points, those with a sparse point are counted.
 
     Raises
     ------
@@ -182,6 +186,8 @@ def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
         values = cursor.take(_IMAGE, "an image")
         name = cursor.name()
         points = cursor.count(_POINT2D_BYTES, 2**31, f"2D points of image {name!r}")
+        entries = np.frombuffer(cursor.data, _POINT2D, points, cursor.at)
+        observed = int((entries["point"] != _NO_POINT).sum())
         cursor.skip(points * _POINT2D_BYTES)
         images.append(
             RawImage(
@@ -191,6 +197,7 @@ def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
                 int(values[8]),
                 name,
                 f"byte {begin}",
+                observed,
             )
         )
     return images, _rest(cursor)

@@ -217,7 +217,8 @@ def _usable_photos(
         seen_ids.add(image.image_id)
         seen_names.add(name)
         pose = np.concatenate([rotation, image.translation[:, None]], 1)
-        photos.append(PosedPhoto(name, cameras[image.camera_id], pose))
+        camera = cameras[image.camera_id]
+        photos.append(PosedPhoto(name, camera, pose, observed=image.observed))
     for reason, names in dropped.items():
         listed = ", ".join(names[:_EXAMPLES]) + (" ..." if len(names) > _EXAMPLES else "")
         text = f"{len(names)} images were left out for {reason}: {listed}."

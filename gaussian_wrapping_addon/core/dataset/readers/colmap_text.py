@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ from ...errors import ParseError
 from ...regular_files import open_regular
 from ...report_warning import ReportWarning
 from .colmap_binary import RawImage, RawPoints, add_camera
-from .source_model import LENS_PARAMETERS, LensCamera
+from .source_model import LENS_NAMES, LensCamera
 
 _AGAIN = "Export the model again, or solve the cameras from the photos."
 
@@ -78,7 +79,7 @@ def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[ReportWarning]
             continue
         if len(words) < 5:
             raise ParseError(path, f"line {line}", "a camera needs at least 5 entries.", _AGAIN)
-        if words[1] not in LENS_PARAMETERS:
+        if words[1] not in LENS_NAMES:
             raise ParseError(
                 path, f"line {line}", f"camera model {words[1][:60]} is not supported.",
                 "Convert the photos to perspective images, or solve the cameras again.",
@@ -115,6 +116,8 @@ def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
         lists_points = len(words) % 3 == 0 and all(_NUMERIC.fullmatch(w) for w in words)
         if expects_points and lists_points:  # an empty line lists no points
             expects_points = False
+            observed = sum(not word.startswith("-") for word in words[2::3])
+            images[-1] = dataclasses.replace(images[-1], observed=observed)
             continue
         if not words:
             continue

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +41,33 @@ LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
     "FISHEYE": ("fx", "fy", "cx", "cy"),
     "EUCM": ("fx", "fy", "cx", "cy", "alpha", "beta"),
 }
-"""COLMAP's lens models in the order of their numbers."""
+"""COLMAP's lens models in the order of their numbers, then our own."""
 
 LENS_NAMES = tuple(LENS_PARAMETERS)
+"""COLMAP's lens models: what its files may name."""
+
+SKEWED_BROWN = "SKEWED_BROWN"
+"""Brown's polynomial with a fourth radial coefficient and skew, which COLMAP has no model for."""
+LENS_PARAMETERS[SKEWED_BROWN] = (
+    *("fx", "fy", "cx", "cy", "skew"),
+    *("k1", "k2", "k3", "k4", "p1", "p2"),
+)
+
+PANORAMA = "EQUIRECTANGULAR"
+"""What panoramas are called among lens models; no :class:`LensCamera` has it."""
+
+COLMAP, TRANSFORMS, PHOTOS = "COLMAP model", "transforms.json", "photos"
+"""Kinds of inputs; others are named after the program that wrote the cameras."""
+
+
+def counts_stored_pixels(kind: str) -> bool:
+    """Whether the cameras of a kind of input are of the photos as stored.
+
+    COLMAP and photogrammetry programs read pixels as stored; for the frames of a transforms.json
+    and where cameras are solved here, the EXIF orientation is applied first.
+    """
+    return kind not in (TRANSFORMS, PHOTOS)
+
 
 _FOCAL_SHARE = (1e-3, 1e3)
 """Focal length over the photo's long side: 0.001 is a 179.9 degree lens, 1000 a telescope."""
@@ -123,6 +147,8 @@ class LensCamera:
             params[1] *= sy
         params[at] *= sx
         params[at + 1] *= sy
+        if "skew" in names:
+            params[names.index("skew")] *= sx
         return LensCamera(model, int(width), int(height), tuple(params))
 
 
@@ -143,12 +169,62 @@ def _with_two_focal_lengths(camera: LensCamera) -> tuple[str, tuple[str, ...], l
 
 
 @dataclass(frozen=True)
+class Brown:
+    """Brown's polynomial distortion, from ray to pixel, and skew; tangential terms as of OpenCV."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    skew: float = 0.0
+    """What y adds to the pixel's x, in the unit of the focal length."""
+
+    def lens(
+        self, width: int, height: int, focal: tuple[float, float], center: tuple[float, float]
+    ) -> LensCamera:
+        """Return the simplest model that holds all of it exactly."""
+        if self.skew or self.k4:
+            terms = (self.skew, self.k1, self.k2, self.k3, self.k4, self.p1, self.p2)
+            return LensCamera(SKEWED_BROWN, width, height, (*focal, *center, *terms))
+        if self.k3:
+            full = (self.k1, self.k2, self.p1, self.p2, self.k3, 0.0, 0.0, 0.0)
+            return LensCamera("FULL_OPENCV", width, height, (*focal, *center, *full))
+        if self.k1 or self.k2 or self.p1 or self.p2:
+            four = (self.k1, self.k2, self.p1, self.p2)
+            return LensCamera("OPENCV", width, height, (*focal, *center, *four))
+        return LensCamera("PINHOLE", width, height, (*focal, *center))
+
+
+@dataclass(frozen=True)
+class RelativeLens:
+    """A lens in shares of the photo's long side, for inputs that state no photo size."""
+
+    focal: float
+    aspect: float
+    """Vertical over horizontal focal length."""
+    offset: tuple[float, float]
+    """Principal point, from the photo's middle."""
+    brown: Brown
+
+    def of_size(self, width: int, height: int) -> LensCamera:
+        """Return the lens of a photo of ``width`` x ``height`` pixels."""
+        side = max(width, height)
+        fx = self.focal * side
+        center = 0.5 * width + self.offset[0] * side, 0.5 * height + self.offset[1] * side
+        brown = replace(self.brown, skew=self.brown.skew * side)
+        return brown.lens(width, height, (fx, fx * self.aspect), center)
+
+
+@dataclass(frozen=True)
 class PosedPhoto:
     """One photo of the input: its name there, its lens, its pose."""
 
     name: str
     lens: LensCamera | None
-    """``None`` if the photo's size is needed to complete the intrinsics (``angle_x`` is set)."""
+    """``None`` if the photo's size is needed to complete the intrinsics (``angle_x`` or
+    ``relative`` is set), and of panoramas."""
     cam_from_world: np.ndarray
     """(3, 4) float64, COLMAP axes (x right, y down, z forward)."""
     mask_name: str | None = None
@@ -156,6 +232,12 @@ class PosedPhoto:
     """Horizontal field of view in radians, if the input gives nothing else."""
     mask_path: Path | None = None
     """Mask made while the cameras were solved, of the upright photo's size."""
+    observed: int | None = None
+    """Sparse points that were found in it, where the input tells."""
+    relative: RelativeLens | None = None
+    """Intrinsics of a photo of any size."""
+    is_panorama: bool = False
+    """Whether the photo is equirectangular: it has no lens, and is cut into views when loaded."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +245,7 @@ class SourceModel:
     """Cameras and points of an input, world frame, float64."""
 
     kind: str
-    """``"COLMAP model"``, ``"transforms.json"`` or ``"photos"``."""
+    """:data:`COLMAP`, :data:`TRANSFORMS`, :data:`PHOTOS`, or the name of a program."""
     photos: tuple[PosedPhoto, ...]
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) float64."""

@@ -21,7 +21,7 @@ from ...files import read_json, resolve_inside
 from ...report_warning import LEFT_OUT_HINT, ReportWarning
 from .colmap_reader import is_safe_name
 from .point_file import read_point_ply
-from .source_model import LENS_PARAMETERS, LensCamera, PosedPhoto, SourceModel
+from .source_model import LENS_PARAMETERS, PANORAMA, LensCamera, PosedPhoto, SourceModel
 
 NAMES = ("transforms.json", "transforms_train.json")
 
@@ -87,11 +87,13 @@ def read_transforms(path: Path) -> SourceModel:
         seen.add(name)
         pose, was_scaled = _pose(path, f"{place}.transform_matrix", frame.get("transform_matrix"))
         scaled += was_scaled
-        lens, angle_x = _intrinsics(path, place, {**values, **frame})
+        intrinsics = {**values, **frame}
+        is_panorama = intrinsics.get("camera_model") == PANORAMA
+        lens, angle_x = (None, None) if is_panorama else _intrinsics(path, place, intrinsics)
         mask = frame.get("mask_path")
         if mask is not None:
             mask = _name(path, f"{place}.mask_path", mask)
-        photos.append(PosedPhoto(name, lens, pose, mask, angle_x))
+        photos.append(PosedPhoto(name, lens, pose, mask, angle_x, is_panorama=is_panorama))
     if unsafe:
         text = (
             f"{len(unsafe)} frames were left out because their file_path is too long or leads "
@@ -113,7 +115,7 @@ def read_transforms(path: Path) -> SourceModel:
     facts: dict[str, Any] = {
         "frames": len(frames),
         "camera_models": sorted({p.lens.model for p in photos if p.lens is not None})
-        or ["PINHOLE"],
+        or [PANORAMA if photos[0].is_panorama else "PINHOLE"],
         "points_in_model": len(points),
     }
     if "applied_transform" in values or "applied_scale" in values:
@@ -186,7 +188,7 @@ def _intrinsics(
     if stated and stated not in _LENSES:
         raise ParseError(
             path, f"{place}.camera_model", f"{stated[:40]} is not supported.",
-            f"Use one of {', '.join(_LENSES)}.",
+            f"Use one of {', '.join((*_LENSES, PANORAMA))}.",
         )  # fmt: skip
     if values.get("is_fisheye") is True:
         stated = "OPENCV_FISHEYE"

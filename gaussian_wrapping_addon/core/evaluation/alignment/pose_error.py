@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from ...dataset.camera import Camera
+from ...dataset.frames.similarity_fit import umeyama
 from ...dataset.similarity import Similarity
 from ...errors import DatasetError
-from .similarity_alignment import umeyama
 
 
 @dataclass(frozen=True)

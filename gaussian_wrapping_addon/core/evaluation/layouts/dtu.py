@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from ...dataset.camera import Camera
+from ...dataset.frames.similarity_fit import umeyama
 from ...dataset.similarity import Similarity
 from ...errors import DatasetError, ParseError
-from ..alignment.similarity_alignment import umeyama
 from ..surface.dtu_chamfer import (
     DENSITY_MM,
     PATCH_MM,

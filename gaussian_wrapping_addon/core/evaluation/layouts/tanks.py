@@ -20,10 +20,11 @@ import numpy as np
 
 from ... import limits
 from ...dataset.camera import Camera
+from ...dataset.frames.similarity_fit import RansacResult, umeyama_ransac
 from ...dataset.similarity import Similarity
 from ...errors import DatasetError, ParseError, UsageError
 from ...progress import Progress
-from ..alignment.similarity_alignment import RansacResult, refine_as_tanks, umeyama_ransac
+from ..alignment.similarity_alignment import refine_as_tanks
 from ..surface.samples import (
     sample_legacy,
     sample_uniformly,

@@ -55,6 +55,7 @@ _UNITS = {
     "seconds_low": "s",
     "seconds_high": "s",
     "speed": "times the reference machine",
+    "video_fps": "1/s",
     "euler": "number",
     "genus": "number",
 }
@@ -90,7 +91,8 @@ _COUNTS = frozenset(
         "inconsistent_edges", "interior_samples", "iterations", "jump_points", "left_out", "lods",
         "max_atlases", "max_gaussians", "most_parts",
         "nonmanifold_edges", "nonmanifold_vertices", "not_finite_vertices",
-        "open_at_region", "open_edges", "part_count", "photos", "photos_masked",
+        "open_at_region", "open_edges", "pairs_contradicting_cameras", "pairs_matched",
+        "pairs_verified", "part_count", "photos", "photos_joined", "photos_masked",
         "photos_masked_as_turning", "photos_placed",
         "photos_undistorted", "photos_used", "photos_with_focal_length", "pivots",
         "pivots_each", "pivots_high", "pivots_low",
@@ -106,7 +108,9 @@ _COUNTS = frozenset(
         "threads", "tile_processes", "turntable_photos", "undecided_tetrahedra",
         "unseen_evaluations",
         "unused_vertices",
-        "vertices", "vertices_at_end_of_sight", "vertices_moved_apart",
+        "vertices", "video_frames", "video_frames_blurred", "video_frames_damaged",
+        "video_frames_kept", "video_frames_read", "video_frames_still",
+        "vertices_at_end_of_sight", "vertices_moved_apart",
         "vertices_on_region_boundary", "vertices_on_surface", "views", "wrap_rounds",
     )
 )  # fmt: skip

@@ -36,6 +36,8 @@ CURVE = "learning-curve.svg"
 
 _STAGES = {
     "cameras": "photos and cameras",
+    "masks": "making masks",
+    "masked": "photos with these masks",
     "train": "training the Gaussians",
     "mesh": "mesh of region",
     "texture": "texture of region",
@@ -46,19 +48,32 @@ _MEMORY = {
 }
 _FACTS = {
     "kind": ("Input", ""),
+    "video_frames_read": ("Frames of the video", "frames"),
+    "video_frames_blurred": ("Frames left out as blurred", "frames"),
+    "video_frames_still": ("Frames left out because nothing moved", "frames"),
+    "video_frames_damaged": ("Frames that cannot be decoded", "frames"),
+    "video_frames_kept": ("Frames used as photos", "frames"),
+    "photos_in_order": ("Photos in the order of", ""),
     "photos": ("Photos in the input", "photos"),
     "photos_placed": ("Photos with a solved camera", "photos"),
     "photos_undistorted": ("Photos undistorted", "photos"),
     "photos_masked": ("Photos with a mask", "photos"),
     "turntable_photos": ("Photos of a turntable", "photos"),
     "photos_masked_as_turning": ("Photos masked to what turns", "photos"),
+    "photos_masked_to_object": ("Photos with a made mask", "photos"),
+    "photos_rejected": ("Photos whose mask was rejected, left out", "photos"),
     "photos_with_focal_length": ("Photos with a recorded focal length", "photos"),
+    "pairs_matched": ("Pairs of photos matched", "pairs"),
+    "pairs_verified": ("Pairs that show the same", "pairs"),
+    "pairs_contradicting_cameras": ("Pairs that contradict the cameras", "pairs"),
+    "photos_joined": ("Photos joined from other parts", "photos"),
     "photo_sizes": ("Photo size", "pixels"),
     "mean_reprojection_error_px": ("Mean reprojection error of the sparse points", "px"),
     "start_points": ("Initial points", ""),
     "up_from": ("Up direction taken from", ""),
     "world_frame": ("World frame", ""),
     "camera_models": ("Lens model", ""),
+    "georeference_note": ("GPS is not used", ""),
     "also_present": ("Also found in the input", ""),
 }
 
@@ -265,6 +280,32 @@ def _time(report: dict[str, Any]) -> list[str]:
     return lines
 
 
+def _unit_rows(units: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return what the entry ``georeference`` says about metres and how well they are known."""
+    if not units:
+        return []
+    sources = units.get("sources")
+    listed = ", ".join(str(s) for s in sources) if isinstance(sources, list) else None
+    rows = [("Metres from", escaped_or(listed))]
+    error = measured(units.get("scale_error"))
+    if error is not None:
+        rows.append(("Error of the scale (standard deviation)", number(100.0 * error, "%")))
+    for key, name in (("gps", "Cameras"), ("control_points", "Control points")):
+        found = part(units, key)
+        if found:
+            text = f"{name} off their known places, median"
+            rows.append((text, number(found.get("median_m"), "m", digits=3)))
+    markers = part(units, "markers")
+    if markers:
+        rows.append(("Markers measured", number(markers.get("used"), "markers")))
+    origin = part(units, "origin")
+    if origin:
+        place = [measured(origin.get(k)) for k in ("latitude_deg", "longitude_deg", "altitude_m")]
+        text = ", ".join("-" if v is None else f"{v:.6f}" for v in place[:2])
+        rows.append(("Origin: latitude, longitude (WGS 84)", text))
+    return rows
+
+
 def _cameras(cameras: dict[str, Any]) -> list[str]:
     facts = part(cameras, "facts")
     rows = [
@@ -283,8 +324,12 @@ def _cameras(cameras: dict[str, Any]) -> list[str]:
             listed = ", ".join(str(v) for v in value if v) if isinstance(value, list) else value
             text = f"{escaped_or(listed)} {unit}".strip()
         rows.append((name, text))
+    units = part(facts, "georeference")
+    rows += _unit_rows(units)
     lines = table(("photos and cameras", "figure"), rows, "lr")
-    if facts.get("kind") == "photos":
+    if units.get("applied") is True:
+        lines += ["", "One world unit is one metre."]
+    elif facts.get("kind") in ("photos", "video"):
         lines += [
             "",
             (

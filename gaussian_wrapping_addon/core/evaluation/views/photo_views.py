@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ...dataset.camera import Camera
+from ...dataset.loading.source_kind import read_poses, source_kind
 from ...dataset.loading.views import prepare_views
 from ...dataset.photos.photo_store import PhotoStore
-from ...dataset.readers.source_kind import read_poses, source_kind
 from ...dataset.scene import Scene, View
 from ...dataset.similarity import Similarity
 from ...errors import ParseError, UsageError

@@ -18,6 +18,7 @@ from ...errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError, WrapError
 from ...machine import total_memory_bytes
 from ...processes.helper_process import child_command, emit
 from ...processes.spawn import run_to_end
+from ...processes.worker_extras import EXTRAS
 from ...processes.worker_requirements import not_started, read_requirements, requirements_file
 
 MIN_PYTHON = (3, 11)
@@ -28,7 +29,7 @@ DOCTOR_DEADLINE_S = 120.0
 REQUIRED = {
     "numpy": "numpy", "torch": "torch", "numba": "numba", "scipy": "scipy", "shull": "shull",
     "pycolmap": "pycolmap", "xatlas": "xatlas",
-    "PIL": "pillow", "trimesh": "trimesh", "igl": "libigl",
+    "PIL": "pillow", "trimesh": "trimesh", "igl": "libigl", "av": "av",
 }  # fmt: skip
 
 
@@ -53,6 +54,7 @@ def diagnose(folder: str = ".") -> list[Diagnosis]:
         )
     ]
     found += _packages()
+    found += _extras()
     found += _devices()
     found.append(_memory())
     free_bytes = shutil.disk_usage(folder).free
@@ -83,6 +85,27 @@ def _packages() -> list[Diagnosis]:
         good = requirement.allows(version)
         wanted = "" if good else f", but {requirement.versions} is required"
         found.append(Diagnosis(name, good, f"{version}{_build(module)}{wanted}", hint))
+    return found
+
+
+def _extras() -> list[Diagnosis]:
+    """Return which extras are installed; one that is not prevents no job, a broken one does."""
+    found = []
+    for extra in EXTRAS:
+        hint = f"Press Add {extra.title}, or: pip install {' '.join(extra.pins)}"
+        try:
+            versions = [importlib.metadata.version(p.name) for p in extra.packages]
+        except importlib.metadata.PackageNotFoundError:
+            found.append(Diagnosis(extra.title, True, "not installed (optional)"))
+            continue
+        try:
+            importlib.import_module(extra.module)
+        except Exception as error:  # a broken binary package can raise anything
+            found.append(Diagnosis(extra.title, False, f"cannot be imported: {error}", hint))
+            continue
+        good = all(p.allows(v) for p, v in zip(extra.packages, versions, strict=True))
+        wanted = "" if good else f", but {' '.join(extra.pins)} is required"
+        found.append(Diagnosis(extra.title, good, ", ".join(versions) + wanted, hint))
     return found
 
 

@@ -14,6 +14,7 @@ from ...devices import choose_device
 from ...errors import DatasetError
 from ...files import real_path
 from ...report_warning import ReportWarning
+from ...settings import JobSettings
 from ..store.job_file import JobFile
 from .worker_call import run_command
 
@@ -38,7 +39,7 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
     from ...training.initialisation.splat_start import wrapping_settings
     from ..stages.splat_scene import start_splat_of
 
-    facts = input_facts(Path(job.source))
+    facts = input_facts(Path(job.source), job.settings)
     device = choose_device(job.settings.device)
     training = job.settings.training
     if start_splat_of(job) is not None:
@@ -65,18 +66,25 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
     return [*lines, *check_resources(expected, machine)]
 
 
-def input_facts(source: Path) -> SceneFacts:
+def input_facts(source: Path, settings: JobSettings | None = None) -> SceneFacts:
     """Return number and size of an input's photos and points, from headers and poses alone.
+
+    Parameters
+    ----------
+    source : Path
+    settings : JobSettings, optional
+        Of a video, they may say how many frames are used; else the most is assumed.
 
     Raises
     ------
     DatasetError
         The input holds no photo that can be read.
     """
+    from ...dataset.loading.source_kind import SPLAT, VIDEO, read_poses, source_kind
     from ...dataset.loading.splat_cameras import FAR_VIEWS, NEAR_VIEWS, PHOTO_SIDE_PX
+    from ...dataset.panoramas.panorama_views import VIEWS, are_panoramas, view_lens
     from ...dataset.photos.photo_file import photo_header
     from ...dataset.photos.photo_finder import PhotoIndex, find_mask, list_photos, photo_root
-    from ...dataset.readers.source_kind import SPLAT, read_poses, source_kind
     from ...dataset.readers.splat_header import read_splat_header
     from ...training.cost.training_estimate import SceneFacts
     from ..stages.splat_scene import MAX_START_POINTS
@@ -87,12 +95,17 @@ def input_facts(source: Path) -> SceneFacts:
         views = FAR_VIEWS + NEAR_VIEWS
         points = min(header.count, MAX_START_POINTS)
         return SceneFacts(views, float(PHOTO_SIDE_PX**2), PHOTO_SIDE_PX, points)
+    if kind.kind == VIDEO and kind.video is not None:
+        return _video_facts(kind.video, settings or JobSettings())
     points = 0
+    panoramas = False
     if kind.kind == "photos":
         root = photo_root(kind.folder)
         named = {p.relative_to(root).as_posix(): p for p in list_photos(root)}
+        panoramas = are_panoramas(list(named.values()))
     else:
         model = read_poses(kind)
+        panoramas = any(photo.is_panorama for photo in model.photos)
         points, index = len(model.points), PhotoIndex(kind.photo_roots)
         matches = {photo.name: index.find(photo.name) for photo in model.photos}
         named = {name: match.path for name, match in matches.items() if match is not None}
@@ -106,6 +119,9 @@ def input_facts(source: Path) -> SceneFacts:
         raise DatasetError(
             f"{source} holds no photo that can be read.", "See what batch.py check finds."
         )
+    if panoramas:
+        lenses = [view_lens(width) for width, _ in sizes]
+        sizes = [(lens.width, lens.height) for lens in lenses for _ in VIEWS]
     return SceneFacts(
         len(sizes),
         sum(width * height for width, height in sizes) / len(sizes),
@@ -113,3 +129,18 @@ def input_facts(source: Path) -> SceneFacts:
         points,
         any(find_mask(kind.mask_roots, name, kind.photo_roots) is not None for name in named),
     )
+
+
+def _video_facts(video: Path, settings: JobSettings) -> SceneFacts:
+    """Return the most photos that a video may give, and their size."""
+    from ...dataset.video.choose_frames import MOST_FRAMES
+    from ...dataset.video.probe import probed
+    from ...training.cost.training_estimate import SceneFacts
+
+    found = probed(video)
+    count = settings.video_frames
+    if not count and settings.video_fps and found.duration_s:
+        count = round(found.duration_s * settings.video_fps)
+    count = count or MOST_FRAMES
+    count = max(min(count, found.frames) if found.frames else count, 1)
+    return SceneFacts(count, float(found.width * found.height), max(found.width, found.height), 0)

@@ -17,11 +17,13 @@ from ...names import AUTOMATIC_REGIONS
 from ...progress import Progress
 from ...report_warning import ReportWarning
 from ...settings import MeshingSettings, from_json
+from ..stages.cameras_stage import scene_stage_name
 from ..stages.region_field import field_views
 from ..stages.region_meshing import estimate_region_mesh, estimate_region_pivots, free_bytes
 from ..store.continue_training import no_finished_training
 from ..store.job_file import read_job
 from ..store.job_folder import JobFolder
+from ..store.rollback import finished_job
 from ..store.stage_folder import read_done
 from .worker_call import run_command
 
@@ -65,7 +67,8 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     if request["region"] not in AUTOMATIC_REGIONS:
         world_region = read_region(Path(request["region"]))
     trained = _newest_stage(folder.stages, "train")
-    scene = load_refined_scene(_newest_stage(folder.stages, "cameras"), trained)
+    scene_stage = _newest_stage(folder.stages, scene_stage_name(finished_job(folder)))
+    scene = load_refined_scene(scene_stage, trained)
     gaussians = load_gaussians(trained / "gaussians.npz")
     arrays = gaussians.arrays()
     if request["region"] not in AUTOMATIC_REGIONS:

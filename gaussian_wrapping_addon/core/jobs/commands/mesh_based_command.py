@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ...errors import DatasetError, ParseError, UsageError
 from ...files import read_json
 from ...progress import Progress
+from ..stages.cameras_stage import MASKED
 from ..store.job_folder import MARKER, JobFolder
 
 if TYPE_CHECKING:
@@ -111,6 +112,7 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
     import numpy as np
 
     from ...dataset.refined_scene import with_poses
+    from ...dataset.scene import MASKS_MADE
     from ...dataset.scene_file import SCENE_NAME, load_saved_scene
 
     job = JobFolder(folder)
@@ -126,10 +128,13 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
         lenses = [_lens(entry) for entry in shown]
         poses = np.array([entry["cam_from_world"] for entry in shown], np.float64)
         poses = poses.reshape(len(shown), 3, 4)
-        held_out = [str(entry["name"]) for entry in read_json(paths[1])["training"]["held_out"]]
+        report = read_json(paths[1])
+        held_out = [str(entry["name"]) for entry in report["training"]["held_out"]]
+        facts = report.get("cameras", {}).get("facts", {})
+        name = MASKED if MASKS_MADE in facts else "cameras"
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ParseError(paths[0], "cameras", f"not as expected ({error}).", again) from None
-    for stage in sorted(job.stages.glob("cameras-*")):
+    for stage in sorted(job.stages.glob(f"{name}-*")):
         if not (stage / SCENE_NAME).is_file():
             continue
         # Photos may have been added since: only the stage with the result's own cameras counts.

@@ -16,6 +16,7 @@ from ...errors import (
     EXIT_DONE,
     EXIT_OTHER,
     EXIT_RESOURCES,
+    MissingExtraError,
     WrapError,
     known_error,
 )
@@ -41,6 +42,9 @@ def run_command(
                 emit(warning=line.text, code=line.code)
             else:
                 emit(line=line)
+    except MissingExtraError as error:
+        emit(error=error.message, hint=error.hint, extras=error.extras)
+        return error.exit_code
     except WrapError as error:
         emit(error=error.message, hint=error.hint)
         return error.exit_code

@@ -3,12 +3,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from ...dataset.frames.placement_file import FILE_NAME as PLACEMENT
+from ...dataset.frames.placement_file import read_placement, write_placement
 from ...dataset.similarity import Similarity
+from ...dataset.units.real_units import blender_start
+from ...errors import ParseError
 from ...evaluation.report.markdown import CURVE
 from ...evaluation.report.report import write_report
 from ...files import finite_json, read_json, resolve_inside, write_json
@@ -19,6 +24,9 @@ from ..store.job_folder import JobFolder
 from ..store.result_swap import new_result
 from ..store.stage_folder import Stage
 from .scene_summary import write_scene_summary
+
+if TYPE_CHECKING:
+    from ...dataset.scene import Scene
 
 REPORTS = ("report.json", "report.md")
 """Replaced last, since they describe all other files."""
@@ -51,6 +59,7 @@ def export_results(
         progress.update(0.1, "writing the scene")
         scene = load_refined_scene(cameras.folder, trained.folder)
         write_scene_summary(new / "scene.json", scene)
+        _place_in_metres(folder.result, new, scene)
         gaussians = load_gaussians(trained.folder / "gaussians.npz")
         write_splat_ply(new / "gaussians.ply", gaussians, scene.world_from_scene)
         for index, (name, meshed, textured) in enumerate(regions):
@@ -77,6 +86,18 @@ def export_results(
         write_report(new, report, of_training, earlier=folder.result)
 
 
+def _place_in_metres(earlier: Path, new: Path, scene: Scene) -> None:
+    """Write the first placement of a scene that has metres; one made in Blender stays."""
+    start = blender_start(scene.facts.get("georeference"), scene.world_from_scene)
+    if start is None:
+        return
+    path = earlier / PLACEMENT
+    with contextlib.suppress(ParseError):  # a damaged one is replaced
+        if path.is_file() and read_placement(path, scene.world_from_scene) is not None:
+            return
+    write_placement(new / PLACEMENT, start, scene.world_from_scene)
+
+
 def _figures_in(result: Path) -> dict[str, dict[str, Any]]:
     return {path.parent.name: read_json(path) for path in sorted(result.glob("*/figures.json"))}
 
@@ -84,7 +105,7 @@ def _figures_in(result: Path) -> dict[str, dict[str, Any]]:
 def _job_report(
     cameras: Stage, trained: Stage, regions: list[tuple[str, Stage, Stage]]
 ) -> dict[str, Any]:
-    stages = [cameras, trained, *(s for _, m, t in regions for s in (m, t))]
+    stages = [*cameras.before, cameras, trained, *(s for _, m, t in regions for s in (m, t))]
     return {
         "stages": [
             {

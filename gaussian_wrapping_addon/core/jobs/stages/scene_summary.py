@@ -16,9 +16,11 @@ def write_scene_summary(path: Path, scene: Scene) -> None:
     """Write ``result/scene.json``, the cameras and frame for Blender (docs/architecture.md)."""
     from ...tolerances import SCENE_RADIUS
 
+    units = scene.facts.get("georeference")
     write_json(
         path,
         {
+            **({} if units is None else {"georeference": units}),
             "version": 1,
             "world_from_scene": scene.world_from_scene.to_json(),
             "radius": SCENE_RADIUS,

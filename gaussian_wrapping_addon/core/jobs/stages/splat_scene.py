@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...dataset.loading.source_kind import SPLAT
 from ...dataset.loading.splat_cameras import (
     NO_PHOTOS_HINT,
     NO_PHOTOS_WARNING,
@@ -15,7 +16,6 @@ from ...dataset.loading.splat_cameras import (
     scene_frame,
     splat_extent,
 )
-from ...dataset.readers.source_kind import SPLAT
 from ...dataset.readers.splat_header import is_splat_path
 from ...dataset.scene import Scene, View
 from ...files import write_bytes

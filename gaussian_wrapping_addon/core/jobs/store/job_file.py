@@ -14,6 +14,7 @@ from typing import Any
 from ...errors import DatasetError, ParseError, SettingError, UsageError
 from ...files import read_json, real_path, write_json
 from ...limits import SHORTEST_EDGE
+from ...masks.model_file import check_model_file
 from ...names import AUTOMATIC_REGIONS, region_name, region_names
 from ...regions.region_file import parse_region_file, read_region_body
 from ...settings import JobSettings, MeshingSettings, from_json, to_json
@@ -137,18 +138,55 @@ def make_job(
     start = settings.start_splat
     if start and not Path(start).is_file():
         raise DatasetError(f"The start splat {start} does not exist.", "Check the path.")
-    training = settings.training
+    if start and (settings.markers or settings.control_points or settings.georeference == "on"):
+        raise UsageError(
+            "A splat to start from lies in the frame of the cameras, which markers, control points "
+            "and georeference on replace by metres.",
+            "Leave one of them out; a result can be scaled by a measured length.",
+        )
+    control = settings.control_points
+    if control and not Path(control).is_file():
+        raise DatasetError(f"The control points {control} do not exist.", "Check the path.")
+    training, mask_regions = settings.training, settings.mask_regions
     if command == "wrap":
+        listed = json.dumps(list(bodies.values()), sort_keys=True)
         weighted = training.region_weight != 1.0 and bodies
-        focus = json.dumps(list(bodies.values()), sort_keys=True) if weighted else ""
-        training = replace(training, focus=focus)
+        training = replace(training, focus=listed if weighted else "")
+        mask_regions = listed if _makes_masks_of_regions(settings, source, bodies) else ""
     settings = replace(
         settings,
         training=training,
+        mask_regions=mask_regions,
+        mask_model=str(real_path(settings.mask_model)) if settings.mask_model else "",
         regions=tuple(names),
         start_splat=str(real_path(start)) if start else "",
+        control_points=str(real_path(control)) if control else "",
     )
     return JobFile(command, str(real_path(source)), settings, bodies, lengths)
+
+
+def _makes_masks_of_regions(settings: JobSettings, source: Path, bodies: Mapping[str, Any]) -> bool:
+    """Return whether masks are made of region files; raise where the job could make none."""
+    if not settings.masks_are_made:
+        return False
+    if source.suffix.lower() == ".ply":
+        raise UsageError(
+            "A splat alone has no photos that masks could be made for.", "Leave the masks out."
+        )
+    if settings.mask_model:
+        check_model_file(Path(settings.mask_model))
+        if settings.make_masks != "off":
+            raise UsageError(
+                "Masks are made of regions or by a model, not both.",
+                "Give --make-masks region or --mask-model.",
+            )
+        return False
+    if not bodies:
+        raise UsageError(
+            "Masks of a region need a region file: the automatic region is no object's.",
+            "Give --region REGION.json with a box around the object.",
+        )
+    return True
 
 
 def _settings_of(values: Any) -> JobSettings:
@@ -179,16 +217,29 @@ def _check_bodies(settings: JobSettings, bodies: dict[str, Any]) -> None:
     if missing:
         raise UsageError(f"job.json holds no region {min(missing)!r}.", "Start the job again.")
     _check_regions(bodies)
-    if settings.training.focus:
-        try:
-            weighted = json.loads(settings.training.focus)
-        except (ValueError, RecursionError):
-            weighted = None
-        if not isinstance(weighted, list) or not weighted:
-            raise UsageError(
-                "job.json: settings.training.focus is no list of regions.", "Start the job again."
-            )
-        _check_regions({f"focus[{number}]": body for number, body in enumerate(weighted)})
+    if (settings.make_masks != "off") != bool(settings.mask_regions):
+        raise UsageError(
+            "job.json: settings.mask_regions does not fit make_masks.", "Start the job again."
+        )
+    for where, text in (
+        ("training.focus", settings.training.focus), ("mask_regions", settings.mask_regions),
+    ):  # fmt: skip
+        if text:
+            _check_region_list(where, text)
+
+
+def _check_region_list(where: str, text: str) -> None:
+    """Raise for a setting that is no JSON list of region bodies."""
+    try:
+        listed = json.loads(text)
+    except (ValueError, RecursionError):
+        listed = None
+    if not isinstance(listed, list) or not listed:
+        raise UsageError(
+            f"job.json: settings.{where} is no list of regions.", "Start the job again."
+        )
+    name = where.rpartition(".")[2]
+    _check_regions({f"{name}[{number}]": body for number, body in enumerate(listed)})
 
 
 def _check_regions(bodies: dict[str, Any]) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 
 from ...dataset.frames.file_frame import FileFrame
 from ...dataset.similarity import Similarity
+from ...dataset.units.real_units import metric_from_world
 from ...errors import WrapError
 from ...files import finite_json, read_json, write_json
 from ...names import AUTOMATIC_REGIONS
@@ -62,18 +63,37 @@ def write_sidecar(
     contents : dict
         Content of the file: region, level, shading, number of vertices and faces, textures.
     """
+    units = _units(result, frame, world_from_scene)
+    in_metres = units is not None and units["applied"]
+    unit = "metre" if in_metres else "unit of the input"
     values = {
         "version": VERSION,
         "file": path.name,
         "format": frame.format,
         "placed": placed,
-        "unit": "metre, as placed in Blender" if placed else "unit of the input",
+        "unit": "metre, as placed in Blender" if placed else unit,
         **frame.to_json(world_from_scene, blender_from_scene),
+        **({} if units is None else {"georeference": units}),
         **contents,
         **_source(result, contents.get("region")),
         "made_with": _versions(),
     }
     write_json(sidecar_path(path), finite_json(values))
+
+
+def _units(result: Path, frame: FileFrame, world_from_scene: Similarity) -> dict[str, Any] | None:
+    """Return the result's entry ``georeference``, with the way there from the file."""
+    try:
+        record = read_json(result / "scene.json").get("georeference")
+    except (OSError, WrapError, AttributeError):
+        return None
+    metric = metric_from_world(record)
+    if metric is None:
+        return None
+    metric_from_scene = metric.after(world_from_scene)
+    metric_from_file = metric_from_scene.after(frame.file_from_scene().inverse())
+    applied = bool(record.get("applied"))
+    return {**record, "applied": applied, "metric_from_file": metric_from_file.to_json()}
 
 
 def _source(result: Path, region: Any) -> dict[str, Any]:
@@ -86,6 +106,7 @@ def _source(result: Path, region: Any) -> dict[str, Any]:
             settings = to_json(job.settings)
             settings["regions"] = [_name(r) for r in job.settings.regions]
             settings["start_splat"] = _name(job.settings.start_splat)
+            settings["control_points"] = _name(job.settings.control_points)
             out["job"] = {
                 "name": result.parent.name, "command": job.command, "source": _name(job.source),
                 "settings": settings,

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ... import limits
+from ...dataset.photos.image_formats import PHOTO_SUFFIXES
 from ...errors import DatasetError, ParseError
 from ...files import read_json, write_json
 from ...progress import Progress
@@ -25,12 +26,15 @@ _logger = logging.getLogger(__name__)
 # Keys of later stages hold those of earlier ones. Finished trainings can be meshed and trained on
 # whatever the number of their cameras; with another number of their own they cannot: a training
 # that comes out better now keeps its number.
-STAGE_VERSIONS = {"cameras": 3, "train": 6, "mesh": 11, "texture": 13, "bake": 3}
+STAGE_VERSIONS = {
+    "frames": 1, "cameras": 3, "masks": 1, "masked": 1, "train": 6, "mesh": 11, "texture": 13,
+    "bake": 3,
+}  # fmt: skip
 
 DONE_NAME = "done.json"
 HASH_CHARACTERS = 12
 INPUT_SUFFIXES = (
-    ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".bin", ".txt", ".json", ".ply",
+    *PHOTO_SUFFIXES, ".bin", ".txt", ".json", ".ply", ".sfm", ".xml", ".csv", ".geojson", ".xmp",
 )  # fmt: skip
 
 
@@ -45,6 +49,8 @@ class Stage:
     done: dict[str, Any]
     """Content of ``done.json``: the stage's measurements."""
     reused: bool
+    before: tuple[Stage, ...] = ()
+    """Stages that it takes the place of, for the report: cameras and masks of a masked scene."""
 
 
 def stage_key(*parts: Any) -> str:

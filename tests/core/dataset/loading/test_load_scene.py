@@ -236,6 +236,23 @@ def test_masks_of_every_name_and_alpha(tmp_path: Path) -> None:
     assert scene.facts["photos_masked"] == 3
 
 
+def test_a_photo_that_the_model_names_is_no_mask_of_another(tmp_path: Path) -> None:
+    source = project(tmp_path, count=5)
+    images = source / "images"
+    # p01 becomes "p00_mask.png": the model and the disk know it as a photo.
+    for file in (source / "sparse" / "0").iterdir():
+        file.write_bytes(file.read_bytes().replace(b"p01.png", b"p00_mask.png"))
+    (images / "p01.png").rename(images / "p00_mask.png")
+    half = np.zeros((HEIGHT, WIDTH), np.uint8)
+    half[:, : WIDTH // 2] = 255
+    Image.fromarray(half).save(images / "p02_mask.png")  # this one is no photo of the model
+    scene = load(source)
+    masked = {v.camera.name: v.mask_path for v in scene.views}
+    assert sorted(masked) == ["p00.png", "p00_mask.png", "p02.png", "p03.png", "p04.png"]
+    assert [name for name, path in masked.items() if path] == ["p02.png"]
+    assert scene.facts["photos_masked"] == 1
+
+
 def test_masks_are_undistorted_with_their_photos(tmp_path: Path) -> None:
     source = project(tmp_path, model="OPENCV", params=[60, 60, 32, 24, -0.2, 0.0, 0.0, 0.0])
     (source / "masks").mkdir()
@@ -307,12 +324,14 @@ def test_refusals_come_at_once(tmp_path: Path) -> None:
     (tmp_path / "phone").mkdir()
     for name in ("IMG_1.HEIC", "IMG_2.dng"):
         (tmp_path / "phone" / name).write_bytes(b"compressed")
+    for name in ("a.png", "b.png"):
+        Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(tmp_path / "phone" / name)
     (tmp_path / "a.txt").write_text("a file")
     cases = {
         "gone": "does not exist",
         "empty": "holds no photos",
         "texts": "holds no photos",
-        "phone": "no photo that can be read, but 2 HEIC or RAW files",
+        "phone": " of 4 photos cannot be read. First: IMG_1.HEIC",
         "a.txt": "is a file, but not a transforms.json",
     }
     for name in ("one", "two"):

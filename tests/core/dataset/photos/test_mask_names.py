@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from gaussian_wrapping_addon.core.dataset.loading.source_kind import source_kind
 from gaussian_wrapping_addon.core.dataset.photos.photo_finder import find_mask, list_photos
-from gaussian_wrapping_addon.core.dataset.readers.source_kind import source_kind
 
 
 def put(*paths: Path) -> None:

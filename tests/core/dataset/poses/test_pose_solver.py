@@ -18,7 +18,6 @@ from gaussian_wrapping_addon.core.dataset.loading.start_points import (
     random_points,
 )
 from gaussian_wrapping_addon.core.dataset.photos.photo_exif import read_lens_exif
-from gaussian_wrapping_addon.core.dataset.poses.match_pairs import pairs_by_order, pairs_by_pose
 from gaussian_wrapping_addon.core.dataset.quaternion import quaternion_from_rotation
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
@@ -41,24 +40,6 @@ def small_bananas(folder: Path, long_side: int = 400) -> Path:
             small = image.resize(size, Image.Resampling.LANCZOS)
         small.save(folder / f"{name}.jpg", quality=95, exif=exif)
     return folder
-
-
-def test_pairs_of_small_and_large_sets() -> None:
-    assert pairs_by_order(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
-    pairs = pairs_by_order(1000)
-    assert len(pairs) < 25_000
-    assert all(0 <= i < j < 1000 for i, j in pairs)
-    assert len(set(pairs)) == len(pairs)
-    assert {(i, i + 1) for i in range(999)} <= set(pairs)
-    assert (0, 999) in pairs
-
-
-def test_pairs_by_pose_join_neighbours_that_look_alike() -> None:
-    angles = np.arange(40) * 2 * np.pi / 40
-    centers = np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
-    pairs = pairs_by_pose(centers, -centers)
-    assert {(i, i + 1) for i in range(39)} | {(0, 39)} <= set(pairs)
-    assert all(min(j - i, 40 - j + i) <= 7 for i, j in pairs)
 
 
 def test_focal_length_from_exif(tmp_path: Path) -> None:

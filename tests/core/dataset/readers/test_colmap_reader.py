@@ -17,7 +17,7 @@ from gaussian_wrapping_addon.core.dataset.quaternion import (
     rotation_from_quaternion,
 )
 from gaussian_wrapping_addon.core.dataset.readers.colmap_reader import read_colmap
-from gaussian_wrapping_addon.core.dataset.readers.source_model import LENS_PARAMETERS
+from gaussian_wrapping_addon.core.dataset.readers.source_model import LENS_NAMES, LENS_PARAMETERS
 from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, DatasetError, ParseError
 from tests.core.dataset.model_writers import (
     HEIGHT,
@@ -202,7 +202,7 @@ def test_wrong_number_of_parameters_and_unknown_name_in_text(tmp_path: Path) -> 
         read_colmap(folder)
 
 
-@pytest.mark.parametrize("kind", sorted(LENS_PARAMETERS))
+@pytest.mark.parametrize("kind", sorted(LENS_NAMES))
 def test_every_lens_model_is_known(tmp_path: Path, kind: str) -> None:
     names = LENS_PARAMETERS[kind]
     values = {"f": 60.0, "fx": 60.0, "fy": 61.0, "cx": 32.0, "cy": 24.0}

@@ -379,3 +379,29 @@ def test_where_the_job_computed_and_why_is_said(
     assert line in report_markdown(report, tmp_path).splitlines()
     del report["device"]  # as version 0.1.0 wrote it
     assert "- Device" not in report_markdown(report, tmp_path)
+
+
+def test_metres_and_how_well_they_are_known_are_said(tmp_path: Path) -> None:
+    gps = {"median_m": 0.351, "used": 18}
+    units = {
+        "sources": ["gps", "markers"], "applied": True, "scale_error": 0.0023, "gps": gps,
+        "markers": {"used": 7},
+        "origin": {"latitude_deg": 46.8426598, "longitude_deg": -91.9940031, "altitude_m": 198.6},
+    }  # fmt: skip
+    facts = {"kind": "photos", "georeference": units}
+    text = report_markdown({"cameras": {"facts": facts}}, tmp_path)
+    assert "One world unit is one metre." in text
+    assert "arbitrary length" not in text
+    assert row(text, "Metres from") == "gps, markers"
+    assert row(text, "Error of the scale (standard deviation)") == "0.23 %"
+    assert row(text, "Cameras off their known places, median") == "0.351 m"
+    assert row(text, "Markers measured") == "7 markers"
+    assert "46.842660, -91.994003" in row(text, "Origin: latitude, longitude (WGS 84)")
+    recorded = {"cameras": {"facts": {**facts, "georeference": {**units, "applied": False}}}}
+    assert "arbitrary length" in report_markdown(recorded, tmp_path)
+    broken = {"sources": 3, "applied": "yes", "gps": [], "origin": {"latitude_deg": "x"}}
+    text = report_markdown({"cameras": {"facts": {**facts, "georeference": broken}}}, tmp_path)
+    assert "arbitrary length" in text
+    note = {"kind": "photos", "georeference_note": "too little"}
+    text = report_markdown({"cameras": {"facts": note}}, tmp_path)
+    assert row(text, "GPS is not used") == "too little"

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from gaussian_wrapping_addon.core.dataset.loading.real_world import UnitsRequest
 from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.commands import estimate_mesh_command, worker_call
+from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import _units_key, run_cameras
 from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.job_file import (
     JobFile,
@@ -22,9 +24,10 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import (
     reject_region_conflicts,
     write_job,
 )
-from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER
+from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER, JobFolder
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import stage_key
 from gaussian_wrapping_addon.core.names import region_name, region_names
+from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings, preset
 
 
@@ -250,3 +253,49 @@ def test_impossible_lengths_are_refused(tmp_path: Path, lengths: object) -> None
     if isinstance(lengths, dict):
         with pytest.raises(UsageError, match="edge_lengths"):
             make_job("mesh", tmp_path, JobSettings(), lengths)
+
+
+def test_metres_in_a_job(tmp_path: Path) -> None:
+    points, splat = tmp_path / "gcp.txt", tmp_path / "a.ply"
+    points.write_text("LOCAL\n")
+    splat.write_bytes(b"ply\n")
+    plain = preset("draft")
+    settings = replace(plain, markers="4x4_50:0.05", control_points=str(points))
+    job = make_job("wrap", tmp_path, settings)
+    assert JobFile.from_json(job.to_json()) == job
+    assert job.settings.control_points == str(points)
+    with pytest.raises(DatasetError, match=r"control points .* do not exist"):
+        make_job("wrap", tmp_path, replace(plain, control_points=str(tmp_path / "none")))
+    for wrong in ("4x4_50", "5:0.1", "4x4_50:0"):
+        with pytest.raises(UsageError, match=r"markers is out of range. Give .*4x4_50:0.05"):
+            make_job("wrap", tmp_path, replace(plain, markers=wrong))
+    started = replace(plain, start_splat=str(splat))
+    assert make_job("wrap", tmp_path, started).settings.start_splat == str(splat)
+    for change in ({"markers": "4x4_50:1"}, {"georeference": "on"}):
+        with pytest.raises(UsageError, match="A splat to start from lies in the frame"):
+            make_job("wrap", tmp_path, replace(started, **change))
+
+
+def test_metres_in_the_key_of_the_cameras(tmp_path: Path) -> None:
+    points = tmp_path / "gcp.txt"
+    assert _units_key(UnitsRequest()) == []
+    keys = [
+        _units_key(UnitsRequest(georeference="off")),
+        _units_key(UnitsRequest(markers="4x4_50:0.05")),
+        _units_key(UnitsRequest(control_points=str(points))),
+    ]
+    points.write_text("LOCAL\n")
+    keys.append(_units_key(UnitsRequest(control_points=str(points))))
+    points.write_text("EPSG:4326\n")
+    keys.append(_units_key(UnitsRequest(control_points=str(points))))
+    assert len({tuple(key) for key in keys}) == 5
+
+
+def test_a_splat_has_nothing_to_tell_its_size_by(tmp_path: Path) -> None:
+    source = tmp_path / "a.ply"
+    source.write_bytes(b"ply\n")
+    folder = JobFolder(tmp_path / "job")
+    folder.stages.mkdir(parents=True)
+    job = JobFile("wrap", str(source), replace(preset("draft"), markers="4x4_50:0.05"))
+    with pytest.raises(UsageError, match="A splat has no photos to tell its size by"):
+        run_cameras(folder, job, Progress(), threads=1)

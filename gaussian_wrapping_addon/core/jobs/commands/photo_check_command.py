@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The part of ``check`` that decodes photos, in the worker's Python.
+
+Writes one JSON object per line to stdout, in the protocol of :mod:`~.run_in_worker`, with each
+finding as ``{"line", "finding"}``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+from ...dataset.quality.photo_findings import photo_findings
+from ...processes.helper_process import emit
+from ...progress import Progress, ProgressEvent
+from .worker_call import run_command
+
+
+def main(arguments: list[str]) -> int:
+    """Look at the photos of ``arguments = [request as JSON]``; return the exit code."""
+    request = json.loads(arguments[0])
+    return run_command(lambda: _look(Path(request["source"]), int(request["threads"])))
+
+
+def _look(source: Path, threads: int) -> Iterator[str]:
+    found = photo_findings(source, Progress("check", _say), threads=threads)
+    for finding in found:
+        emit(finding=asdict(finding))
+        yield f"{finding.severity}: {finding.message} {finding.hint}".rstrip()
+    yield "fact: All photos were looked at."
+
+
+def _say(event: ProgressEvent) -> None:
+    emit(fraction=event.fraction, message=event.message)

@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A running job outside of the panel: points in the 3D view, progress in the status bar."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import bpy
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon.core.gaussians.preview_points import POINT, POINTS_FILE, points_file
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
+from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer, live_points, watched_jobs
+from gaussian_wrapping_addon.ops.results.scene_objects import import_result
+from gaussian_wrapping_addon.ui.jobs import points_drawing, status_bar
+from tests.blender.fake_layout import FakeLayout
+from tests.blender.synthetic_result import write_result
+
+pytestmark = pytest.mark.usefixtures("addon")
+
+RUNNING = JobStatus("RUNNING", "train", 0.3, "iteration 750/3000", 90.0)
+
+
+class Client:
+    """Answers with the status that a test sets."""
+
+    def __init__(self, status: JobStatus) -> None:
+        self.status = status
+
+    def poll(self) -> JobStatus:
+        return self.status
+
+
+def watch(folder: Path, status: JobStatus = RUNNING, scene: Any = None) -> Client:
+    client = Client(status)
+    scene = scene or bpy.context.scene
+    job_timer.watch(scene, folder, client, imports=False)  # type: ignore[arg-type]
+    return client
+
+
+def write_points(folder: Path, count: int = 5, data: bytes | None = None) -> Path:
+    points = np.zeros(count, POINT)
+    points["position"][:, 0] = np.arange(count)
+    points["color"] = (255, 0, 51, 255)
+    path = folder / "stages" / "train-now" / POINTS_FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(points_file(points) if data is None else data)
+    return path
+
+
+def look(folder: Path) -> None:
+    """Let the timer search, wait for the reading, and let it take what was read."""
+    live_points._shown.setdefault(str(folder), live_points._Shown()).searched_s = float("-inf")
+    job_timer.poll_jobs()
+    reading = live_points._shown[str(folder)].reading
+    assert reading is not None
+    assert reading.finished(20.0)
+    job_timer.poll_jobs()
+
+
+def count() -> int | None:
+    points = live_points.points_of(bpy.context.scene)
+    return None if points is None else len(points.positions)
+
+
+def test_points_follow_the_file_the_job_and_the_checkbox(tmp_path: Path) -> None:
+    client = watch(tmp_path)
+    assert count() is None
+    path = write_points(tmp_path, 5)
+    look(tmp_path)
+    points = live_points.points_of(bpy.context.scene)
+    assert points is not None
+    assert points.positions[:, 0].tolist() == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose(points.colors, np.tile((1, 0, 0.2, 1), (5, 1)), atol=1e-6)
+    write_points(tmp_path, 7)
+    look(tmp_path)
+    assert count() == 7
+    for bad in (b"", b"PK", points_file(np.zeros(3, POINT))[:-1], b"\x93NUMPY" * 400_000):
+        write_points(tmp_path, data=bad)
+        look(tmp_path)
+        assert count() == 7, "a broken file changes nothing"
+    bpy.context.scene.gwrap.show_points = False
+    assert count() is None
+    bpy.context.scene.gwrap.show_points = True
+    assert count() == 7
+    other = bpy.data.scenes.new("other")
+    assert live_points.points_of(other) is None, "only where the job is"
+    client.status = replace(RUNNING, stage="mesh")
+    job_timer.poll_jobs()
+    assert count() is None, "the training is over"
+    client.status = replace(RUNNING, state="CANCELLED")
+    job_timer.poll_jobs()
+    assert live_points._shown == {}
+    assert path.exists()
+
+
+@pytest.mark.parametrize("where", ["link", "done", "elsewhere"])
+def test_points_of_nothing_that_runs_are_not_read(tmp_path: Path, where: str) -> None:
+    path = write_points(tmp_path)
+    if where == "link":
+        path.rename(tmp_path / "there.npy")
+        path.symlink_to(tmp_path / "there.npy")
+    elif where == "done":
+        (path.parent / "done.json").write_text("{}")
+    else:
+        path.rename(path.parent.with_name("mesh-now.npy"))
+    watch(tmp_path)
+    look(tmp_path)
+    assert count() is None
+
+
+def test_another_file_shows_neither_points_nor_progress(tmp_path: Path) -> None:
+    write_points(tmp_path)
+    watch(tmp_path)
+    look(tmp_path)
+    assert count() == 5
+    assert len(status_bar.running_jobs()) == 1
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    job_attach.attach_open_file()
+    assert count() is None
+    assert status_bar.running_jobs() == []
+
+
+def test_points_lie_where_the_result_will_be(tmp_path: Path) -> None:
+    watch(tmp_path / "job")
+    assert live_points.frame_of_job(bpy.context.scene) is None
+    import_result(write_result(tmp_path / "elsewhere"), bpy.context.scene)
+    assert live_points.frame_of_job(bpy.context.scene) is None, "another job's result"
+    imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
+    assert live_points.frame_of_job(bpy.context.scene) == imported.frame
+
+
+class Gpu:
+    """Stands for Blender's modules ``gpu`` and ``gpu_extras.batch``, and notes what is drawn."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, known: str = "FLAT_COLOR") -> None:
+        self.drawn: list[tuple[np.ndarray, np.ndarray | None]] = []
+        self.matrix_now: np.ndarray | None = None
+        self.made = 0
+        batch = SimpleNamespace(draw=lambda _shader: self.drawn.append((self.pos, self.matrix_now)))
+
+        def from_builtin(name: str) -> str:
+            if name != known:
+                raise ValueError(name)
+            return name
+
+        def for_shader(_shader: object, kind: str, values: dict[str, np.ndarray]) -> object:
+            assert kind == "POINTS"
+            assert values["color"].shape[1] == 4
+            self.pos = values["pos"]
+            self.made += 1
+            return batch
+
+        state = SimpleNamespace(
+            depth_test_set=lambda _v: None, point_size_set=lambda _v: None,
+        )  # fmt: skip
+        gpu = SimpleNamespace(
+            shader=SimpleNamespace(from_builtin=from_builtin), state=state, matrix=self,
+        )  # fmt: skip
+        monkeypatch.setitem(__import__("sys").modules, "gpu", gpu)
+        extras = SimpleNamespace(batch_for_shader=for_shader)
+        monkeypatch.setitem(__import__("sys").modules, "gpu_extras.batch", extras)
+
+    def push_pop(self) -> Gpu:
+        return self
+
+    def __enter__(self) -> None:
+        self.matrix_now = None
+
+    def __exit__(self, *_error: object) -> None:
+        self.matrix_now = None
+
+    def multiply_matrix(self, matrix: object) -> None:
+        self.matrix_now = np.array(matrix)
+
+
+def context(*, overlays: bool = True) -> Any:
+    space = SimpleNamespace(overlay=SimpleNamespace(show_overlays=overlays))
+    return SimpleNamespace(
+        space_data=space, scene=bpy.context.scene, preferences=bpy.context.preferences
+    )
+
+
+@pytest.mark.parametrize("known", points_drawing.SHADERS)
+def test_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known: str) -> None:
+    gpu = Gpu(monkeypatch, known)
+    points_drawing._draw(context())
+    assert gpu.drawn == []
+    write_points(tmp_path / "job")
+    watch(tmp_path / "job")
+    look(tmp_path / "job")
+    points_drawing._draw(context(overlays=False))
+    assert gpu.drawn == []
+    points_drawing._draw(context())
+    points_drawing._draw(context())
+    assert gpu.made == 1, "one batch for as long as the points are the same"
+    assert [matrix for _, matrix in gpu.drawn] == [None, None]
+    imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
+    imported.frame.location = (1, 2, 3)
+    bpy.context.view_layer.update()
+    points_drawing._draw(context())
+    matrix = gpu.drawn[-1][1]
+    assert matrix is not None
+    assert matrix[:3, 3].tolist() == [1, 2, 3]
+    bpy.context.scene.gwrap.show_points = False
+    points_drawing._draw(context())
+    assert len(gpu.drawn) == 3
+    assert points_drawing._drawing.batch is None, "the GPU's memory is given back"
+
+
+def test_an_error_while_drawing_is_logged_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(*_arguments: object) -> None:
+        raise RuntimeError("no context")
+
+    monkeypatch.setattr(points_drawing, "_draw", broken)
+    monkeypatch.setattr(status_bar, "_draw", broken)
+    with caplog.at_level(logging.ERROR):
+        for _ in range(3):
+            points_drawing.draw()
+            status_bar.draw(SimpleNamespace(layout=None), bpy.context)
+    assert [r.message for r in caplog.records] == [
+        "points cannot be drawn", "progress cannot be drawn",
+    ]  # fmt: skip
+
+
+def bar() -> FakeLayout:
+    layout = FakeLayout()
+    status_bar.draw(SimpleNamespace(layout=layout), bpy.context)
+    return layout
+
+
+@pytest.mark.parametrize("state", ["NEW", "RUNNING", "CANCELLING"])
+def test_a_running_job_is_in_the_status_bar(tmp_path: Path, state: str) -> None:
+    assert bar().log == []
+    client = watch(tmp_path, replace(RUNNING, state=state, fraction=0.256))
+    (name, _, keywords) = bar().log[-1]
+    assert name == "progress"
+    assert keywords["text"] == "Train · 26 % · 1 min 30 s left"
+    assert keywords["factor"] == 0.256
+    for ended in ("DONE", "CANCELLED", "FAILED", "LOST"):
+        client.status = replace(RUNNING, state=ended)
+        watched_jobs.jobs[str(tmp_path)].status = client.status
+        assert bar().log == []
+
+
+def test_the_newest_of_several_jobs_is_shown_and_the_others_are_counted(tmp_path: Path) -> None:
+    watch(tmp_path / "a")
+    watch(tmp_path / "b", replace(RUNNING, fraction=1.7), bpy.data.scenes.new("other"))
+    (_, _, keywords) = bar().log[-1]
+    assert keywords["text"] == "Train · 100 % · 1 min 30 s left (+1)"
+    assert keywords["factor"] == 1.0
+
+
+def test_nothing_stays_in_the_status_bar(addon: Any) -> None:
+    functions = bpy.types.STATUSBAR_HT_header._dyn_ui_initialize()
+    assert functions.count(status_bar.draw) == 1
+    addon.register()
+    assert functions.count(status_bar.draw) == 1
+    addon.unregister()
+    assert functions.count(status_bar.draw) == 0
+    assert points_drawing._drawing.handle is None
