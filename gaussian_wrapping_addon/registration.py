@@ -99,8 +99,8 @@ def register() -> None:
         for name, handler in HANDLERS:
             getattr(bpy.app.handlers, name).append(handler)
         table.register()
-        region_drawing.start()
-        points_drawing.start()
+        region_drawing.VIEW.start()
+        points_drawing.VIEW.start()
         status_bar.start()
         cli_command.register(batch.main)
         # While Blender starts, scripts may not see the open file yet.
@@ -115,8 +115,8 @@ def unregister() -> None:
     worker_setup.stop()
     training_estimate.forget()
     region_estimate.stop()
-    region_drawing.stop()
-    points_drawing.stop()
+    region_drawing.VIEW.stop()
+    points_drawing.VIEW.stop()
     status_bar.stop()
     region_gizmo.stop()
     region_watch.forget()

@@ -194,7 +194,7 @@ def test_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known: s
     write_points(tmp_path / "job")
     watch(tmp_path / "job")
     look(tmp_path / "job")
-    points_drawing._draw(context(overlays=False))
+    points_drawing.VIEW.draw(context(overlays=False))
     assert gpu.drawn == []
     points_drawing._draw(context())
     points_drawing._draw(context())
@@ -223,7 +223,7 @@ def test_an_error_while_drawing_is_logged_once(
     monkeypatch.setattr(status_bar, "_draw", broken)
     with caplog.at_level(logging.ERROR):
         for _ in range(3):
-            points_drawing.draw()
+            points_drawing.VIEW.draw(context())
             status_bar.draw(SimpleNamespace(layout=None), bpy.context)
     assert [r.message for r in caplog.records] == [
         "points cannot be drawn", "progress cannot be drawn",
@@ -265,4 +265,4 @@ def test_nothing_stays_in_the_status_bar(addon: Any) -> None:
     assert functions.count(status_bar.draw) == 1
     addon.unregister()
     assert functions.count(status_bar.draw) == 0
-    assert points_drawing._drawing.handle is None
+    assert points_drawing.VIEW.handle is None

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from types import SimpleNamespace
 from typing import Any
 
 import bpy
@@ -126,15 +127,15 @@ def test_edges_are_made_anew_only_where_the_shape_changes(monkeypatch: pytest.Mo
 
 
 def test_the_handler_goes_with_the_addon(addon: Any) -> None:
-    assert region_drawing._drawing.handle is not None
-    handle = region_drawing._drawing.handle
+    assert region_drawing.VIEW.handle is not None
+    handle = region_drawing.VIEW.handle
     addon.unregister()
-    assert region_drawing._drawing.handle is None
+    assert region_drawing.VIEW.handle is None
     assert not region_drawing._drawing.batches
     with pytest.raises((ValueError, RuntimeError)):
         bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
     addon.register()
-    assert region_drawing._drawing.handle is not None
+    assert region_drawing.VIEW.handle is not None
 
 
 def test_an_error_while_drawing_is_told_once(
@@ -144,8 +145,9 @@ def test_an_error_while_drawing_is_told_once(
         raise RuntimeError("no such shader")
 
     monkeypatch.setattr(region_drawing, "_draw", broken)
+    space = SimpleNamespace(overlay=SimpleNamespace(show_overlays=True))
     with caplog.at_level(logging.ERROR):
         for _ in range(3):
-            region_drawing.draw()
+            region_drawing.VIEW.draw(SimpleNamespace(space_data=space))
     assert [r.getMessage() for r in caplog.records] == ["regions cannot be drawn"]
     assert "no such shader" in caplog.text

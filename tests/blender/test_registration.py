@@ -28,7 +28,7 @@ def left_behind() -> list[str]:
             found += [name for h in handlers if "gaussian_wrapping" in h.__module__]
     bar = bpy.types.STATUSBAR_HT_header._dyn_ui_initialize()
     found += [f.__name__ for f in bar if "gaussian_wrapping" in f.__module__]
-    found += ["points"] if points_drawing._drawing.handle is not None else []
+    found += ["points"] if points_drawing.VIEW.handle is not None else []
     if bpy.app.timers.is_registered(background.poll):
         found.append("poll")
     return found

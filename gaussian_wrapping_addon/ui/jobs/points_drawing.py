@@ -7,7 +7,6 @@ mode) Blender never calls it.
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -16,8 +15,7 @@ import bpy
 from ...ops.jobs import live_points
 from ...ops.jobs.live_points import LivePoints
 from ...ops.jobs.live_preview import Stamp
-
-_logger = logging.getLogger(__name__)
+from ..common.view_drawing import ViewDrawing
 
 SHADERS: Final = ("POINT_FLAT_COLOR", "FLAT_COLOR")
 """Blender 4.5 and later have a shader of their own for points."""
@@ -26,44 +24,15 @@ SIZE_PX: Final = 2.5
 
 @dataclass
 class _Drawing:
-    handle: Any = None
     shader: Any = None
     stamp: Stamp | None = None
     batch: Any = None
-    failed: bool = False
 
 
 _drawing = _Drawing()
 
 
-def start() -> None:
-    """Start drawing."""
-    stop()
-    _drawing.handle = bpy.types.SpaceView3D.draw_handler_add(draw, (), "WINDOW", "POST_VIEW")
-
-
-def stop() -> None:
-    """Stop drawing; the shader and the batch are made again next time."""
-    if _drawing.handle is not None:
-        bpy.types.SpaceView3D.draw_handler_remove(_drawing.handle, "WINDOW")
-    _drawing.handle, _drawing.shader, _drawing.failed = None, None, False
-    _drawing.stamp, _drawing.batch = None, None
-
-
-def draw() -> None:
-    """Draw the points of one view; Blender calls this. An error is logged once."""
-    try:
-        _draw(bpy.context)
-    except Exception:  # an exception here would recur at every redraw
-        if not _drawing.failed:
-            _logger.exception("points cannot be drawn")
-        _drawing.failed = True
-
-
 def _draw(context: bpy.types.Context) -> None:
-    space: Any = context.space_data
-    if space is None or not space.overlay.show_overlays:
-        return
     points = live_points.points_of(context.scene)
     if points is None:
         _drawing.stamp, _drawing.batch = None, None  # frees the GPU's memory after the training
@@ -106,3 +75,10 @@ def _point_shader() -> Any:
         except ValueError:  # an older Blender
             continue
     return gpu.shader.from_builtin(SHADERS[-1])
+
+
+def _forget() -> None:
+    _drawing.shader, _drawing.stamp, _drawing.batch = None, None, None
+
+
+VIEW: Final = ViewDrawing("points", lambda context: _draw(context), _forget)

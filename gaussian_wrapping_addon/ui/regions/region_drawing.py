@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -14,8 +13,7 @@ from ...core.errors import WrapError
 from ...core.regions.box import hull_edges
 from ...ops.regions import region_watch
 from ...ops.regions.region_objects import local_hull
-
-_logger = logging.getLogger(__name__)
+from ..common.view_drawing import ViewDrawing
 
 SHADER: Final = "POLYLINE_UNIFORM_COLOR"
 WIDTH_PX: Final = 3.0
@@ -30,38 +28,12 @@ MOST_CACHED: Final = 200
 
 @dataclass
 class _Drawing:
-    handle: Any = None
     shader: Any = None
     batches: dict[tuple[object, ...], Any] = field(default_factory=dict)
     """By what decides the shape; None where there is nothing to draw."""
-    failed: bool = False
 
 
 _drawing = _Drawing()
-
-
-def start() -> None:
-    """Start drawing."""
-    stop()
-    _drawing.handle = bpy.types.SpaceView3D.draw_handler_add(draw, (), "WINDOW", "POST_VIEW")
-
-
-def stop() -> None:
-    """Stop drawing; shaders and batches are recreated next time."""
-    if _drawing.handle is not None:
-        bpy.types.SpaceView3D.draw_handler_remove(_drawing.handle, "WINDOW")
-    _drawing.handle, _drawing.shader, _drawing.failed = None, None, False
-    _drawing.batches.clear()
-
-
-def draw() -> None:
-    """Draw the regions of one view; Blender calls this. An error is logged once."""
-    try:
-        _draw(bpy.context)
-    except Exception:  # an exception here would recur at every redraw
-        if not _drawing.failed:
-            _logger.exception("regions cannot be drawn")
-        _drawing.failed = True
 
 
 def visible_regions(
@@ -95,8 +67,6 @@ def edges_of(thing: bpy.types.Object) -> np.ndarray | None:
 
 def _draw(context: bpy.types.Context) -> None:
     space: Any = context.space_data
-    if space is None or not space.overlay.show_overlays:
-        return
     things = visible_regions(context.scene, context.view_layer, space)
     if not things:
         return
@@ -144,3 +114,11 @@ def _made(edges: np.ndarray | None) -> Any:
     if edges is None:
         return None
     return batch_for_shader(_drawing.shader, "LINES", {"pos": edges.reshape(-1, 3)})
+
+
+def _forget() -> None:
+    _drawing.shader = None
+    _drawing.batches.clear()
+
+
+VIEW: Final = ViewDrawing("regions", lambda context: _draw(context), _forget)
