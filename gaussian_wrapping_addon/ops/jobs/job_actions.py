@@ -17,7 +17,7 @@ from ...core.jobs.store.rollback import finished_job
 from ...core.jobs.store.stage_folder import read_done
 from ...core.names import AUTOMATIC_REGIONS, region_name, region_names
 from ...core.regions.region_file import read_region_file
-from ...core.settings import with_values
+from ...core.settings import JobSettings, with_values
 from ..common import tags
 from ..common.addon import properties_of
 from ..regions.region_objects import export_region
@@ -70,14 +70,39 @@ def start_mesh(
     _require_training(folder)
     refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
-    properties = properties_of(scene)
+    changed = {"threads": choice.threads, "device": choice.device}
+    settings = with_values(earlier.settings, changed)
+    return start_on_regions(scene, regions, choice, "mesh", earlier.source, settings)
+
+
+def start_on_regions(
+    scene: bpy.types.Scene,
+    regions: list[bpy.types.Object],
+    choice: WorkerChoice,
+    command: str,
+    source: str,
+    settings: JobSettings,
+) -> Path:
+    """Start a job in the folder of a result that meshes regions; return the folder.
+
+    Parameters
+    ----------
+    regions : list of Object
+        Region objects under the frame of the result.
+    command : str
+        Of the job.
+    source : str
+        Input of the job.
+    settings : JobSettings
+        Those of the regions, of meshing and texture are taken from the scene.
+    """
+    frame = common_frame(regions)
+    folder = job_folder_of(frame)
     own = own_lengths(scene, regions, frame)
     requests = export_requests(regions, frame, folder)
     settings = with_values(
-        earlier.settings,
+        settings,
         {
-            "threads": choice.threads,
-            "device": choice.device,
             "regions": tuple(requests),
             **meshing_choices(scene, world_per_blender(frame)),
             **texture_choices(scene),
@@ -86,16 +111,14 @@ def start_mesh(
     lengths = {
         request: length for request, length in zip(requests, own, strict=True) if length is not None
     }
-    job = make_job("mesh", Path(earlier.source), settings, lengths)
+    job = make_job(command, Path(source), settings, lengths)
     names = region_names(job.settings.regions, job.region_bodies)
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
     )
     for region, name in zip(regions, names, strict=True):
-        region[tags.REGION] = (
-            name  # so that the import finds this box and does not add a second one
-        )
-    properties.job_command = "MESH"
+        region[tags.REGION] = name  # the import finds this box and adds no second one
+    properties_of(scene).job_command = command.upper()
     job_timer.watch(scene, folder, client)
     return folder
 
