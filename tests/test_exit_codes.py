@@ -166,7 +166,7 @@ def test_input_that_cannot_be_used(place: Path, words: str) -> None:
 def test_a_command_line_that_is_wrong(
     place: Path, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(check, "check_input", lambda *_: [])
+    monkeypatch.setattr(check, "check_input", lambda *_, **_keywords: [])
     (place / "trained" / "result").mkdir()
     identity = {"scale": 1.0, "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
                 "translation": [0, 0, 0]}  # fmt: skip
@@ -190,7 +190,7 @@ def test_a_place_that_cannot_be_written(
     place: Path, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Root may write anywhere: here a folder stands where the file is to be, or a file is above."""
-    monkeypatch.setattr(check, "check_input", lambda *_: [])
+    monkeypatch.setattr(check, "check_input", lambda *_, **_keywords: [])
     (place / "trained" / "status.json").mkdir()
     (place / "trained" / "result").mkdir()
     identity = {"scale": 1.0, "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],

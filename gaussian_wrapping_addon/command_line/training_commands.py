@@ -48,12 +48,12 @@ def _wrap(options: Namespace) -> int:
     job = make_job("wrap", options.input, region_settings(settings, options))
     require_bpy(job, options)
     require_device(job.settings.device)
+    _reject_frames_of_photos(job)
     for finding in check_input(options.input, worker=worker_if_any()):
         if finding.severity == "error":
             raise DatasetError(finding.message, finding.hint)
         if finding.severity == "warning":
             _logger.warning("warning: %s %s", finding.message, finding.hint)
-    _reject_frames_of_photos(job)
     return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
 
 

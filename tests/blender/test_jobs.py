@@ -11,13 +11,14 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import bpy
 import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core import limits
+from gaussian_wrapping_addon.core.dataset.loading.check import Finding
 from gaussian_wrapping_addon.core.devices import choice
 from gaussian_wrapping_addon.core.errors import DeviceError
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
@@ -337,11 +338,11 @@ def test_a_deleted_job_folder_is_survived(photos: Path, worker: Callable[[str], 
 
 def test_check_photos_lists_findings(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = [
-        SimpleNamespace(severity="error", message="Only 1 photo.", hint="Take more.", short=""),
-        SimpleNamespace(severity="warning", message="w" * 200, hint="", short=""),
+        Finding("error", "Only 1 photo.", "Take more."),
+        Finding("warning", "w" * 200),
     ]
     check = ModuleType("check")
-    check.check_input = lambda source: found if source == photos else []  # type: ignore[attr-defined]
+    check.check_input = lambda source, **_: found if source == photos else []  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "gaussian_wrapping_addon.core.dataset.loading.check", check)
     assert not bpy.ops.gwrap.check_photos.poll()
     bpy.context.scene.gwrap.source = str(photos)

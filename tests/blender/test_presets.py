@@ -64,7 +64,10 @@ def change_everything() -> dict[str, object]:
             setattr(owner, name, not getattr(owner, name))
         else:
             # 0 leaves a number to the preset; the next that the setting allows is its lowest.
-            low = declared.check.low if declared.panel.preset_if_zero else kind.default + 1
+            more = kind.default + 1
+            low = declared.check.low if declared.panel.preset_if_zero else more
+            if getattr(declared.check, "zero", ""):  # 0, or a number of at least the lowest
+                low = max(declared.check.low, more)
             setattr(owner, name, type(kind.default)(low))
     gwrap.resolution, gwrap.decimate = "POINTS", not gwrap.decimate
     after = panel_values()
