@@ -46,9 +46,7 @@ class GWRAP_PT_train(TabPanel, bpy.types.Panel):
         running = watched_jobs.is_running(properties.job_folder)
         column = layout.column()
         column.enabled = not running
-        row = column.row()
-        row.use_property_split = False  # no label: it would cut off the names of the presets
-        row.prop(properties, "preset", expand=True)
+        column.prop(properties, "preset")  # a list: five names do not fit beside each other
         column.menu("GWRAP_MT_presets", icon="PRESET")
         column.prop(properties, "output")
         if not running and stage_of(context) not in _NOT_YET:
