@@ -42,7 +42,7 @@ def steps() -> Iterator[float]:
     yield from until(lambda: fraction_of_job() > 0.2, "the timer sees progress")
     points = driving.module("ui.jobs.points_drawing")
     yield from until(lambda: points._drawing.batch is not None, "the training's points are drawn")
-    check(not points._drawing.failed, "without an error")
+    check(not points.VIEW.failed, "without an error")
     bar = driving.module("ui.jobs.status_bar")
     check(len(bar.running_jobs()) == 1 and not bar._failed, "the status bar shows the job")
     driving.execute(bpy.ops.view3d.view_axis, type="FRONT")

@@ -50,7 +50,7 @@ def steps() -> Iterator[float]:
         yield 1.0
         check(len(bpy.context.window_manager.windows) == 2, "a second window")
         bar = driving.module("ui.jobs.status_bar")
-        check(not bar._failed and not points._drawing.failed, "both are drawn without an error")
+        check(not bar._failed and not points.VIEW.failed, "both are drawn without an error")
         press(bpy.ops.gwrap.cancel_job)
         yield from until(lambda: state_of_job() == "CANCELLED", "the job is cancelled")
         yield 0.5

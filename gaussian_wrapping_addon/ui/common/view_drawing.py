@@ -30,7 +30,7 @@ class ViewDrawing:
     ) -> None:
         self.handle: Any = None
         self._what, self._draw, self._forget = what, draw, forget
-        self._failed = False
+        self.failed = False
 
     def start(self) -> None:
         """Start drawing."""
@@ -41,7 +41,7 @@ class ViewDrawing:
         """Stop drawing."""
         if self.handle is not None:
             bpy.types.SpaceView3D.draw_handler_remove(self.handle, "WINDOW")
-        self.handle, self._failed = None, False
+        self.handle, self.failed = None, False
         self._forget()
 
     def draw(self, context: bpy.types.Context | None = None) -> None:
@@ -55,6 +55,6 @@ class ViewDrawing:
             if space is not None and space.overlay.show_overlays:
                 self._draw(context)
         except Exception:  # an exception here would recur at every redraw
-            if not self._failed:
+            if not self.failed:
                 _logger.exception("%s cannot be drawn", self._what)
-            self._failed = True
+            self.failed = True

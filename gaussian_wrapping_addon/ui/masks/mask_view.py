@@ -10,11 +10,12 @@ from ...ops.masks import mask_review
 from ..common.text import wrapped_label
 
 _PICTURE_SCALE = 12.0  # of an icon's size
+_LONG_LABEL = 0.66  # of the width, for the longer of two labels
 
 
 def draw_masks(layout: Any, characters: int) -> None:
     """Draw the making of masks, and their review where one is open."""
-    row = layout.row(align=True)
+    row = layout.split(factor=_LONG_LABEL, align=True)
     row.operator("gwrap.masks_from_region", icon="MOD_MASK")
     row.operator("gwrap.review_masks", text="Review", icon="VIEWZOOM")
     if not mask_review.is_open():
