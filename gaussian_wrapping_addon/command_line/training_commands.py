@@ -151,7 +151,9 @@ def _estimate(options: Namespace) -> int:
     from ..core.jobs.commands.run_in_worker import run_in_worker
     from ..core.jobs.store.job_file import make_job
 
-    job = make_job("wrap", options.input, training_settings(options))
+    # Masks of a region need the region, and hardly change what the training costs.
+    settings = replace(training_settings(options), make_masks="off")
+    job = make_job("wrap", options.input, settings)
     _reject_frames_of_photos(job)
     require_device(job.settings.device)
     return run_in_worker(

@@ -23,6 +23,8 @@ AUTOMATIC_REGIONS = ("auto", "all")
 """Values that a job accepts instead of a region file."""
 REPORT_FOLDER = "report"
 """Folder of the report's pictures in a result; reserved, no region may use it."""
+JOB_MARKER = ".gaussian-wrapping-job"
+"""Empty file that makes a folder one of a job."""
 MAX_REGION_CHARACTERS = 40
 MAX_STEM_BYTES = 120
 """With suffixes, and those of atomic writing, names stay below the 255 bytes of file systems."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 import bpy
 
@@ -14,6 +15,12 @@ from ..jobs.job_actions import common_frame, refuse_running, start_on_regions
 from ..jobs.panel_settings import job_settings
 from ..jobs.scene_folders import job_folder_of
 from ..worker.preferred_worker import WorkerChoice
+
+CAMERA_SETTINGS: Final = (
+    "seed", "turntable", "equirectangular", "mask_invert", "mask_grow_px", "georeference",
+    "markers", "control_points", "video_frames", "video_fps",
+)  # fmt: skip
+"""What a job's cameras depend on besides its input."""
 
 
 def start_region_masks(
@@ -36,6 +43,8 @@ def start_region_masks(
     folder = job_folder_of(common_frame(regions))
     refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
-    masked = {"make_masks": "region", "mask_model": ""}
-    settings = with_values(job_settings(scene, choice.threads, choice.device), masked)
+    # The region lies in the world of the job's cameras, which would move with any of these.
+    changed = {name: getattr(earlier.settings, name) for name in CAMERA_SETTINGS}
+    changed |= {"make_masks": "region", "mask_model": ""}
+    settings = with_values(job_settings(scene, choice.threads, choice.device), changed)
     return start_on_regions(scene, regions, choice, "wrap", earlier.source, settings)

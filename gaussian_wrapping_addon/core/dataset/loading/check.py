@@ -59,11 +59,7 @@ class Finding:
     """Of the finding that names it: the input's kind."""
 
 
-_PANORAMAS = Finding(
-    "fact",
-    f"The photos are 360 degree panoramas; each is cut into {len(VIEWS)} views "
-    "(--equirectangular off takes them for ordinary photos).",
-)
+_PANORAMAS = f"The photos are 360 degree panoramas; each is cut into {len(VIEWS)} views"
 
 
 def check_input(source: Path, *, worker: str = "") -> list[Finding]:
@@ -174,7 +170,8 @@ def _check_photos(kind: SourceKind, findings: list[Finding]) -> None:
         Finding("fact", "The input has no camera poses; they will be solved from the photos.")
     )
     if are_panoramas(photos):
-        findings.append(_PANORAMAS)
+        text = f"{_PANORAMAS} (--equirectangular off takes them for ordinary photos)."
+        findings.append(Finding("fact", text))
 
 
 def second_copies_warning(root: Path) -> list[ReportWarning]:
@@ -197,7 +194,7 @@ def _check_poses(kind: SourceKind, findings: list[Finding]) -> None:
         )
     model = read_poses(kind)
     if any(photo.is_panorama for photo in model.photos):
-        findings.append(_PANORAMAS)
+        findings.append(Finding("fact", f"{_PANORAMAS}."))
     findings += [Finding("warning", warning.text, warning.hint) for warning in model.warnings]
     findings.append(
         Finding("fact", f"{len(model.photos)} posed photos, {len(model.points)} sparse points.")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import DatasetError
+from ...errors import DatasetError, UsageError
 from ...files import real_path
 from ...limits import MIN_IMAGES
 from ...progress import Progress
@@ -120,7 +120,9 @@ def load_scene(
         check_photo_count(len(photos))
         require_extras(photos)
         warnings += second_copies_warning(root)
-        if takes_for_panoramas(photos, equirectangular):
+        # Frames of a video as wide as two of their heights are what phones film.
+        if takes_for_panoramas(photos, "off" if in_order else equirectangular):
+            _refuse_places_of_panoramas(units)
             if turntable == "on":
                 warnings.append(_NO_TURNTABLE_OF_PANORAMAS)
             model, kind = solve_views_of_panoramas(
@@ -138,6 +140,7 @@ def load_scene(
             warnings.append(_CAMERAS_ARE_GIVEN)
         if any(photo.is_panorama for photo in model.photos):
             check_photo_count(len(model.photos))
+            _refuse_places_of_panoramas(units)
             model, kind = with_views_of_panoramas(
                 model, kind, work_folder, progress.span(0.0, 0.3), reading, threads=threads
             )
@@ -213,6 +216,15 @@ def check_photo_count(count: int, left_out: Sequence[ReportWarning] = ()) -> Non
         raise DatasetError(
             f"Only {count} {photos} usable; at least {MIN_IMAGES} are needed.{reasons}",
             " ".join(hints) or "Add photos of the same thing from other places.",
+        )
+
+
+def _refuse_places_of_panoramas(units: UnitsRequest) -> None:
+    """Raise where places are asked for that the views cut from panoramas do not have."""
+    if units.georeference == "on" or units.control_points:
+        raise UsageError(
+            "GPS and control points are not read for 360 degree photos.",
+            "Leave these options out; markers, or a measured length afterwards, give the scale.",
         )
 
 

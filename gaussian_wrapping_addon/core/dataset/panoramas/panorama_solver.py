@@ -14,7 +14,7 @@ import numpy as np
 from ...errors import DatasetError
 from ...files import write_json
 from ...kernels.parallel import default_threads
-from ...limits import MIN_IMAGES
+from ...limits import HELPER_DEADLINE_S, MIN_IMAGES
 from ...processes.helper_process import run_helper
 from ...progress import Progress
 from ...report_warning import ReportWarning
@@ -27,6 +27,8 @@ from .panorama_views import VIEWS, view_lens
 
 _MAX_SIFT_PX = 1000
 """Side of the views that features are extracted from."""
+_SECONDS_A_PANORAMA = 600.0
+"""Longest time that solving may take: ten times what five panoramas took on one busy core."""
 _ALL_PAIRS = 12
 """Up to this many panoramas each is matched with each other."""
 _NEIGHBOURS = 4
@@ -109,7 +111,10 @@ def solve_panoramas(
         "pairs": pairs,
     }
     write_json(folder / "task.json", task)
-    run_helper(HELPER, folder, progress.span(0.08, 1.0), memory_bytes=memory_limit_bytes())
+    run_helper(
+        HELPER, folder, progress.span(0.08, 1.0), memory_bytes=memory_limit_bytes(),
+        deadline_s=max(HELPER_DEADLINE_S, _SECONDS_A_PANORAMA * len(numbers)),
+    )  # fmt: skip
     model = read_model(ModelFiles(folder / "model", ".bin"))
     target = work_folder / "cameras"
     if target.exists():
@@ -126,7 +131,8 @@ def solve_panoramas(
         raise DatasetError(
             f"Only {len(placed)} of {len(numbers)} panoramas could be placed; {MIN_IMAGES} are "
             "needed.",
-            "Take more panoramas, a few steps apart.",
+            "Take more panoramas, a few steps apart. If these are ordinary photos, say "
+            "--equirectangular off.",
         )
     warnings = list(model.warnings)
     if len(placed) < len(numbers):

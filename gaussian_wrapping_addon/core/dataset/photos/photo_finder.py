@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 from ... import limits
 from ...errors import DatasetError
 from ...files import resolve_inside
+from ...names import JOB_MARKER
 from .image_formats import HEIF_SUFFIXES, PHOTO_SUFFIXES, RAW_SUFFIXES
 
 PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
@@ -51,6 +52,9 @@ def _walk(root: Path) -> tuple[list[Path], list[Path]]:
     left_out: list[Path] = []
     base_depth = len(root.parts)
     for folder, subfolders, names in os.walk(root):
+        if JOB_MARKER in names:
+            subfolders.clear()  # a job beside its video or transforms.json is no input
+            continue
         here = Path(folder)
         deep = len(here.parts) - base_depth >= _MAX_DEPTH
         subfolders[:] = (

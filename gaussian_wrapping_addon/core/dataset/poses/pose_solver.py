@@ -20,7 +20,7 @@ import numpy as np
 from ...errors import DatasetError
 from ...files import write_json
 from ...kernels.parallel import default_threads
-from ...limits import MIN_IMAGES
+from ...limits import HELPER_DEADLINE_S, MIN_IMAGES
 from ...machine import total_memory_bytes
 from ...processes.helper_process import run_helper
 from ...progress import Progress
@@ -51,6 +51,8 @@ TURNTABLE_FOLDER = "turntable"
 """Masks of what turns, of the photos' full size."""
 HELPER = "dataset.poses.pose_solver_helper"
 """Module of the process that solves."""
+_SECONDS_A_PHOTO = 60.0
+"""Longest time that solving may take: more than ten times what 400 photos took on two cores."""
 _MEMORY_SHARE = 0.9
 _MIN_MEMORY_BYTES = 8 << 30
 """The limit includes reserved address space; below this the solver's threads may not start."""
@@ -164,7 +166,10 @@ def solve_poses(
         "positions": [p and [p.latitude_deg, p.longitude_deg] for p in positions],
     }
     write_json(folder / "task.json", task)
-    run_helper(HELPER, folder, progress.span(0.08, 1.0), memory_bytes=memory_limit_bytes())
+    run_helper(
+        HELPER, folder, progress.span(0.08, 1.0), memory_bytes=memory_limit_bytes(),
+        deadline_s=max(HELPER_DEADLINE_S, _SECONDS_A_PHOTO * len(prepared)),
+    )  # fmt: skip
     model = read_model(ModelFiles(folder / "model", ".bin"))
     sizes = {p.name: (p.full_width, p.full_height) for p in prepared}
     target = work_folder / TURNTABLE_FOLDER

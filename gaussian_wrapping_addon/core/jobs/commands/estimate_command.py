@@ -80,9 +80,10 @@ def input_facts(source: Path, settings: JobSettings | None = None) -> SceneFacts
     DatasetError
         The input holds no photo that can be read.
     """
+    from ...dataset.loading.panorama_input import takes_for_panoramas
     from ...dataset.loading.source_kind import SPLAT, VIDEO, read_poses, source_kind
     from ...dataset.loading.splat_cameras import FAR_VIEWS, NEAR_VIEWS, PHOTO_SIDE_PX
-    from ...dataset.panoramas.panorama_views import VIEWS, are_panoramas, view_lens
+    from ...dataset.panoramas.panorama_views import VIEWS, view_lens
     from ...dataset.photos.photo_file import photo_header
     from ...dataset.photos.photo_finder import PhotoIndex, find_mask, list_photos, photo_root
     from ...dataset.readers.splat_header import read_splat_header
@@ -102,7 +103,8 @@ def input_facts(source: Path, settings: JobSettings | None = None) -> SceneFacts
     if kind.kind == "photos":
         root = photo_root(kind.folder)
         named = {p.relative_to(root).as_posix(): p for p in list_photos(root)}
-        panoramas = are_panoramas(list(named.values()))
+        mode = (settings or JobSettings()).equirectangular
+        panoramas = takes_for_panoramas(list(named.values()), mode)
     else:
         model = read_poses(kind)
         panoramas = any(photo.is_panorama for photo in model.photos)

@@ -170,13 +170,15 @@ def _refuse_own_masks(scene: Scene, mask_mode: str) -> None:
 
 
 def _run_model(scene: Scene, job: JobFile, folder: Path, progress: Progress, threads: int) -> None:
+    from ...dataset.poses.pose_solver import memory_limit_bytes
     from ...processes.helper_process import run_helper
 
     photos = [os.path.abspath(view.photo_path) for view in scene.views]
     write_json(folder / "task.json", _task(job, photos, threads))
     run_helper(
-        "masks.model_helper", folder, progress, deadline_s=SECONDS_A_PHOTO * (5 + len(photos))
-    )
+        "masks.model_helper", folder, progress, deadline_s=SECONDS_A_PHOTO * (5 + len(photos)),
+        memory_bytes=memory_limit_bytes(),
+    )  # fmt: skip
 
 
 def check_mask_model(job: JobFile, folder: JobFolder, progress: Progress) -> None:
@@ -189,6 +191,7 @@ def check_mask_model(job: JobFile, folder: JobFolder, progress: Progress) -> Non
     """
     import tempfile
 
+    from ...dataset.poses.pose_solver import memory_limit_bytes
     from ...processes.helper_process import run_helper
 
     if not job.settings.mask_model or job.command != "wrap":
@@ -198,7 +201,10 @@ def check_mask_model(job: JobFile, folder: JobFolder, progress: Progress) -> Non
     progress.update(0.0, "loading the mask model")
     with tempfile.TemporaryDirectory() as temporary:
         write_json(Path(temporary) / "task.json", _task(job, [], 1))
-        run_helper("masks.model_helper", Path(temporary), progress, deadline_s=SECONDS_A_PHOTO)
+        run_helper(
+            "masks.model_helper", Path(temporary), progress, deadline_s=SECONDS_A_PHOTO,
+            memory_bytes=memory_limit_bytes(),
+        )  # fmt: skip
 
 
 def _task(job: JobFile, photos: list[str], threads: int) -> dict[str, Any]:

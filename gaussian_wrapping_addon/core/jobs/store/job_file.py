@@ -145,7 +145,8 @@ def make_job(
             "Leave one of them out; a result can be scaled by a measured length.",
         )
     control = settings.control_points
-    if control and not Path(control).is_file():
+    # A finished training is meshed without it.
+    if command == "wrap" and control and not Path(control).is_file():
         raise DatasetError(f"The control points {control} do not exist.", "Check the path.")
     training, mask_regions = settings.training, settings.mask_regions
     if command == "wrap":

@@ -15,13 +15,14 @@ from typing import Any
 from ... import limits
 from ...errors import DISK_FULL_ERRNOS, ParseError, UsageError, known_error, unwritable_error
 from ...files import overwrite_json, read_json, write_json
+from ...names import JOB_MARKER
 from ...processes.process_identity import owner_alive, process_start_ticks
 from ...regular_files import read_bounded, reject_foreign_entries, touch_regular
 
 FOREIGN_LOCK_HINT = "If it is no job of this add-on, delete lock.json there."
 STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
 ACTIVE_STATES = ("NEW", "RUNNING", "CANCELLING")
-MARKER = ".gaussian-wrapping-job"
+MARKER = JOB_MARKER
 
 
 @dataclass(frozen=True)

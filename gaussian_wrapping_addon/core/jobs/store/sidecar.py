@@ -106,6 +106,7 @@ def _source(result: Path, region: Any) -> dict[str, Any]:
             settings = to_json(job.settings)
             settings["regions"] = [_name(r) for r in job.settings.regions]
             settings["start_splat"] = _name(job.settings.start_splat)
+            settings["mask_model"] = _name(job.settings.mask_model)
             settings["control_points"] = _name(job.settings.control_points)
             out["job"] = {
                 "name": result.parent.name, "command": job.command, "source": _name(job.source),

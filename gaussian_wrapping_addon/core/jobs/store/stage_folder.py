@@ -10,12 +10,14 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ... import limits
 from ...dataset.photos.image_formats import PHOTO_SUFFIXES
-from ...errors import DatasetError, ParseError
+from ...dataset.photos.photo_finder import second_copies
+from ...dataset.readers.programs.program_files import find_program_cameras
+from ...errors import DatasetError, ParseError, WrapError
 from ...files import read_json, write_json
 from ...progress import Progress
 from .job_folder import MARKER
@@ -34,8 +36,10 @@ STAGE_VERSIONS = {
 DONE_NAME = "done.json"
 HASH_CHARACTERS = 12
 INPUT_SUFFIXES = (
-    *PHOTO_SUFFIXES, ".bin", ".txt", ".json", ".ply", ".sfm", ".xml", ".csv", ".geojson", ".xmp",
+    *PHOTO_SUFFIXES, ".bin", ".txt", ".json", ".ply",
 )  # fmt: skip
+CAMERA_SUFFIXES = (".sfm", ".xml", ".csv", ".geojson", ".xmp")
+"""Of files with cameras that other programs write."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,8 @@ def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
         state = source.stat()
         return [(source.name, state.st_size, state.st_mtime_ns)]
     root = source if source.is_dir() else source.parent
+    # Other programs write such files beside photos, too, and change them: notes of photo managers.
+    suffixes = (*INPUT_SUFFIXES, *(CAMERA_SUFFIXES if _has_camera_files(source) else ()))
     found = []
     seen = 0
     for folder, subfolders, names in os.walk(root):
@@ -86,12 +92,22 @@ def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
             subfolders.clear()  # a job folder beside a transforms.json is not input
             continue
         subfolders[:] = sorted(s for s in subfolders if not s.startswith("."))
+        photos = [n for n in names if PurePosixPath(n).suffix.lower() in PHOTO_SUFFIXES]
+        second = second_copies(photos)
         for name in sorted(names):
             path = Path(folder) / name
-            if path.suffix.lower() in INPUT_SUFFIXES and path.is_file():
+            if path.suffix.lower() in suffixes and name not in second and path.is_file():
                 state = path.stat()
                 found.append((path.relative_to(root).as_posix(), state.st_size, state.st_mtime_ns))
     return [(source.name if source.is_file() else "", 0, 0), *found]
+
+
+def _has_camera_files(source: Path) -> bool:
+    """Return whether an input's cameras are in files of another program."""
+    try:
+        return find_program_cameras(source) is not None
+    except (OSError, WrapError):
+        return True  # loading says what is wrong
 
 
 def read_done(folder: Path) -> dict[str, Any] | None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -14,11 +15,13 @@ from PIL import Image
 from benchmarks.camera_files import writers
 from benchmarks.camera_files.writers import Shots
 from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.dataset.loading import load as load_module
 from gaussian_wrapping_addon.core.dataset.loading.check import check_input
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.loading.panorama_input import (
     with_views_of_panoramas,
 )
+from gaussian_wrapping_addon.core.dataset.loading.real_world import UnitsRequest
 from gaussian_wrapping_addon.core.dataset.loading.source_kind import read_poses, source_kind
 from gaussian_wrapping_addon.core.dataset.matching.match_pairs import pairs_by_pose
 from gaussian_wrapping_addon.core.dataset.panoramas.panorama_solver import panorama_pairs
@@ -32,16 +35,17 @@ from gaussian_wrapping_addon.core.dataset.panoramas.panorama_views import (
 )
 from gaussian_wrapping_addon.core.dataset.photos.mask_reading import AS_WRITTEN
 from gaussian_wrapping_addon.core.dataset.scene import Scene
-from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
 from gaussian_wrapping_addon.core.jobs.commands.estimate_command import input_facts
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.dataset.panoramas.room import HALF, color_of, poses, write_panoramas
 
 WIDTH = 400
 
 
-def load(source: Path, work: Path, **more: str) -> Scene:
-    return load_scene(source, work, Progress(), seed=1, threads=1, **more)  # type: ignore[arg-type]
+def load(source: Path, work: Path, **more: Any) -> Scene:
+    return load_scene(source, work, Progress(), seed=1, threads=1, **more)
 
 
 def room_points(count: int = 400) -> np.ndarray:
@@ -177,10 +181,35 @@ def test_only_sets_of_panoramas_are_taken_for_them(tmp_path: Path) -> None:
     facts = [f.message for f in check_input(tmp_path) if f.severity == "fact"]
     assert any("360 degree panoramas; each is cut into 14 views" in fact for fact in facts)
     assert input_facts(tmp_path).photos == 3 * len(VIEWS)
+    ordinary = dataclasses.replace(JobSettings(), equirectangular="off")
+    assert input_facts(tmp_path, ordinary).photos == 3
     Image.new("RGB", (66, 32), "white").save(tmp_path / "other.png")
     assert not are_panoramas([*files, tmp_path / "other.png"])
     assert input_facts(tmp_path).photos == 4
     assert not are_panoramas([])
+
+
+def test_places_that_views_do_not_have_are_refused_at_once(tmp_path: Path) -> None:
+    source = posed_set(tmp_path / "set", "transforms")
+    with pytest.raises(UsageError, match="not read for 360 degree photos"):
+        load(source, tmp_path / "work", units=UnitsRequest(georeference="on"))
+
+
+def test_wide_frames_of_a_video_are_no_panoramas(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for index in range(3):
+        Image.new("RGB", (64, 32), (40 * index, 0, 0)).save(tmp_path / f"frame-{index}.png")
+    solved: list[str] = []
+
+    def solve(_root: Path, photos: list[Path], *_: object, **more: object) -> NoReturn:
+        solved.extend(path.name for path in photos)
+        raise DatasetError("enough", "")
+
+    monkeypatch.setattr(load_module, "solve_poses", solve)
+    with pytest.raises(DatasetError, match="enough"):
+        load(tmp_path, tmp_path / "work", in_order=True)
+    assert solved == ["frame-0.png", "frame-1.png", "frame-2.png"]
 
 
 def test_cameras_that_are_no_panoramas_are_said(tmp_path: Path) -> None:

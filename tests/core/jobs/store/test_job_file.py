@@ -266,6 +266,7 @@ def test_metres_in_a_job(tmp_path: Path) -> None:
     assert job.settings.control_points == str(points)
     with pytest.raises(DatasetError, match=r"control points .* do not exist"):
         make_job("wrap", tmp_path, replace(plain, control_points=str(tmp_path / "none")))
+    make_job("mesh", tmp_path, replace(plain, control_points=str(tmp_path / "none")))
     for wrong in ("4x4_50", "5:0.1", "4x4_50:0"):
         with pytest.raises(UsageError, match=r"markers is out of range. Give .*4x4_50:0.05"):
             make_job("wrap", tmp_path, replace(plain, markers=wrong))

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from gaussian_wrapping_addon.core.dataset.photos.photo_finder import list_photos
 from gaussian_wrapping_addon.core.errors import Cancelled
+from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
     record_interrupted_time,
     run_stage,
@@ -61,6 +63,30 @@ def test_fingerprint_follows_size_time_and_names(tmp_path: Path) -> None:
     after = source_fingerprint(tmp_path)
     (tmp_path / "b.jpg").write_bytes(b"1")
     assert source_fingerprint(tmp_path) != after
+
+
+def test_fingerprint_leaves_out_jobs_notes_and_second_copies(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"1")
+    before = source_fingerprint(tmp_path)
+    (tmp_path / "a.nef").write_bytes(b"22")
+    (tmp_path / "a.xmp").write_text("<x:xmpmeta xmlns:x='adobe:ns:meta/'/>")
+    (tmp_path / "list.csv").write_text("name,stars\na.jpg,5\n")
+    job = tmp_path / "a_wrap"
+    job.mkdir()
+    (job / MARKER).touch()
+    (job / "frame.jpg").write_bytes(b"333")
+    assert source_fingerprint(tmp_path) == before
+    (tmp_path / "b.nef").write_bytes(b"4444")
+    assert [name for name, _, _ in source_fingerprint(tmp_path)] == ["", "a.jpg", "b.nef"]
+
+
+def test_photos_of_a_job_are_no_input(tmp_path: Path) -> None:
+    job = tmp_path / "clip_wrap" / "stages" / "frames"
+    job.mkdir(parents=True)
+    (tmp_path / "clip_wrap" / MARKER).touch()
+    (job / "frame.jpg").write_bytes(b"1")
+    assert list_photos(tmp_path) == []
+    assert [path.name for path in list_photos(job)] == ["frame.jpg"]
 
 
 def test_key_depends_on_every_part() -> None:

@@ -33,7 +33,7 @@ from .values import (
 
 KIND = "Meshroom cameras"
 
-_MAX_BYTES = 256 * 1024 * 1024
+_MAX_BYTES = 64 * 1024 * 1024
 """A landmark takes about 0.6 kB with its observations: 256 MB are 400 000 of them."""
 _JSON_NAMES = ("sfm.json", "sfmdata.json")
 """In small letters; other programs have an ``sfm_data.json`` of another content."""

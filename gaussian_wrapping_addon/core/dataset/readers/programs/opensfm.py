@@ -22,7 +22,7 @@ from .values import AGAIN, checked_lens, image_size, number, numbers, unsupporte
 
 KIND = "OpenSfM reconstruction"
 
-_MAX_BYTES = 256 * 1024 * 1024
+_MAX_BYTES = 64 * 1024 * 1024
 """A point takes about 120 bytes: 256 MB are two million of them."""
 _OTHER_LENS = "Choose the camera type brown or perspective (ODM: --camera-lens), and solve again."
 _PANORAMAS = ("spherical", "equirectangular")

@@ -15,6 +15,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ....errors import ParseError
+from ....report_warning import ReportWarning
 from ...photos.photo_finder import list_photos
 from ..source_model import Brown, RelativeLens, SourceModel
 from .photo_list import PhotoList
@@ -27,7 +28,9 @@ KIND = "RealityScan XMP"
 _MAX_BYTES = 1024 * 1024
 """An XMP file of a photo takes about 2 kB; with a thumbnail from elsewhere, hundreds."""
 _MARK = b"capturingreality.com/ns/xcr"
+_POSE = b"Rotation"
 _NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
+_WITHOUT_HINT = "Export the cameras again, or move the XMP files away to have all cameras solved."
 _BROWN = ("brown3", "brown4", "brown3t2", "brown4t2")
 _PLAIN = "perspective"
 _NO_DIVISION = "Choose Brown as the distortion model in the alignment's settings, align and export."
@@ -48,10 +51,14 @@ def xmp_files(root: Path) -> dict[Path, Path]:
 
 
 def _is_of_program(path: Path) -> bool:
-    """Whether the file names the program's namespace: other programs write XMP files as well."""
+    """Whether the file has a pose of the program.
+
+    Other programs write XMP files as well, and this one also writes files without any.
+    """
     try:
         with path.open("rb") as stream:
-            return _MARK in stream.read(_MAX_BYTES)
+            text = stream.read(_MAX_BYTES)
+            return _MARK in text and _POSE in text
     except OSError:
         return False
 
@@ -95,7 +102,12 @@ def read_xmp_files(root: Path, files: dict[Path, Path]) -> SourceModel:
             else:
                 photos.leave_out(name, "another component than the largest")
     usable = photos.finished()
-    return SourceModel(KIND, usable, warnings=tuple(photos.warnings), facts={"files": len(files)})
+    warnings = list(photos.warnings)
+    without = len(list_photos(root)) - len(files)
+    if without > 0:
+        text = f"{without} photos have no camera of RealityScan beside them and are left out."
+        warnings.append(ReportWarning("photos-without-camera", text, _WITHOUT_HINT))
+    return SourceModel(KIND, usable, warnings=tuple(warnings), facts={"files": len(files)})
 
 
 def _description(path: Path) -> Element | None:

@@ -104,6 +104,17 @@ def test_polycam_prefers_corrected_cameras(tmp_path: Path) -> None:
         assert not [f for f in check_input(source) if f.severity == "error"]
 
 
+def test_xmp_files_without_a_pose_are_not_cameras(tmp_path: Path) -> None:
+    text = (
+        "<x:xmpmeta xmlns:x='adobe:ns:meta/'><d xmlns:xcr='http://www.capturingreality.com/ns/xcr/"
+        "1.1#' xcr:Version='3' xcr:PosePrior='initial'/></x:xmpmeta>"
+    )
+    write_photos(tmp_path)
+    for name in NAMES:
+        (tmp_path / name).with_suffix(".xmp").write_text(text)
+    assert source_kind(tmp_path).kind == "photos"
+
+
 def test_xmp_files_of_other_programs_are_not_cameras(tmp_path: Path) -> None:
     write_photos(tmp_path)
     for name in NAMES:
