@@ -51,8 +51,10 @@ def photo_kind(path: Path) -> str:
     Raises
     ------
     OSError
-        The file cannot be read.
+        The file cannot be read, or is a pipe or a device, which reading could wait for.
     """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is no file.")
     with path.open("rb") as stream:
         head = stream.read(_BRAND_BYTES)
     if head[4:8] == b"ftyp":

@@ -133,7 +133,8 @@ def exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
         ("dataset.refined_scene", "load_refined_scene"),
         ("gaussians.gaussian_file", "load_gaussians"),
     ):
-        scene = SimpleNamespace(world_from_scene=Similarity(1.0, np.eye(3), np.zeros(3)))
+        frame = Similarity(1.0, np.eye(3), np.zeros(3))
+        scene = SimpleNamespace(world_from_scene=frame, facts={})
         monkeypatch.setattr(f"gaussian_wrapping_addon.core.{module}.{name}", lambda *_, s=scene: s)
     monkeypatch.setattr(
         "gaussian_wrapping_addon.core.gaussians.splat_ply.write_splat_ply",
