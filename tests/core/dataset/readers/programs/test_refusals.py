@@ -76,7 +76,7 @@ def test_entities_are_not_expanded(tmp_path: Path, text: str) -> None:
 def test_entities_beside_photos_are_not_expanded(tmp_path: Path, encoding: str) -> None:
     source, path = written(tmp_path, "xmp")
     text = '<!DOCTYPE d [<!ENTITY a "1">]>' + path.read_text()
-    path.write_bytes(text.encode(encoding) + b"<!-- capturingreality.com/ns/xcr -->")
+    path.write_bytes(text.encode(encoding) + b"<!-- capturingreality.com/ns/xcr Rotation -->")
     with pytest.raises(ParseError, match=r"IMG_0001\.xmp, line 1: document types and entities"):
         read(source)
 
