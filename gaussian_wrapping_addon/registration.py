@@ -13,6 +13,7 @@ from . import batch
 from .ops import cli_command
 from .ops.cameras import camera_operators
 from .ops.common import background
+from .ops.computers import computers_operators, farm_actions, farm_calls, part_watch
 from .ops.dataset import input_operators
 from .ops.export import export_operators
 from .ops.jobs import job_attach, job_operators, job_timer, live_points, live_preview
@@ -26,6 +27,7 @@ from .ops.training import training_estimate, training_operators
 from .ops.worker import worker_check_operators, worker_setup, worker_setup_operators
 from .ui import preferences, properties
 from .ui.baking import bake_panel, bake_properties
+from .ui.computers import computers_panel, computers_properties
 from .ui.dataset import dataset_panel
 from .ui.jobs import points_drawing, status_bar
 from .ui.meshing import mesh_panel, texture_panel
@@ -41,6 +43,7 @@ _logger = logging.getLogger(__name__)
 CLASSES: Final[tuple[type, ...]] = (
     *training_properties.CLASSES,
     *bake_properties.CLASSES,
+    *computers_properties.CLASSES,
     *properties.CLASSES,
     *region_properties.CLASSES,
     *preferences.CLASSES,
@@ -52,6 +55,7 @@ CLASSES: Final[tuple[type, ...]] = (
     *region_list_operators.CLASSES,
     *mask_operators.CLASSES,
     *bake_operators.CLASSES,
+    *computers_operators.CLASSES,
     *import_operators.CLASSES,
     *export_operators.CLASSES,
     *camera_operators.CLASSES,
@@ -63,6 +67,7 @@ CLASSES: Final[tuple[type, ...]] = (
     *dataset_panel.CLASSES,
     *train_panel.CLASSES,
     *train_advanced_panel.CLASSES,
+    *computers_panel.CLASSES,
     *region_panel.CLASSES,
     *mesh_panel.CLASSES,
     *texture_panel.CLASSES,
@@ -80,6 +85,8 @@ HANDLERS: Final[tuple[tuple[str, Callable[..., None]], ...]] = (
     ("load_post", region_watch.after_load),
     ("undo_post", job_attach.after_undo),
     ("redo_post", job_attach.after_undo),
+    ("undo_post", farm_actions.after_undo),
+    ("redo_post", farm_actions.after_undo),
     ("undo_post", placement.after_undo),
     ("redo_post", placement.after_undo),
     ("undo_post", region_watch.after_load),
@@ -124,6 +131,9 @@ def unregister() -> None:
     live_preview.stop()
     mask_review.stop()
     live_points.stop()
+    part_watch.stop()
+    farm_calls.stop()
+    farm_actions.forget()
     background.stop()  # last of these: what they end is ended by its threads
     cli_command.unregister()
     table.unregister()

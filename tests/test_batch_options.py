@@ -29,6 +29,7 @@ from gaussian_wrapping_addon.core.settings import (
     preset,
     to_json,
 )
+from gaussian_wrapping_addon.core.settings.saved_settings import write_saved_settings
 
 BATCH = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon" / "batch.py"
 
@@ -167,6 +168,61 @@ def test_other_words_are_refused(arguments: tuple[str, str]) -> None:
         settings_of(*arguments)
 
 
+def test_a_preset_of_the_panel_is_taken_and_options_override_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    values = {
+        "preset": "fine", "turntable": "on", "training.iterations": 0, "training.exposure": "off",
+        "training.max_gaussians": 5000, "texture.size_px": 512, "meshing.edge_length": 0.5,
+        "old": 1,
+    }  # fmt: skip
+    write_saved_settings(tmp_path / "mine.json", values, {})
+    line = ["wrap", "photos", "--out", "o", "--user-preset", str(tmp_path / "mine.json")]
+
+    def settings(*arguments: str) -> JobSettings:
+        options = build_parser().parse_args([*line, *arguments])
+        return region_settings(training_settings(options), options, texture_stays=True)
+
+    fine = preset("fine")
+    training = replace(fine.training, exposure="off", max_gaussians=5000)
+    wanted = replace(fine, turntable="on", training=training, texture=TextureSettings(size_px=512))
+    assert settings() == wanted
+    assert "mine.json: 'old' is no setting of this version" in caplog.text
+    assert settings("--max-gaussians", "6000", "--texture-size", "1024") == replace(
+        wanted,
+        training=replace(training, max_gaussians=6000),
+        texture=TextureSettings(size_px=1024),
+    )
+    assert settings("--preset", "draft").training.iterations == preset("draft").training.iterations
+    (tmp_path / "mine.json").unlink()
+    with pytest.raises(UsageError, match=r"mine\.json cannot be read"):
+        settings()
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_of_the_program_say_nothing_of_textures(name: str) -> None:
+    assert preset(name).texture == TextureSettings()
+
+
+@pytest.mark.parametrize(
+    ("line", "message", "hint"),
+    [
+        (
+            "wrap x --out o --frames abc",
+            "--frames.*'abc'; give 0 .* or from 3 to 2000",
+            "See p wrap --help.",
+        ),
+        ("wrap x --out o --nonsense", "unrecognized arguments: --nonsense", "See p wrap --help."),
+        ("wrap x", "required: --out", "See p wrap --help."),
+        ("status", "required: DIR", "Usage: p status [-h] DIR"),
+    ],
+)
+def test_an_error_quotes_short_usages_only(line: str, message: str, hint: str) -> None:
+    with pytest.raises(UsageError, match=message) as refused:
+        build_parser("p").parse_args(line.split())
+    assert refused.value.hint == hint
+
+
 def test_model_selection_has_an_option_each() -> None:
     assert MODEL_SELECTION == (
         "harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size",
@@ -187,7 +243,7 @@ def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
     wrap = set(build_parser()._subparsers._group_actions[0].choices["wrap"]._option_string_actions)
     assert set(known.values()) <= wrap
     assert wrap - set(known.values()) == {
-        "-h", "--help", "--needs", "--out", "--no-blend",
+        "-h", "--help", "--needs", "--out", "--no-blend", "--user-preset", "--plan-only",
     }  # fmt: skip
     for name in ("preset", "meshing.min_component_share", "training.holdout_every"):
         assert name in known
@@ -205,9 +261,10 @@ def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
         (["wrap", "photos", "--out", "o", "--tiles", "x", "--no-blend"], 2, "--tiles is"),
         (["wrap", "photos", "--out", "o", "--texture-size", "7"], 2, "--texture-size is"),
         (["estimate-mesh", "--out", "photos", "--threads", "-1"], 2, "--threads is out of range. "),
-        (["work-tiles", "photos", "--threads", "2000"], 2, "--threads is out of range. Give from"),
-        (["work-tiles", "photos", "--wait", "-1"], 2, "--wait is out of range. Give from 0 to"),
-        (["work-tiles", "photos", "--wait", "nan"], 2, "--wait is out of range. Give from 0 to"),
+        (["run-part", "photos", "train", "--threads", "2000"], 2, "--threads is out of range. "),
+        (["farm", "worker", "tcp://127.0.0.1:1", "--slots", "0"], 2, "--slots is out of range. "),
+        (["wrap", "photos", "--out", "o", "--processes", "0", "--no-blend"], 2, "--processes is"),
+        (["wrap", "photos", "--out", "o", "--computers", "here", "--no-blend"], 2, "--computers"),
         (["evaluate", "m.ply", "--truth", "photos", "--threads", "-1"], 2, "--threads is"),
         (["wrap", "photos", "--out", "o", "--lods", "9", "--no-blend"], 2, "--lods is"),
         (["wrap", "photos", "--out", "o", "--pivots", "4", "--no-blend"], 2, "--pivots"),

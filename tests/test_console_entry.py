@@ -87,6 +87,9 @@ def test_the_wheel_is_complete(entry: tuple[str, str], tmp_path: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         for name in lists:
             assert archive.read(f"{package}/{name}") == (ROOT / name).read_bytes()
+        data = [p for p in (ROOT / package).rglob("*") if p.suffix in (".js", ".json", ".cu")]
+        assert len(data) >= 3
+        assert {p.relative_to(ROOT).as_posix() for p in data} <= set(archive.namelist())
         scripts = next(n for n in archive.namelist() if n.endswith("entry_points.txt"))
         assert f"{NAME} = {':'.join(entry)}" in archive.read(scripts).decode()
         archive.extractall(tmp_path / "site")

@@ -21,6 +21,7 @@ from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.jobs import runner
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.commands import device_check
+from gaussian_wrapping_addon.core.jobs.parts import part_runner
 from gaussian_wrapping_addon.core.jobs.stages.mesh_keys import mesh_key
 from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.bake_request import BakeRequest
@@ -63,7 +64,7 @@ COMMANDS = [
     "more --out job/out --iterations 5 --no-blend",
     "resume job/out --no-blend",
     "resume job/out --max-gaussians 5000 --no-blend",
-    "work-tiles job/out",
+    "run-part job/out train",
 ]
 
 
@@ -247,7 +248,7 @@ def test_a_job_that_names_a_missing_gpu_ends_before_its_photos_are_read(
         raise DeviceError(f"The device {setting} cannot be used: none.")
 
     monkeypatch.setattr(runner, "choose_device", missing)
-    monkeypatch.setattr(runner, "run_cameras", lambda *_, **__: pytest.fail("read the photos"))
+    monkeypatch.setattr(part_runner, "run_cameras", lambda *_, **__: pytest.fail("read the photos"))
     job = read_job(folder.job_path)
     with pytest.raises(DeviceError, match="The device auto cannot be used"):
         runner.run_job(folder, job, lambda event: None, lambda: False)

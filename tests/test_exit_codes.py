@@ -21,7 +21,8 @@ from gaussian_wrapping_addon.core.errors import (
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, write_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER, JobFolder
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.names import JOB_MARKER
 from gaussian_wrapping_addon.core.settings import JobSettings
 
 LONG = "x" * 300
@@ -40,7 +41,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("begun", "trained"):
         job = tmp_path / name
         (job / "stages").mkdir(parents=True)
-        (job / MARKER).touch()
+        (job / JOB_MARKER).touch()
         write_job(job / "job.json", JobFile("wrap", str(tmp_path / "photos"), JobSettings()))
     stage = tmp_path / "trained" / "stages" / "train-a"
     stage.mkdir()
@@ -62,9 +63,12 @@ def code_of(words: str) -> int:
         "export empty --out new",
         "evaluate empty --truth mesh.off",
         "estimate-mesh --out empty",
-        "work-tiles empty",
         "status empty",
         "cancel empty",
+        "farm submit empty --flamenco http://127.0.0.1:9",
+        "farm status empty",
+        "farm cancel empty",
+        "farm retry empty",
         "set-up-worker --dry-run --to trained",
         "set-up-worker --dry-run --to file",
         "set-up-worker --to new --find-links file",
@@ -81,10 +85,12 @@ def test_a_folder_that_is_no_job(place: Path, words: str) -> None:
     [
         f"status {LONG}",
         f"cancel {LONG}",
+        f"farm submit {LONG} --flamenco http://127.0.0.1:9",
+        f"farm status {LONG}",
+        f"farm job-type {LONG}",
         f"resume {LONG}",
         f"export {LONG} --out new",
         f"estimate-mesh --out {LONG}",
-        f"work-tiles {LONG}",
         f"estimate {LONG}",
         f"wrap photos --out new --no-blend --region {LONG}.json",
         f"wrap photos --out new --no-blend --start-splat {LONG}.ply",

@@ -31,7 +31,7 @@ FOLDERS = (
     "core/training/optimizer", "core/training/losses", "core/training/density",
     "core/training/appearance", "core/training/poses", "core/training/selection",
     "core/training/initialisation", "core/training/devices",
-    "core/training", "core/training/cost", "core/masks",
+    "core/training", "core/training/blocks", "core/training/cost", "core/masks",
     "core/meshing/tetrahedra", "core/meshing/points", "core/meshing/cleanup",
     "core/meshing/checks", "core/meshing", "core/meshing/tiles", "core/meshing/cost",
     "core/texture/atlas", "core/texture/unwrap", "core/texture/bake", "core/texture/cost",
@@ -39,16 +39,17 @@ FOLDERS = (
     "core/evaluation/surface", "core/evaluation/alignment", "core/evaluation/layouts",
     "core/evaluation/color_field", "core/evaluation/views", "core/evaluation/report",
     "core/evaluation",
-    "core/jobs/store", "core/jobs/video", "core/jobs/stages", "core/jobs/masking",
-    "core/jobs/baking", "core/jobs",
-    "core/jobs/commands", "core/setup",
+    "core/cluster", "core/jobs/store", "core/jobs/video", "core/jobs/stages", "core/jobs/masking",
+    "core/jobs/baking", "core/jobs/parts", "core/jobs",
+    "core/jobs/commands", "core/jobs/commands/farm", "core/setup", "core/farm",
+    "core/farm/flamenco",
     "ops/common", "ops/cameras", "ops/regions", "ops/placement", "ops/results", "ops/baking",
     "ops/export",
-    "ops/worker", "ops/jobs", "ops/presets", "ops/training", "ops/dataset", "ops/meshing",
-    "ops/masks", "ops",
+    "ops/worker", "ops/jobs", "ops/computers", "ops/presets", "ops/training", "ops/dataset",
+    "ops/meshing", "ops/masks", "ops",
     "ui/translations", "ui/common", "ui/worker", "ui/jobs", "ui/presets", "ui/dataset",
-    "ui/training", "ui/masks", "ui/regions", "ui/meshing", "ui/baking", "ui/results",
-    "ui/placement", "ui",
+    "ui/training", "ui/computers", "ui/masks", "ui/regions", "ui/meshing", "ui/baking",
+    "ui/results", "ui/placement", "ui",
     "command_line/options", "command_line", "",
 )  # fmt: skip
 
@@ -67,7 +68,8 @@ BLENDER_SIDE = (
     "core.jobs.commands.evaluate_command", "core.jobs.store.job_file",
     "core.dataset.loading.check", "core.settings", "core.setup.install",
     "core.processes.worker_environment", "core.regions.box", "core.regions.region_file",
-    "core.names", "core.gaussians.preview_points",
+    "core.names", "core.gaussians.preview_points", "core.farm.flamenco.submission",
+    "core.farm.flamenco.job_state", "core.jobs.parts.planning", "core.farm.part_states",
 )  # fmt: skip
 HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl", "av")
 

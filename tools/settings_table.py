@@ -30,6 +30,7 @@ _PANELS = {
     "mesh": "Mesh",
     "mesh_advanced": "Mesh, Advanced",
     "texture": "Texture",
+    "computers": "Computers",
     "preferences": "Preferences",
 }
 _HEAD = f"""\

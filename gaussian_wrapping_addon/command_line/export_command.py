@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command ``export``: write the results of a finished job for other programs."""
+"""The commands ``export`` and ``convert-region``: results and regions for other programs."""
 
 from __future__ import annotations
 
@@ -94,3 +94,29 @@ def _export(options: Namespace) -> int:
         for path in paths:
             _logger.info("written: %s", path)
     return 0
+
+
+def add_convert_region(commands: Commands) -> None:
+    """Add ``convert-region``."""
+    parser = commands.add_parser(
+        "convert-region", help="convert a region file: JSON, or .rsbox of RealityScan"
+    )
+    parser.add_argument("input", type=Path, metavar="FILE")
+    parser.add_argument("output", type=Path, metavar="OUT", help="ends with .json or .rsbox")
+    parser.set_defaults(run=_convert_region)
+
+
+def _convert_region(options: Namespace) -> int:
+    from ..core.errors import EXIT_DONE, UsageError
+    from ..core.regions.region_file import read_region_file, write_region_file
+    from ..core.regions.rsbox import SUFFIXES
+
+    output: Path = options.output
+    if output.suffix.lower() not in (".json", *SUFFIXES):
+        raise UsageError(f"{output.name} names no format.", "Let it end with .json or .rsbox.")
+    region = read_region_file(options.input)
+    if not output.parent.is_dir():
+        raise UsageError(f"{output.parent} is no folder.", "Make it first.")
+    write_region_file(output, region.name, region.vertices)
+    _logger.info("written: %s", output)
+    return EXIT_DONE

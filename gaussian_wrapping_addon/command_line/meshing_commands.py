@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The commands ``mesh``, ``estimate-mesh`` and ``work-tiles``: mesh a finished training."""
+"""The commands ``mesh`` and ``estimate-mesh``: mesh a finished training."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from .options.meshing_options import (
     method_settings,
     region_settings,
 )
-
-MAX_WAIT_S = 7 * 86400.0
 
 
 def add_mesh(commands: Commands) -> None:
@@ -85,39 +83,4 @@ def _estimate_mesh(options: Namespace) -> int:
         python=worker_python(),
         module="jobs.commands.estimate_mesh_command",
         what="estimate",
-    )
-
-
-def add_work_tiles(commands: Commands) -> None:
-    """Add ``work-tiles``."""
-    parser = commands.add_parser(
-        "work-tiles", help="mesh tiles of a running job, in another process or on another machine"
-    )
-    parser.add_argument("out", type=Path, metavar="DIR", help="job folder of that job")
-    add_threads(parser)
-    add_device(parser)
-    parser.add_argument(
-        "--wait", type=float, default=0.0, metavar="S", help="longest time to wait for tiles, in s"
-    )
-    parser.set_defaults(run=_work_tiles)
-
-
-def _work_tiles(options: Namespace) -> int:
-    from ..core.errors import UsageError
-    from ..core.files import real_path
-    from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.device_check import require_device
-    from ..core.jobs.commands.run_in_worker import run_in_worker
-    from ..core.settings import JobSettings
-
-    JobSettings(threads=options.threads, device=options.device).validated()
-    if not 0 <= options.wait <= MAX_WAIT_S:
-        raise UsageError("--wait is out of range.", f"Give from 0 to {MAX_WAIT_S:.0f} seconds.")
-    require_device(options.device)
-    request = {
-        "out": str(real_path(options.out)), "threads": options.threads, "wait_s": options.wait,
-        "device": options.device,
-    }  # fmt: skip
-    return run_in_worker(
-        request, python=worker_python(), module="jobs.commands.tile_worker", what="work on tiles"
     )

@@ -10,17 +10,24 @@ from typing import Any, NoReturn
 from .bake_command import add_bake
 from .check_commands import add_check, add_doctor
 from .evaluate_command import add_evaluate
-from .export_command import add_export
-from .job_commands import add_cancel, add_status
-from .meshing_commands import add_estimate_mesh, add_mesh, add_work_tiles
-from .region_command import add_convert_region
+from .export_command import add_convert_region, add_export
+from .farm_commands import add_farm
+from .job_commands import add_cancel, add_parts, add_run_part, add_status
+from .meshing_commands import add_estimate_mesh, add_mesh
 from .setup_command import add_set_up_worker
-from .training_commands import add_continue_training, add_estimate, add_resume, add_wrap
+from .training_commands import (
+    add_continue_training,
+    add_estimate,
+    add_queue,
+    add_resume,
+    add_wrap,
+)
 
 _logger = logging.getLogger("gaussian_wrapping")
 
 _COMMANDS = (
     add_wrap,
+    add_queue,
     add_mesh,
     add_bake,
     add_continue_training,
@@ -28,7 +35,9 @@ _COMMANDS = (
     add_status,
     add_cancel,
     add_estimate_mesh,
-    add_work_tiles,
+    add_parts,
+    add_run_part,
+    add_farm,
     add_export,
     add_convert_region,
     add_evaluate,
@@ -40,13 +49,26 @@ _COMMANDS = (
 """In the order shown by ``--help``."""
 
 
+_MOST_USAGE = 240
+"""Characters of a usage that an error quotes, some three lines; ``--help`` has longer ones."""
+
+
 class Parser(ArgumentParser):
     """Raise :class:`UsageError` instead of exiting the process, so that Blender exits cleanly."""
 
     def error(self, message: str) -> NoReturn:
         from ..core.errors import UsageError
 
-        raise UsageError(f"{message}.", f"Usage: {' '.join(self.format_usage().split()[1:])}")
+        usage = " ".join(self.format_usage().split()[1:])
+        short = f"Usage: {usage}" if len(usage) <= _MOST_USAGE else f"See {self.prog} --help."
+        raise UsageError(f"{message}.", short)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse unknown options in the command that got them: the main parser names no option."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found, unknown
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """Write help as the commands write: ``argparse`` fails on ASCII and hides full disks."""

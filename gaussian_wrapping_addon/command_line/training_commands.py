@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The commands ``wrap``, ``more``, ``resume`` and ``estimate``: jobs that train."""
+"""The commands ``wrap``, ``queue``, ``more``, ``resume`` and ``estimate``: jobs that train."""
 
 from __future__ import annotations
 
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger("gaussian_wrapping")
 
+MOST_JOBS = 10_000
+"""Of a queue."""
+
 
 def add_wrap(commands: Commands) -> None:
     """Add ``wrap``."""
@@ -34,27 +37,54 @@ def add_wrap(commands: Commands) -> None:
     add_method_options(parser)
     add_region_options(parser)
     add_no_blend(parser)
+    parser.add_argument(
+        "--plan-only", action="store_true", help="write the job and its parts, run nothing"
+    )
     parser.set_defaults(run=_wrap)
 
 
 def _wrap(options: Namespace) -> int:
+    from ..core.errors import EXIT_DONE
+    from ..core.jobs.client import JobClient, prepare_job, worker_python
+
+    job = checked_job(options.input, options)
+    if not options.plan_only:
+        require_bpy(job, options)
+        return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+    from ..core.jobs.parts.planning import plan_if_missing
+
+    folder = prepare_job(options.out, job)
+    graph = plan_if_missing(folder)
+    _logger.info("%d parts are planned; parts %s lists them", len(graph.parts), folder.root)
+    return EXIT_DONE
+
+
+def checked_job(photos: Path, options: Namespace) -> JobFile:
+    """Return the job that wraps photos with the options given; warn of what they show.
+
+    Raises
+    ------
+    DatasetError, UsageError, DeviceError
+        The photos, an option or the device cannot be used.
+    """
     from ..core.dataset.loading.check import check_input
     from ..core.errors import DatasetError
-    from ..core.jobs.client import JobClient, worker_if_any, worker_python
+    from ..core.jobs.client import worker_if_any
     from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import make_job
 
     settings = training_settings(options)
-    job = make_job("wrap", options.input, region_settings(settings, options))
-    require_bpy(job, options)
+    # Presets of the program have no settings of textures; those of users have.
+    job = make_job("wrap", photos, region_settings(settings, options, texture_stays=True))
     require_device(job.settings.device)
     _reject_frames_of_photos(job)
-    for finding in check_input(options.input, worker=worker_if_any()):
+    panoramas = job.settings.equirectangular
+    for finding in check_input(photos, worker=worker_if_any(), panoramas=panoramas):
         if finding.severity == "error":
             raise DatasetError(finding.message, finding.hint)
         if finding.severity == "warning":
             _logger.warning("warning: %s %s", finding.message, finding.hint)
-    return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+    return job
 
 
 def _reject_frames_of_photos(job: JobFile) -> None:
@@ -162,3 +192,88 @@ def _estimate(options: Namespace) -> int:
         module="jobs.commands.estimate_command",
         what="estimate",
     )
+
+
+def add_queue(commands: Commands) -> None:
+    """Add ``queue``."""
+    parser = commands.add_parser(
+        "queue", help="wrap each folder of photos in a folder, and list the results"
+    )
+    parser.add_argument("input", type=Path, metavar="FOLDER", help="folder of folders of photos")
+    add_training_options(parser)
+    add_out(parser)
+    add_method_options(parser)
+    add_region_options(parser)
+    parser.set_defaults(run=_queue)
+
+
+def _queue(options: Namespace) -> int:
+    from ..core.errors import UsageError, WrapError, known_error
+    from ..core.files import real_path
+    from ..core.jobs.client import prepare_job, worker_python
+    from ..core.jobs.commands.run_in_worker import run_in_worker
+
+    root, out = real_path(options.input), real_path(options.out)
+    if out == root or out.is_relative_to(root):
+        raise UsageError(f"{options.out} lies inside {options.input}.", "Give a folder beside it.")
+    names, refused = [], 0
+    for folder in _folders(root):
+        try:
+            job = checked_job(folder, options)
+            if not _is_same(out / folder.name, job):
+                prepare_job(out / folder.name, job)
+            names.append(folder.name)
+        except WrapError as error:
+            refused += 1
+            _logger.error("error: %s: %s", folder.name, error)
+        except OSError as error:
+            raise known_error(error, out) or error from None
+    if not names:
+        raise UsageError(f"No folder in {options.input} can be wrapped.", "See the errors above.")
+    request = {
+        "out": str(out), "jobs": names, "computers": options.computers or "",
+        "processes": _default(options.processes, "processes"),
+        "certificates": str(options.certificates or ""),
+    }  # fmt: skip
+    code = run_in_worker(request, python=worker_python(), module="jobs.queue_process", what="queue")
+    return code or int(bool(refused))
+
+
+def _folders(root: Path) -> list[Path]:
+    """Return the folders of a folder, by name.
+
+    Raises
+    ------
+    UsageError
+        There is no such folder, or it holds none, or too many.
+    """
+    from ..core.errors import UsageError
+
+    if not root.is_dir():
+        raise UsageError(f"{root} is not a folder.", "Give a folder of folders of photos.")
+    found = sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
+    if not 0 < len(found) <= MOST_JOBS:
+        raise UsageError(
+            f"{root} holds {len(found)} folders, not from 1 to {MOST_JOBS}.",
+            "Give a folder that holds one folder of photos for each wrap.",
+        )
+    return found
+
+
+def _is_same(folder: Path, job: JobFile) -> bool:
+    """Return whether a folder holds this job already, begun or finished."""
+    from ..core.errors import WrapError
+    from ..core.jobs.parts.planning import plan_hash
+    from ..core.jobs.store.job_file import read_job
+    from ..core.jobs.store.job_folder import JobFolder
+
+    try:
+        return plan_hash(read_job(JobFolder(folder).job_path)) == plan_hash(job)
+    except (WrapError, OSError):
+        return False
+
+
+def _default(value: int | None, path: str) -> int:
+    from ..core.settings import declared
+
+    return int(declared(path).default) if value is None else value

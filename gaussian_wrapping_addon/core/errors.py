@@ -33,6 +33,8 @@ class WrapError(Exception):
     """
 
     exit_code = EXIT_OTHER
+    can_resume = False
+    """Whether a mesh that ends so keeps what it has begun, as a cancelled one does."""
 
     def __init__(self, message: str, hint: str = "") -> None:
         super().__init__(message)
@@ -160,6 +162,10 @@ def known_error(error: OSError, path: str | Path = "") -> WrapError | None:
             "Use shorter names.",
         )
     return None
+
+
+class FarmError(WrapError):
+    """A farm's manager cannot be reached, answers as none does, or refuses what it is asked."""
 
 
 class DeviceError(WrapError):

@@ -44,6 +44,27 @@ def write_bytes(path: Path, data: bytes) -> None:
         partial.unlink(missing_ok=True)
 
 
+def seconds_since_written(path: Path) -> float:
+    """Return the age of a file by the clock of its file system: those of computers differ.
+
+    Raises
+    ------
+    OSError
+        There is no such file.
+    """
+    written_s = path.stat().st_mtime
+    probe = path.with_name(f"{path.name}{_PARTIAL}{uuid.uuid4().hex[:8]}")
+    try:
+        probe.touch(exist_ok=False)
+        now_s = probe.stat().st_mtime
+    except OSError:  # it cannot be written: the clock of this computer is all there is
+        now_s = time.time()
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink(missing_ok=True)
+    return now_s - written_s
+
+
 def remove_partial_files(root: Path) -> None:
     """Remove what :func:`write_bytes` of killed processes left anywhere in a folder.
 

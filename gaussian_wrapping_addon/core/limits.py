@@ -18,6 +18,7 @@ MAX_CHOSEN_FRAMES = 2000
 MAX_JSON_BYTES = 64 * 1024 * 1024
 MAX_STATUS_BYTES = 1024 * 1024
 """Largest status or lock file: Blender's main thread reads them."""
+MAX_PART_STATE_BYTES = 64 * 1024
 MAX_JSON_DEPTH = 32
 MAX_LINE_BYTES = 1024 * 1024
 MAX_NAME_BYTES = 1024
@@ -26,6 +27,9 @@ MAX_MODEL_BYTES = 2 * 1024**3
 """Largest segmentation model: that of one ONNX file."""
 MAX_MESH_POINTS = 5_000_000
 MAX_TILES = 4096
+MAX_PARTS = 50_000
+"""Of a job: those of a few regions of the most tiles."""
+MAX_PARTS_BYTES = 32 * 1024 * 1024
 MAX_TEXTURE_SIDE_PX = 8192
 MAX_ATLASES = 16
 """Largest number of textures per mesh: each is a material and an image for readers."""
@@ -42,6 +46,9 @@ SHORTEST_EDGE = 1e-30
 HELPER_DEADLINE_S = 3600.0
 PARTIAL_FILE_S = 60.0
 """Time after the last write to a temporary file until it counts as left by a killed process."""
+SILENT_S = 90.0
+"""Time without a heartbeat after which a process of another computer counts as ended. File systems
+of networks may show a heartbeat a minute late."""
 CANCEL_ALONE_S = 7.0
 """Time after which a cancelled worker exits if its main thread does not poll for cancellation."""
 CANCEL_GRACE_S = 9.0

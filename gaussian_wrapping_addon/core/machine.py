@@ -20,6 +20,11 @@ PACKAGES = (
     "libigl", "av",
 )  # fmt: skip
 
+HELPER_MEMORY_SHARE = 0.9
+"""Of the machine's memory: a helper process that wants more is ended before the system chooses."""
+MIN_HELPER_MEMORY_BYTES = 8 << 30
+"""A limit includes reserved address space; below this a helper's threads may not start."""
+
 _PROC = Path("/proc")
 _GROUPS = Path("/sys/fs/cgroup")
 
@@ -60,6 +65,12 @@ def total_memory_bytes() -> int:
     """Return the total memory of this machine or its container; 0 if unknown."""
     installed = _installed_bytes()
     return min([installed, *(limit for limit, _ in _groups())]) if installed else 0
+
+
+def helper_memory_limit_bytes() -> int | None:
+    """Return the memory limit of helper processes on foreign input; ``None`` where unknown."""
+    total = total_memory_bytes()
+    return max(int(HELPER_MEMORY_SHARE * total), MIN_HELPER_MEMORY_BYTES) if total else None
 
 
 def available_memory_bytes() -> int:

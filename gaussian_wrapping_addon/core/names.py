@@ -25,6 +25,8 @@ REPORT_FOLDER = "report"
 """Folder of the report's pictures in a result; reserved, no region may use it."""
 JOB_MARKER = ".gaussian-wrapping-job"
 """Empty file that makes a folder one of a job."""
+SHARED_VARIABLE = "GW_SHARED"
+"""Environment variable that names the folder that several computers share, as each sees it."""
 MAX_REGION_CHARACTERS = 40
 MAX_STEM_BYTES = 120
 """With suffixes, and those of atomic writing, names stay below the 255 bytes of file systems."""

@@ -20,6 +20,7 @@ from bpy.props import (
 
 from .baking.bake_properties import GWRAP_PG_bake
 from .common.setting_properties import with_settings
+from .computers.computers_properties import GWRAP_PG_computers
 from .regions.region_properties import GWRAP_PG_region
 from .training.training_properties import GWRAP_PG_training
 
@@ -78,6 +79,7 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
         options={"HIDDEN"},
     )
     bake: PointerProperty(type=GWRAP_PG_bake)  # type: ignore[valid-type]
+    computers: PointerProperty(type=GWRAP_PG_computers)  # type: ignore[valid-type]
     checked_source: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     checked_text: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     checked_kind: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]

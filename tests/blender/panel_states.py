@@ -25,7 +25,17 @@ PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel
 
 OPERATORS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Operator)]
 
-ORDER = ["Dataset", "Train", "Region", "Mesh", "Texture", "Bake", "Result", "Scene Tools"]
+ORDER = [
+    "Dataset",
+    "Train",
+    "Computers",
+    "Region",
+    "Mesh",
+    "Texture",
+    "Bake",
+    "Result",
+    "Scene Tools",
+]
 
 ANSWER = Estimate(
     (

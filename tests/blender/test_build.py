@@ -47,7 +47,7 @@ def test_the_zip_holds_the_package_and_nothing_else(built: Path) -> None:
         if "__pycache__" in n or n.endswith((".pyc", ".nbi")) or "test" in n.lower()
     ]
     assert wrong == []
-    assert built.stat().st_size < 1.5 * 2**20, "pure Python stays under a megabyte and a half"
+    assert built.stat().st_size < 2 * 2**20, "pure Python stays under two megabytes"
 
 
 def test_blenders_validator_was_found_and_accepts_the_zip(

@@ -12,6 +12,7 @@ import pytest
 from gaussian_wrapping_addon.core.settings import JobSettings, declarations, declared
 from gaussian_wrapping_addon.ops.worker import preferred_worker
 from gaussian_wrapping_addon.ui import preferences
+from gaussian_wrapping_addon.ui.computers import computers_panel
 from gaussian_wrapping_addon.ui.dataset import dataset_panel
 from gaussian_wrapping_addon.ui.meshing import mesh_panel, texture_panel
 from gaussian_wrapping_addon.ui.training import train_advanced_panel, train_panel
@@ -116,6 +117,7 @@ def test_every_declared_property_is_there_and_drawn() -> None:
             dataset_panel.GWRAP_PT_dataset,
             train_panel.GWRAP_PT_train,
             train_advanced_panel.GWRAP_PT_train_advanced,
+            computers_panel.GWRAP_PT_computers,
             mesh_panel.GWRAP_PT_mesh,
             mesh_panel.GWRAP_PT_mesh_advanced,
             texture_panel.GWRAP_PT_texture,

@@ -100,3 +100,18 @@ def test_this_machine_is_described() -> None:
     assert set(found["packages"]) == set(machine.PACKAGES)
     assert 0 < machine.available_memory_bytes() <= machine.total_memory_bytes()
     assert found["processor"]
+
+
+@pytest.mark.parametrize(
+    ("installed", "limit"),
+    [
+        (64 * GIB, int(0.9 * 64 * GIB)),
+        (4 * GIB, 8 * GIB),  # threads of a helper reserve more than they use
+        (0, None),
+    ],
+)
+def test_helpers_get_a_share_of_the_memory(
+    installed: int, limit: int | None, system: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(machine, "_installed_bytes", lambda: installed)
+    assert machine.helper_memory_limit_bytes() == limit

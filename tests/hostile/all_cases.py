@@ -9,6 +9,7 @@ from tests.hostile.cases import (
     colmap_sets,
     colmap_values,
     commands,
+    farms,
     findings,
     job_folders,
     job_places,
@@ -34,6 +35,7 @@ GROUPS: tuple[Group, ...] = (
     commands.GROUP,
     findings.GROUP,
     masks.GROUP,
+    farms.GROUP,
 )
 
 

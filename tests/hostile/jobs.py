@@ -12,11 +12,11 @@ from typing import Any
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import (
-    MARKER,
     JobFolder,
     JobStatus,
     process_start_ticks,
 )
+from gaussian_wrapping_addon.core.names import JOB_MARKER
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.jobs.commands.test_export_files import write_result
 from tests.core.jobs.finished_sphere import write_finished_sphere
@@ -51,7 +51,7 @@ def trained(folder: Path) -> None:
 def with_result(folder: Path) -> None:
     """Make a job with the textured mesh of a cube as its result."""
     write_result(folder / JOB)
-    (folder / JOB / MARKER).touch()
+    (folder / JOB / JOB_MARKER).touch()
 
 
 def sphere(folder: Path) -> None:

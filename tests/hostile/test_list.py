@@ -12,7 +12,7 @@ from tests.hostile.all_cases import cases
 from tests.hostile.case import row_id
 
 ROOT = Path(__file__).resolve().parents[2]
-NUMBERS = range(1, 73)
+NUMBERS = range(1, 75)
 
 
 def test_every_number_is_there_once_and_has_a_row_or_a_test() -> None:

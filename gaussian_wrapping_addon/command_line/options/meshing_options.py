@@ -74,10 +74,13 @@ def add_region_options(parser: ArgumentParser) -> None:
     add_options(parser, "region")
 
 
-def region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
+def region_settings(
+    settings: JobSettings, options: Namespace, *, texture_stays: bool = False
+) -> JobSettings:
     """Return settings with the options of :func:`add_method_options` and `add_region_options`.
 
-    Options that are not given have their defaults, not the values of an earlier mesh.
+    Options that are not given have their defaults, not the values of an earlier mesh; with
+    ``texture_stays``, those of the texture have the values of ``settings``.
 
     Raises
     ------
@@ -85,7 +88,11 @@ def region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
         An option is given that the method ignores, or a value cannot be parsed.
     """
     given = given_settings(options, "region")
-    values = {entry.path: entry.default for entry in declared_options("region")}
+    values = {
+        entry.path: entry.default
+        for entry in declared_options("region")
+        if not (texture_stays and entry.group == "texture")
+    }
     values |= {f"meshing.{name}": value for name, value in method_settings(options).items()}
     values |= given
     if options.threads is not None:

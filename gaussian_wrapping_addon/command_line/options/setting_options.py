@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
+from argparse import ArgumentTypeError, Namespace
+from collections.abc import Callable
 from typing import Any
 
 from ...core.settings import Declaration, JobSettings, declarations
@@ -54,10 +55,24 @@ def add_option(parser: Any, entry: Declaration, **changes: Any) -> None:
         keywords["metavar"] = option.metavar or (None if entry.choices else shown)
         keywords["choices"] = entry.choices or None
         if option.parse is None and entry.kind in (int, float):
-            keywords["type"] = entry.kind
+            keywords["type"] = _number_reader(entry)
     if option.many:
         keywords |= {"nargs": "+", "action": "extend"}
     parser.add_argument(option.name, **(keywords | changes))
+
+
+def _number_reader(entry: Declaration) -> Callable[[str], Any]:
+    """Return what reads the number of an option; its error gives the valid ones."""
+
+    def read(text: str) -> Any:
+        try:
+            return entry.kind(text)
+        except ValueError:
+            valid = f"; give {entry.check.wanted}" if entry.check is not None else ""
+            kind = entry.kind.__name__
+            raise ArgumentTypeError(f"invalid {kind} value: {text!r}{valid}") from None
+
+    return read
 
 
 def given_settings(options: Namespace, scope: Scope) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from argparse import ArgumentParser, Namespace
 
 from ...core.settings import MODEL_SELECTION, JobSettings, preset, with_values
 from .setting_options import add_options, given_settings, option_of
+from .user_preset import add_user_preset, saved_values
 
 _SELECTION_VALUES = {"auto": "auto", "all": "on", "none": "off"}
 """Values of ``--needs`` and the model selection that they set."""
@@ -15,6 +16,7 @@ _SELECTION_VALUES = {"auto": "auto", "all": "on", "none": "off"}
 def add_training_options(parser: ArgumentParser) -> None:
     """Add preset, seed, threads, device and all options of the training."""
     add_options(parser, "training")
+    add_user_preset(parser)
     names = ", ".join(option_of(f"training.{name}") for name in MODEL_SELECTION)
     parser.add_argument(
         "--needs",
@@ -31,15 +33,17 @@ def add_training_options(parser: ArgumentParser) -> None:
 
 
 def training_settings(options: Namespace) -> JobSettings:
-    """Return the preset's settings with the options of :func:`add_training_options`.
+    """Return settings: the preset's, a user's preset, the options of :func:`add_training_options`.
 
     Ranges are checked when the job is made.
     """
     values = given_settings(options, "training") | given_settings(options, "constants")
+    saved = saved_values(options, values.get("preset"))
     if options.needs is not None:
         selected = {
             f"training.{name}": _SELECTION_VALUES[options.needs] for name in MODEL_SELECTION
         }
         values = {**selected, **values}
+    values = {**saved, **values}
     chosen = preset(values.pop("preset", JobSettings().preset))
     return with_values(chosen, values)

@@ -14,6 +14,7 @@ from .. import limits
 from ..array_file import read_arrays
 from ..errors import DatasetError, ParseError
 from ..files import read_json, write_bytes, write_json
+from ..names import SHARED_VARIABLE
 from ..report_warning import read_warnings
 from .camera import Camera
 from .scene import Scene, View
@@ -59,7 +60,8 @@ def scene_to_json(scene: Scene, folder: Path | None = None) -> dict[str, Any]:
     """Return the scene without its points as plain JSON values.
 
     Paths inside ``folder``, or in a folder beside it, are written relative to it, so that a job
-    folder can be moved.
+    folder can be moved; and those inside the folder that several computers share
+    (``names.SHARED_VARIABLE``), which each sees elsewhere.
     """
     return {
         "version": VERSION,
@@ -115,7 +117,15 @@ def _written(path: Path, folder: Path | None) -> str:
         return path.relative_to(folder).as_posix()
     if folder is not None and path.is_relative_to(folder.parent):  # frames of a video
         return f"../{path.relative_to(folder.parent).as_posix()}"
+    shared = os.environ.get(SHARED_VARIABLE)
+    if folder is not None and shared and _both_in(Path(shared), path, folder):
+        return Path(os.path.relpath(path, folder)).as_posix()
     return str(path)
+
+
+def _both_in(shared: Path, path: Path, folder: Path) -> bool:
+    root = shared.resolve()
+    return path.is_relative_to(root) and folder.resolve().is_relative_to(root)
 
 
 def _read(written: str, folder: Path) -> Path:

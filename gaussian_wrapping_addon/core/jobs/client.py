@@ -27,7 +27,7 @@ from ..errors import (
 )
 from ..files import real_path
 from ..processes.helper_process import child_command
-from ..processes.process_identity import process_alive
+from ..processes.process_identity import is_here, process_alive
 from ..processes.spawn import kill_group, spawn
 from ..processes.worker_environment import ready_worker
 from ..processes.worker_requirements import not_started
@@ -113,6 +113,35 @@ def _writing(root: Path) -> Iterator[None]:
         raise unwritable_error(error.filename2 or error.filename or root, error) from None
 
 
+def prepare_job(folder: Path, job: JobFile) -> JobFolder:
+    """Write a job into its folder, to be started or submitted.
+
+    Parameters
+    ----------
+    folder : Path
+        New, empty, or a job folder.
+
+    Raises
+    ------
+    WrapError
+        The folder cannot be used, or a job runs there; the earlier job stays.
+    """
+    target = JobFolder(real_path(folder))
+    source = Path(job.source)
+    if source.is_dir() and target.root.is_relative_to(source):
+        raise UsageError(
+            f"{folder} lies inside the photos' folder.", "Choose a folder outside of it."
+        )
+    target.create()
+    if target.locked():
+        raise UsageError(f"A job is running in {folder}.", RUNNING_HINT)
+    reject_region_conflicts(target.result, job)
+    with _writing(target.root):
+        save_rollback(target, job)
+        write_job(target.job_path, job)
+    return target
+
+
 class JobClient:
     """Handle of one job for Blender or the command line."""
 
@@ -150,20 +179,7 @@ class JobClient:
             The job names a GPU that the driver does not find; nothing was written.
         """
         _reject_absent_device(job)
-        target = JobFolder(real_path(folder))
-        source = Path(job.source)
-        if source.is_dir() and target.root.is_relative_to(source):
-            raise UsageError(
-                f"{folder} lies inside the photos' folder.", "Choose a folder outside of it."
-            )
-        target.create()
-        if target.locked():
-            raise UsageError(f"A job is running in {folder}.", RUNNING_HINT)
-        reject_region_conflicts(target.result, job)
-        with _writing(target.root):
-            save_rollback(target, job)
-            write_job(target.job_path, job)
-        return cls._launch(target, python, keep_running)
+        return cls._launch(prepare_job(folder, job), python, keep_running)
 
     @classmethod
     def resume(
@@ -343,7 +359,7 @@ class JobClient:
             kill_group(self._process)
             return
         status = self.folder.read_status()
-        if not _is_worker(status.pid):
+        if not is_here(status.place) or not _is_worker(status.pid):
             return
         for number in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)):
             end_s = time.monotonic() + KILL_GRACE_S

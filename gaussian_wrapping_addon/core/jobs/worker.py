@@ -20,7 +20,11 @@ from ..errors import EXIT_DONE, Cancelled, WrapError
 from ..files import remove_partial_files
 from ..log_lines import LineFormatter
 from ..processes.helper_process import emit, kill_helpers
-from ..processes.process_identity import Caller, process_start_ticks
+from ..processes.process_identity import (
+    Caller,
+    host_and_pid_namespace,
+    process_start_ticks,
+)
 from ..progress import COMPILING, ProgressEvent
 from ..regular_files import open_regular
 from .failure import failure_of
@@ -83,6 +87,7 @@ class _Reporter:
     def keep_heartbeat(self, caller: Caller | None) -> None:
         """Write the heartbeat; request a stop when the caller has ended. Runs in a thread."""
         requested_s = math.inf
+        shown_s = time.monotonic()
         while not self._stop.wait(PARENT_POLL_S):
             if caller is not None and caller.ended():
                 self.stop_requested = True
@@ -100,6 +105,9 @@ class _Reporter:
                     self.write(state="CANCELLING")
                 elif time.time() - self.status.heartbeat_s > HEARTBEAT_S:
                     self.write()
+            if time.monotonic() - shown_s > HEARTBEAT_S:
+                shown_s = time.monotonic()
+                self.folder.show_life()
 
     def _exit_immediately(self) -> None:
         """Exit while the main thread is in a long native call, such as a compilation.
@@ -175,7 +183,12 @@ def main(arguments: list[str]) -> int:
         return refused.exit_code
     reporter = _Reporter(
         folder,
-        JobStatus(state="RUNNING", pid=os.getpid(), pid_started=process_start_ticks(os.getpid())),
+        JobStatus(
+            state="RUNNING",
+            pid=os.getpid(),
+            pid_started=process_start_ticks(os.getpid()),
+            place=host_and_pid_namespace(),
+        ),
     )
 
     def request_stop(_number: int, _frame: FrameType | None) -> None:
@@ -190,6 +203,7 @@ def main(arguments: list[str]) -> int:
         _logger.error("%s", refused)
         emit(error=refused.message, hint=refused.hint)
         return refused.exit_code
+    can_resume = False
     try:
         remove_partial_files(folder.root)
         reporter.write()
@@ -202,6 +216,7 @@ def main(arguments: list[str]) -> int:
         code = Cancelled.exit_code
         state, error, hint = "CANCELLED", "", RESUME_HINT
     except Exception as error_of_job:
+        can_resume = getattr(error_of_job, "can_resume", False)
         failure = failure_of(error_of_job, folder.root)
         if isinstance(error_of_job, WrapError):
             _logger.error("%s", error_of_job)
@@ -214,7 +229,7 @@ def main(arguments: list[str]) -> int:
     result = str(folder.result) if folder.result.is_dir() else ""
     if state == "DONE":
         discard_rollback(folder)
-    earlier = _roll_back(folder) if state == "FAILED" else None
+    earlier = _roll_back(folder) if state == "FAILED" and not can_resume else None
     finished = {"fraction": 1.0, "seconds_left": 0.0, "message": ""} if state == "DONE" else {}
     last = {**finished, "state": state, "phase": "", "result": result}
     if earlier is not None:

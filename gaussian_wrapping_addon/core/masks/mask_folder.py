@@ -7,6 +7,7 @@ Standard library only, so that Blender can load it.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import re
 import shutil
@@ -27,6 +28,7 @@ VERSION = 1
 MOST_MASK_BYTES = 4 * limits.MAX_IMAGE_PIXELS
 """Largest mask file that is read: one byte a pixel and channel, uncompressed."""
 _KEY = re.compile("[0-9a-f]{1,64}")
+_logger = logging.getLogger(__name__)
 _HINT = "Delete the folder masks and resume the job: its masks are made again."
 
 
@@ -129,7 +131,7 @@ def publish(root: Path, made: Path, masks: MaskList) -> Path:
     """Put masks that were made into the job's folder of masks, unless they are there.
 
     A folder that a person may have edited is kept: masks of another origin are moved aside, to
-    ``masks-KEY``, and come back from there.
+    ``masks-KEY``, and come back from there; files without a list, to ``masks-kept``.
 
     Parameters
     ----------
@@ -147,22 +149,38 @@ def publish(root: Path, made: Path, masks: MaskList) -> Path:
     there = read_list(folder)
     if there is not None and there.made_by == masks.made_by:
         return folder
+    # Complete before it takes the place of the other: an interrupted run leaves no half there.
+    ready = root / f"{FOLDER}-{masks.made_by}"
+    if not is_real_folder(ready) or read_list(ready) is None:
+        if is_real_folder(ready):
+            shutil.rmtree(ready)
+        ready.mkdir()
+        for index, mask in enumerate(masks.masks):
+            target = ready / mask.file
+            target.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(target, read_bounded(made / f"{index:06d}.png", MOST_MASK_BYTES))
+        write_list(ready, masks)
     if there is not None:
         aside = root / f"{FOLDER}-{there.made_by}"
         if is_real_folder(aside):
             shutil.rmtree(aside)
         os.replace(folder, aside)
-    earlier = root / f"{FOLDER}-{masks.made_by}"
-    if is_real_folder(earlier) and not folder.exists():
-        os.replace(earlier, folder)
-        return publish(root, made, masks) if read_list(folder) is None else folder
-    folder.mkdir(exist_ok=True)
-    for index, mask in enumerate(masks.masks):
-        target = folder / mask.file
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(target, read_bounded(made / f"{index:06d}.png", MOST_MASK_BYTES))
-    write_list(folder, masks)
+    elif folder.exists():
+        aside = _unused(root)
+        os.replace(folder, aside)
+        _logger.warning(
+            "%s held files that this job has not made: they are in %s now.", folder.name, aside.name
+        )
+    os.replace(ready, folder)
     return folder
+
+
+def _unused(root: Path) -> Path:
+    """Return a name for files that are not ours."""
+    number = 1
+    while (aside := root / f"{FOLDER}-kept{'' if number == 1 else f'-{number}'}").exists():
+        number += 1
+    return aside
 
 
 def used_masks(folder: Path, masks: MaskList) -> Iterable[tuple[MadeMask, Path]]:

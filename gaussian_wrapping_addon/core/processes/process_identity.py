@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which process is meant: pid and start time; and the caller, with which a child ends.
+"""Which process is meant: place, pid and start time; and the caller, with which a child ends.
 
 A pid alone is used again. A parent alone says nothing to a child that starts when its caller is
 dead already: it has another parent from the start. So each child is told who called it.
@@ -7,8 +7,11 @@ dead already: it has another parent from the start. So each child is told who ca
 
 from __future__ import annotations
 
+import contextlib
 import os
+import platform
 import sys
+from functools import cache
 from pathlib import Path
 
 CALLER_OPTION = "gwrap_caller"
@@ -22,6 +25,24 @@ def process_start_ticks(pid: int) -> int:
     """Return the start time of a process in system ticks; 0 if unknown, as outside Linux."""
     fields = _linux_stat(pid)
     return int(fields[19]) if fields else 0
+
+
+@cache
+def host_and_pid_namespace() -> str:
+    """Return a text that is equal only for processes that see each other's process ids."""
+    parts = [platform.node()]
+    for read in (
+        lambda: Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
+        lambda: os.readlink("/proc/self/ns/pid"),
+    ):
+        with contextlib.suppress(OSError, AttributeError):  # outside Linux: the host name alone
+            parts.append(read())
+    return " ".join(parts)
+
+
+def is_here(place: str) -> bool:
+    """Return whether a record's process ids are ours; one without a place is taken for ours."""
+    return place in ("", host_and_pid_namespace())
 
 
 def process_alive(pid: int, started: int) -> bool:

@@ -63,6 +63,23 @@ EXTRAS = (
         ),
         "onnxruntime", "Mask Models", "segmentation models (ONNX)",
     ),
+    Extra(
+        "farm",
+        (
+            Requirement("cffi", "==2.1.1"), Requirement("click", "==8.5.1"),
+            Requirement("cloudpickle", "==3.1.3"), Requirement("cryptography", "==50.0.2"),
+            Requirement("dask", "==2026.8.0"), Requirement("distributed", "==2026.8.0"),
+            Requirement("importlib-metadata", "==8.9.0"), Requirement("locket", "==1.0.0"),
+            Requirement("msgpack", "==1.2.4"), Requirement("packaging", "==26.4"),
+            Requirement("partd", "==1.4.2"), Requirement("psutil", "==7.2.2"),
+            Requirement("pycparser", "==3.12"), Requirement("pyyaml", "==6.0.4"),
+            Requirement("sortedcontainers", "==2.4.0"), Requirement("tblib", "==3.2.2"),
+            Requirement("toolz", "==1.2.0"), Requirement("tornado", "==6.6.1"),
+            Requirement("urllib3", "==2.8.0"), Requirement("zict", "==3.0.0"),
+            Requirement("zipp", "==4.1.2"),
+        ),
+        "distributed", "Several Computers", "several processes or computers (Dask)",
+    ),
 )  # fmt: skip
 
 

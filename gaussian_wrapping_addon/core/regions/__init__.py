@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Regions of interest: convex bodies, their file format, and automatic regions.
 
-In: region files, corners of solids, cameras, Gaussians. Out: convex bodies. ``region_file.py``,
-``volume.py`` and ``box.py`` need only numpy and are also used in Blender.
+In: region files, corners of solids, cameras, Gaussians. Out: convex bodies, and boxes that
+partition space (``tiling.py``). ``region_file.py``, ``volume.py`` and ``box.py`` need only numpy
+and are also used in Blender.
 """

@@ -11,6 +11,10 @@ SWITCH = ("off", "on")
 DEVICE = r"auto|cpu|cuda(:[0-9]{1,3})?"
 """Pattern of the devices that a job can be given."""
 
+COMPUTERS = r"|local|(tcp|tls)://(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253}):[0-9]{1,5}"
+"""Pattern of where the parts of a job run; empty: here, in one process."""
+MAX_PROCESSES = 64
+
 MASK_MODES = ("ignore", "background", "auto")
 """``"auto"``: background where the masks were made of a turntable, a region or by a model, else
 ignore."""

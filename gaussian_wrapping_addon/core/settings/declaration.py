@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from ..errors import SettingError
 from .checks import Check, Choices
 from .choices import SWITCH
 
@@ -36,7 +37,14 @@ Owner = Literal["scene", "training", "preferences"]
 """Owner of a property in Blender: ``Scene.gwrap``, ``Scene.gwrap.training``, or the add-on."""
 
 PanelName = Literal[
-    "dataset", "train", "train_advanced", "mesh", "mesh_advanced", "texture", "preferences"
+    "dataset",
+    "train",
+    "train_advanced",
+    "mesh",
+    "mesh_advanced",
+    "texture",
+    "computers",
+    "preferences",
 ]
 """A panel in Blender."""
 
@@ -284,3 +292,12 @@ def with_values(settings: Any, values: Mapping[str, Any]) -> Any:
         }
         changes[group] = with_values(getattr(settings, group), inside)
     return dataclasses.replace(settings, **changes)
+
+
+def validate(settings: Any) -> None:
+    """Raise :class:`SettingError` for the first setting whose value is invalid."""
+    kind: type = type(settings)
+    for declared in declarations(kind):
+        check = declared.check
+        if check is not None and not check.holds(value_at(settings, declared.path)):
+            raise SettingError(declared.path, check.wanted)

@@ -30,13 +30,14 @@ from .declaration import (
     PanelProperty,
     declarations,
     setting,
+    validate,
     with_values,
 )
+from .farm import certificates_setting, computers_setting, processes_setting
 from .markers import MARKERS_WANTED, are_markers, checked_markers
 from .meshing import MeshingSettings
 from .texture import TextureSettings
 from .training import TrainingSettings
-from .validation import validate
 
 
 def _formats(text: str) -> tuple[str, ...]:
@@ -102,6 +103,7 @@ class JobSettings:
             owner="preferences",
             panel_name="preferences",
         ),
+        affects_result=False,
     )
     device: str = setting(
         "auto",
@@ -133,6 +135,9 @@ class JobSettings:
         affects_result=False,
         since="0.2.0",
     )
+    computers: str = computers_setting()
+    processes: int = processes_setting()
+    certificates: str = certificates_setting()
     regions: tuple[str, ...] = setting(
         ("auto",),
         help="What is meshed: auto, all, or the paths of region files (JSON, or .rsbox of "
@@ -204,7 +209,8 @@ class JobSettings:
     equirectangular: str = setting(
         "auto",
         help="Whether photos without cameras are 360 degree panoramas, which are cut into pinhole "
-        "views. Auto: where all are exactly twice as wide as high.",
+        "views. Auto: where all are exactly twice as wide as high and none says another projection "
+        "(XMP GPano).",
         check=Choices(PANORAMA_MODES),
         since="0.2.0",
         option=Option(

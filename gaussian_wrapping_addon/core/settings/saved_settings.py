@@ -48,6 +48,7 @@ def savable_settings() -> list[Declaration]:
         for declared in declarations(JobSettings)
         if declared.panel is not None
         and declared.property_owner != "preferences"
+        and declared.panel_name != "computers"
         and not (declared.kind is str and not declared.choices)
     ]
 

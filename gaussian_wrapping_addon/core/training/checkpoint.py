@@ -32,7 +32,11 @@ _BLOCK_BYTES = 1024 * 1024
 
 
 def fingerprint(
-    scene: Scene, settings: TrainingSettings, seed: int, start: Path | None = None
+    scene: Scene,
+    settings: TrainingSettings,
+    seed: int,
+    start: Path | None = None,
+    taken_over: str = "",
 ) -> str:
     """Hash the inputs that a training's result depends on.
 
@@ -42,6 +46,8 @@ def fingerprint(
     ----------
     start : Path, optional
         File of Gaussians that the training starts from; its content is hashed.
+    taken_over : str
+        Digest of what it takes over from another training.
     """
     described = key_values(settings)
     described.pop("extra_iterations")  # a longer run starts as the shorter one does
@@ -56,6 +62,7 @@ def fingerprint(
     if start is not None:
         with open(start, "rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
+    digest.update(taken_over.encode())
     return digest.hexdigest()
 
 

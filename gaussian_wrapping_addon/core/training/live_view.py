@@ -135,7 +135,7 @@ class LiveView:
     photos : PhotoStore
         The training's own; its cache is shared.
     held_out : sequence of int
-        Held-out views. The middle one is shown; without any, the first view of the scene.
+        Held-out views. The middle one is shown.
     folder : Path
         Receives :data:`PREVIEW_FILE`, :data:`PIXELS_FILE` and
         :data:`~..gaussians.preview_points.POINTS_FILE`, each replaced atomically.
@@ -144,6 +144,8 @@ class LiveView:
     threads : int
     renderer : Renderer, optional
         By default one on the processor.
+    otherwise : int
+        View to show where none is held out.
     clock : callable
         Seconds; the first update comes ``preview_every_s`` after the start.
     """
@@ -157,12 +159,14 @@ class LiveView:
         threads: int,
         clock: Callable[[], float] = time.monotonic,
         renderer: Renderer | None = None,
+        otherwise: int = 0,
     ) -> None:
         self._photos, self._held_out, self._folder = photos, list(held_out), folder
         self._every_s, self._threads, self._clock = settings.preview_every_s, threads, clock
         self.renderer = renderer or ViewRenderer()
         self._updated_s = clock()
-        self._shown_view = self._held_out[len(self._held_out) // 2] if self._held_out else 0
+        middle = self._held_out[len(self._held_out) // 2 :]
+        self._shown_view = middle[0] if middle else otherwise
 
     def is_due(self) -> bool:
         """Tell whether :meth:`update` would write anything now."""

@@ -53,6 +53,8 @@ class Rounds:
         Tells which points lie in the regions that density control favours.
     progress : Progress
         Checked for cancellation before every view of a round.
+    filter_views : sequence of int, optional
+        Views whose pixels the 3D filter follows; by default the training views.
     """
 
     def __init__(
@@ -61,8 +63,10 @@ class Rounds:
         held_out: Sequence[int],
         inside: Inside | None,
         progress: Progress,
+        filter_views: Sequence[int] | None = None,
     ) -> None:
         self.stepper, self.held_out, self.inside = stepper, list(held_out), inside
+        self.filter_views = stepper.views if filter_views is None else list(filter_views)
         self.photos: PhotoSource = stepper.photos
         self.schedule: Schedule = stepper.schedule
         self.settings, self.views, self.threads = (
@@ -132,13 +136,16 @@ class Rounds:
 
     def _filter_of(self, state: TrainingState) -> np.ndarray:
         divisor = self.schedule.divisor(min(state.iteration, self.schedule.total - 1))
-        cameras = [self.photos.camera(i, divisor) for i in self.views]
-        return mip_filter(
+        cameras = [self.photos.camera(i, divisor) for i in self.filter_views]
+        widths = mip_filter(
             state.adam.array("means"),
             cameras,
             variance_px=self.settings.filter_variance,
             threads=self.threads,
         )
+        frozen = state.adam.frozen
+        widths[:frozen] = state.adam.array("filter_3d")[:frozen]
+        return widths
 
     def _decide_poses(self, state: TrainingState) -> None:
         if state.poses is None or self.settings.refine_poses != "auto":
@@ -207,7 +214,7 @@ class Rounds:
         state.model_selection = state.model_selection.with_decision(decision)
         if decision.chosen == "off" and not self.schedule.refines:
             # As if it had been off from the start; a splat keeps the orientation it came with.
-            state.adam.array("orientation")[:] = 0.0
+            state.adam.array("orientation")[state.adam.frozen :] = 0.0
             state.adam.reset_moments("orientation")
 
     def _wrap(self, state: TrainingState) -> bool:
@@ -239,7 +246,8 @@ class Rounds:
         if found.coefficients is not None:
             state.degree = degree
             coefficients = found.coefficients
-            state.adam.array("sh")[:, : coefficients.shape[1]] = coefficients
+            frozen = state.adam.frozen
+            state.adam.array("sh")[frozen:, : coefficients.shape[1]] = coefficients[frozen:]
             state.error_history.clear()
         state.model_selection = state.model_selection.with_decision(
             found.decision("auto", state.degree)

@@ -115,7 +115,7 @@ class TrainingState:
 
     def to_json(self) -> dict[str, Any]:
         """Return the rest of the state as plain JSON values."""
-        return {
+        values: dict[str, Any] = {
             "random": self.random.bit_generator.state,
             "iteration": self.iteration,
             "order": list(self.order),
@@ -129,6 +129,9 @@ class TrainingState:
             "needs": self.model_selection.to_json(),
             "warnings": [warning.to_json() for warning in self.warnings],
         }
+        if self.adam.frozen:
+            values["frozen"] = self.adam.frozen
+        return values
 
     @classmethod
     def restore(cls, arrays: dict[str, np.ndarray], values: dict[str, Any]) -> TrainingState:
@@ -160,6 +163,9 @@ class TrainingState:
     ) -> TrainingState:
         """Return the state of an optimiser, other arrays, which are copied, and JSON values."""
         count = len(adam)
+        adam.frozen = int(values.get("frozen", 0))
+        if not 0 <= adam.frozen <= count:
+            raise ValueError(f"{adam.frozen} of {count} Gaussians are frozen")
         statistics = DensityStatistics.zeros(count)
         for name in _STATISTICS:
             old = getattr(statistics, name)

@@ -33,6 +33,7 @@ from .device_recovery import DeviceRecovery
 from .devices.backend import Backend
 from .devices.cpu_backend import CpuBackend
 from .initialisation.dense_start import dense_start, matched_photos, on_planes
+from .initialisation.handover import Handover
 from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import Correction, LiveView, held_out_metrics, measure_held_out
@@ -76,6 +77,7 @@ def train(
     start_splat: Path | None = None,
     inside: Inside | None = None,
     backend: Backend | None = None,
+    handover: Handover | None = None,
 ) -> TrainingResult:
     """Train oriented Gaussians on the photos of a scene.
 
@@ -104,6 +106,9 @@ def train(
     backend : Backend, optional
         Where to train; by default on the processor. A checkpoint goes on on any. One that fails
         (memory, driver) is replaced by the processor, with a warning in the result.
+    handover : Handover, optional
+        What another training of the scene has found; nothing is started or decided then. The
+        result's ``poses`` are ``None``.
 
     Returns
     -------
@@ -126,7 +131,8 @@ def train(
     torch.set_num_threads(threads)
     try:
         run = _Trainer(
-            scene, photos, settings, folder, seed, threads, start_splat, inside, progress, backend
+            scene, photos, settings, folder, seed, threads, start_splat, inside, progress, backend,
+            handover,
         )  # fmt: skip
         return run.run(progress)
     finally:
@@ -148,6 +154,7 @@ class _Trainer:
         inside: Inside | None = None,
         progress: Progress | None = None,
         backend: Backend | None = None,
+        handover: Handover | None = None,
     ) -> None:
         if start_splat is not None:
             settings = wrapping_settings(settings)
@@ -156,9 +163,12 @@ class _Trainer:
         self.posed = PosedPhotos(photos)
         self.photos = CancellablePhotos(self.posed, progress or Progress())
         self.folder, self.seed, self.threads = folder, seed, threads
-        self.start_splat, self.inside = start_splat, inside
-        self.held_out = held_out_views(scene, settings.holdout_every)
-        self.views = training_views(scene, self.photos, settings.holdout_every)
+        self.start_splat, self.inside, self.handover = start_splat, inside, handover
+        if handover is not None and handover.views is not None:
+            self.held_out, self.views = [], list(handover.views)
+        else:
+            self.held_out = held_out_views(scene, settings.holdout_every)
+            self.views = training_views(scene, self.photos, settings.holdout_every)
         if not self.views:
             raise DatasetError("No photo is left to train on.", "Add photos or check the masks.")
         sizes = [photos.camera(i, 1) for i in self.views]
@@ -175,9 +185,14 @@ class _Trainer:
         )  # fmt: skip
         self.live_figures: dict[str, float] = {}
         self.live = LiveView(
-            self.posed, self.held_out, folder, settings, threads, renderer=self.stepper.renderer
-        )
+            self.posed, self.held_out, folder, settings, threads,
+            renderer=self.stepper.renderer, otherwise=self.views[0] if self._is_part else 0,
+        )  # fmt: skip
         self.recovery = DeviceRecovery(self.stepper, self.posed, self.live, threads)
+
+    @property
+    def _is_part(self) -> bool:
+        return self.handover is not None and self.handover.views is not None
 
     def _image_size(self, side_px: int) -> tuple[Decision, int]:
         """Decide whether to train at full or half size."""
@@ -196,9 +211,14 @@ class _Trainer:
 
     def run(self, progress: Progress) -> TrainingResult:
         """Start or resume, iterate to the end, measure the held-out photos."""
-        key = fingerprint(self.scene, self.settings, self.seed, self.start_splat)
+        handover = self.handover
+        taken_over = "" if handover is None else handover.digest
+        key = fingerprint(self.scene, self.settings, self.seed, self.start_splat, taken_over)
         progress.update(0.0, "preparing the Gaussians")
-        rounds = Rounds(self.stepper, self.held_out, self.inside, progress)
+        rounds = Rounds(
+            self.stepper, self.held_out, self.inside, progress,
+            None if handover is None else handover.filter_views,
+        )  # fmt: skip
         state = load_checkpoint(self.folder, key)
         if state is None:
             state = self._start(rounds, key, progress)
@@ -295,6 +315,8 @@ class _Trainer:
         )
 
     def _start(self, rounds: Rounds, key: str, progress: Progress) -> TrainingState:
+        if self.handover is not None:
+            return self._taken_over(self.handover, rounds)
         warnings: list[ReportWarning] = []
         if self.settings.holdout_every > 0 and len(self.scene.views) < FEW_PHOTOS:
             count = len(self.scene.views)
@@ -320,6 +342,18 @@ class _Trainer:
         state.poses, state.model_selection = start_poses(
             self.settings.refine_poses, self.scene, self.views, state.model_selection
         )
+        rounds.filter(state)
+        return state
+
+    def _taken_over(self, handover: Handover, rounds: Rounds) -> TrainingState:
+        state = TrainingState.start(handover.gaussians, self.seed)
+        state.adam.frozen, state.iteration = handover.frozen, handover.iteration
+        state.degree, state.model_selection = handover.degree, handover.model_selection
+        state.rate_factor = handover.rate_factor
+        if handover.exposure is not None:
+            state.exposure = Exposure.restore(handover.exposure.to_arrays())
+            state.exposure.active = False
+        self.stepper.priors = dict(handover.priors)
         rounds.filter(state)
         return state
 
@@ -358,6 +392,8 @@ class _Trainer:
     ) -> OrientedGaussians:
         """Return the trained Gaussians; those of a dense start with a backdrop."""
         gaussians = trimmed(rounds.filtered(state), state.degree)
+        if self._is_part:
+            return gaussians.select(torch.arange(state.adam.frozen, len(gaussians)))
         if self.settings.mask_mode == "background":
             return gaussians
         if not state.model_selection.chose("dense_start"):
@@ -388,6 +424,8 @@ class _Trainer:
         self, state: TrainingState, key: str, progress: Progress
     ) -> dict[int, DepthPrior]:
         """Return the confirmed depths of a resumed training; lost ones are made again."""
+        if self.handover is not None:
+            return dict(self.handover.priors)
         if not (state.model_selection.chose("dense_start") and self._uses_priors()):
             return {}
         full = [self.photos.camera(view, 1) for view in self.views]

@@ -47,6 +47,14 @@ def is_trusted(folder: Path) -> bool:
     return absolute in _session or absolute in _stored()
 
 
+def is_named(folder: Path) -> bool:
+    """Return whether a folder was used on this machine, by its name alone.
+
+    The folder is not touched: it may be on a network that does not answer. Links are not followed.
+    """
+    return not is_remote(folder) and (str(folder) in _session or str(folder) in _stored())
+
+
 def is_remote(folder: Path) -> bool:
     r"""Return whether a path is ``\\server\share``: Windows would send it the user's name."""
     return str(folder).replace("\\", "/").startswith("//")

@@ -17,6 +17,16 @@ def redraw(*kinds: str) -> None:
                 area.tag_redraw()
 
 
+def redraw_sidebars() -> None:
+    """Let the side panels of 3D views be drawn again, but not the views."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                for region in area.regions:
+                    if region.type == "UI":
+                        region.tag_redraw()
+
+
 def redraw_status_bars() -> None:
     """Let the status bars of all windows be drawn again; they are in no screen's areas.
 

@@ -50,7 +50,8 @@ def check_now(scene: bpy.types.Scene, python: str = "") -> None:
     from ...core.dataset.loading.check import check_input
 
     stop()
-    _keep(scene, check_input(source_of(scene), worker=worker_if_any(python)))
+    found = check_input(source_of(scene), worker=worker_if_any(python), panoramas=_panoramas(scene))
+    _keep(scene, found)
 
 
 def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None, *, python: str = "") -> None:
@@ -79,6 +80,7 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None, *, python:
     if choice is not None:
         training_estimate.get_ready()
     looks_with = choice or worker_choice(bpy.context)
+    panoramas = _panoramas(scene)
     uid, chosen = scene.session_uid, properties_of(scene).source
 
     def keep(found: list[Finding]) -> None:
@@ -98,9 +100,13 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None, *, python:
         keep([Finding("error", text, "See the system console.")])
 
     def check() -> list[Finding]:
-        return check_input(source, worker=worker_if_any(python))
+        return check_input(source, worker=worker_if_any(python), panoramas=panoramas)
 
     _checks.submit(check, keep, failed=keep_failure)
+
+
+def _panoramas(scene: bpy.types.Scene) -> str:
+    return str(properties_of(scene).training.equirectangular).lower()
 
 
 def _keep(scene: bpy.types.Scene, found: list[Finding]) -> None:

@@ -24,7 +24,7 @@ from ..regions.region_objects import export_region
 from ..regions.region_resolution import own_lengths, world_per_blender
 from ..worker.preferred_worker import WorkerChoice
 from . import job_timer, watched_jobs
-from .panel_settings import job_settings, meshing_choices, texture_choices
+from .panel_settings import computers_choices, job_settings, meshing_choices, texture_choices
 from .scene_folders import job_folder_of, output_of, source_of
 
 
@@ -70,7 +70,7 @@ def start_mesh(
     _require_training(folder)
     refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
-    changed = {"threads": choice.threads, "device": choice.device}
+    changed = {"threads": choice.threads, "device": choice.device, **computers_choices(scene)}
     settings = with_values(earlier.settings, changed)
     return start_on_regions(scene, regions, choice, "mesh", earlier.source, settings)
 
@@ -142,7 +142,8 @@ def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerCh
     job = continue_training_job(
         JobFolder(folder), earlier, properties_of(scene).training.more_iterations
     )
-    job = replace(job, settings=replace(job.settings, threads=choice.threads, device=choice.device))
+    changed = {"threads": choice.threads, "device": choice.device, **computers_choices(scene)}
+    job = replace(job, settings=with_values(job.settings, changed))
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
     )

@@ -10,8 +10,10 @@ from typing import Any
 import bpy
 
 from ...core.errors import UsageError
+from ...core.farm.reachable import scheduler_address
 from ...core.files import real_path
 from ...core.settings import Declaration, JobSettings, declarations, preset, with_values
+from ...core.settings.farm import LOCAL
 from ...core.settings.markers import checked_markers
 from ..common import known_jobs
 from ..common.addon import properties_of
@@ -80,6 +82,7 @@ def job_settings(scene: bpy.types.Scene, threads: int, device: str = "auto") -> 
     values["markers"] = checked_markers(values["markers"])
     values["control_points"] = _control_points(values["control_points"])
     values["mask_model"] = _mask_model(values["mask_model"])
+    values |= computers_choices(scene)
     name = values.pop("preset")
     decided = {
         declared.path
@@ -90,6 +93,29 @@ def job_settings(scene: bpy.types.Scene, threads: int, device: str = "auto") -> 
     }  # Auto leaves it to the preset
     given = {path: value for path, value in values.items() if path not in decided}
     return with_values(preset(name, threads=threads, device=device), given)
+
+
+def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
+    """Return the settings, by path, that say where the parts of a job run.
+
+    A job for Flamenco is submitted, not started: started here, it runs here.
+
+    Raises
+    ------
+    UsageError
+        The address of the Dask scheduler is none.
+    """
+    properties = properties_of(scene)
+    choices, processes = properties.computers, properties.processes
+    where = ""
+    if choices.kind == "DASK":
+        where = str(scheduler_address(choices.dask_address))
+    elif choices.kind == "THIS" and processes > 1:
+        where = LOCAL
+    certificates = bpy.path.abspath(choices.certificates) if choices.certificates else ""
+    if where != LOCAL:
+        processes = JobSettings().processes
+    return {"computers": where, "processes": processes, "certificates": certificates}
 
 
 def meshing_choices(scene: bpy.types.Scene, world_per_blender: float) -> dict[str, Any]:

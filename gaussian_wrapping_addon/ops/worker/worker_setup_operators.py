@@ -59,7 +59,7 @@ def _extra_items() -> list[tuple[str, str, str]]:
 
 def _reads(extra: Extra) -> str:
     """Return what an extra is for, as the table of translations has it."""
-    return f"Reads {extra.purpose}"
+    return f"For {extra.purpose}"
 
 
 def command_lines(

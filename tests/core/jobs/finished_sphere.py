@@ -11,11 +11,14 @@ from PIL import Image
 from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import save_gaussians
-from gaussian_wrapping_addon.core.jobs import runner
 from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint, stage_key
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
+    STAGE_VERSIONS,
+    source_fingerprint,
+    stage_key,
+)
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 from gaussian_wrapping_addon.core.regions.region import write_region
 from gaussian_wrapping_addon.core.settings import JobSettings, TextureSettings
@@ -41,12 +44,10 @@ def write_finished_sphere(root: Path) -> JobFolder:
     folder.create()
     write_job(folder.job_path, job)
     key = stage_key(
-        runner.STAGE_VERSIONS["cameras"], job.source, source_fingerprint(images), settings.seed
+        STAGE_VERSIONS["cameras"], job.source, source_fingerprint(images), settings.seed
     )
     cameras = folder.stages / f"cameras-{key}"
-    training = folder.stages / (
-        f"train-{training_keys(runner.STAGE_VERSIONS['train'], key, job)[0]}"
-    )
+    training = folder.stages / (f"train-{training_keys(STAGE_VERSIONS['train'], key, job)[0]}")
     for number, stage in enumerate((cameras, training)):
         stage.mkdir()
         done = {"finished_unix_s": 1.0 + number, "seconds": 1.0, "held_out": [], "warnings": []}

@@ -17,12 +17,12 @@ from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.jobs import runner
 from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
 from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
+    STAGE_VERSIONS,
     Stage,
     source_fingerprint,
     stage_key,
@@ -46,13 +46,13 @@ def folder(tmp_path: Path, job: JobFile) -> JobFolder:
     folder = JobFolder(tmp_path / "out")
     folder.create()
     key = stage_key(
-        runner.STAGE_VERSIONS["cameras"], job.source, source_fingerprint(Path(job.source)),
+        STAGE_VERSIONS["cameras"], job.source, source_fingerprint(Path(job.source)),
         job.settings.seed,
     )  # fmt: skip
     finish(folder, f"cameras-{key}", 1.0)
     scene = Scene((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), Similarity())
     save_scene(scene, folder.stages / f"cameras-{key}")
-    finish(folder, f"train-{training_keys(runner.STAGE_VERSIONS['train'], key, job)[0]}", 2.0)
+    finish(folder, f"train-{training_keys(STAGE_VERSIONS['train'], key, job)[0]}", 2.0)
     return folder
 
 
@@ -111,6 +111,6 @@ def test_cameras_without_a_finished_training_are_not_taken(folder: JobFolder, jo
 
 def test_the_newest_training_counts(folder: JobFolder, job: JobFile) -> None:
     finish(folder, "cameras-other", 3.0)
-    finish(folder, f"train-{training_keys(runner.STAGE_VERSIONS['train'], 'other', job)[0]}", 4.0)
+    finish(folder, f"train-{training_keys(STAGE_VERSIONS['train'], 'other', job)[0]}", 4.0)
     os.utime(Path(job.source) / "a.jpg", (1, 1))
     assert cameras_of(folder, replace(job, command="mesh")).key == "other"

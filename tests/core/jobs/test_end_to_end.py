@@ -318,7 +318,7 @@ def test_fewer_faces_get_a_normal_map_occlusion_and_levels(
     assert len(offsets) == 1
 
 
-def test_a_region_is_estimated_and_meshed_in_tiles_with_help(
+def test_a_region_is_estimated_and_meshed_in_tiles_by_two_processes(
     wrapped: tuple[BallScene, Path, str],
 ) -> None:
     scene, root, _ = wrapped
@@ -328,20 +328,16 @@ def test_a_region_is_estimated_and_meshed_in_tiles_with_help(
     assert estimate.returncode == 0, estimate.stdout + estimate.stderr
     low, high = re.search(r"triangles: ([\d ]+) to ([\d ]+)\n", estimate.stdout).groups()
     assert "it would be meshed in tiles" in estimate.stdout
-    with subprocess.Popen(
-        [sys.executable, str(BATCH), "work-tiles", str(root / "out"), "--wait", "200"],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-    ) as helper:  # fmt: skip
-        done = batch("mesh", *asked, "--texture-size", "256", "--no-blend")
-        assert done.returncode == 0, done.stdout + done.stderr
-        said, _ = helper.communicate(timeout=240)
-    assert helper.returncode == 0, said
-    helped = int(re.search(r"(\d+) parts done by this process", said).group(1)) > 0
+    done = batch(
+        "mesh", *asked, "--texture-size", "256", "--no-blend", "--computers", "local",
+        timeout_s=400,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
     region = json.loads((root / "out" / "result" / "report.json").read_text())["regions"]["tiled"]
     assert region["provenance"]["tiles"] == 3
-    assert region["provenance"]["tile_processes"] == 1 + helped
+    assert region["provenance"]["tile_processes"] == 7  # one for each part
     text = (root / "out" / "result" / "report.md").read_text(encoding="utf-8")
-    assert f"3 tiles, by {'2 processes' if helped else '1 process'}" in text
+    assert "3 tiles, by 7 processes" in text
     assert region["check"]["defects"] == []
     assert region["estimate"]["tiled"] is True
     mesh = world_mesh(root, "tiled")

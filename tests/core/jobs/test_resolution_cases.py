@@ -17,6 +17,7 @@ import pytest
 from gaussian_wrapping_addon.core.errors import ResourceError, SettingError
 from gaussian_wrapping_addon.core.jobs import runner
 from gaussian_wrapping_addon.core.jobs.client import JobClient
+from gaussian_wrapping_addon.core.jobs.parts import part_runner
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 
@@ -74,7 +75,7 @@ def test_impossible_lengths_are_refused_before_the_training(
     settings = replace(earlier.settings, regions=regions)
     request = "auto" if region == "auto" else str(box)
     job = make_job("wrap", Path(earlier.source), settings, {request: 1e-8})
-    monkeypatch.setattr(runner, "run_training", train)
+    monkeypatch.setattr(part_runner, "run_training", train)
     with pytest.raises(ResourceError, match="too many"):
         runner.run_job(folder, job, lambda _: None, lambda: False)
 

@@ -14,10 +14,10 @@ import pytest
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_folder import (
-    MARKER,
     JobFolder,
     JobStatus,
 )
+from gaussian_wrapping_addon.core.names import JOB_MARKER
 from gaussian_wrapping_addon.core.processes.process_identity import process_alive
 
 DEAF = """
@@ -59,7 +59,7 @@ Progress("train", reporter.event).enter(COMPILING, "any words")
 @pytest.mark.parametrize("code", [DEAF, COMPILES], ids=["deaf", "compiling"])
 def test_a_worker_that_does_not_listen_ends_itself(code: str, tmp_path: Path) -> None:
     folder = JobFolder(tmp_path)
-    (tmp_path / MARKER).touch()
+    (tmp_path / JOB_MARKER).touch()
     folder.job_path.write_text("{}")
     process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], cwd=os.getcwd())
     try:

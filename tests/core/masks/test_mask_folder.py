@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,26 @@ def test_other_masks_take_the_place_and_the_first_come_back(tmp_path: Path) -> N
     assert back.rejected == {"left/c.png"}
     assert digest(folder, back) == before
     assert (tmp_path / "masks-bb" / "a.jpg.png").read_bytes() == b"bb 0"
+
+
+def test_files_without_a_list_are_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for number, aside in ((1, "masks-kept"), (2, "masks-kept-2")):
+        (tmp_path / "masks").mkdir()
+        (tmp_path / "masks" / "a.jpg.png").write_bytes(f"mine {number}".encode())
+        folder = publish(tmp_path, *make(tmp_path, f"a{number}"))
+        assert (folder / "a.jpg.png").read_bytes() == f"a{number} 0".encode()
+        assert (tmp_path / aside / "a.jpg.png").read_bytes() == f"mine {number}".encode()
+        assert f"they are in {aside} now" in caplog.text
+        shutil.rmtree(folder)
+
+
+def test_what_an_interrupted_run_has_left_is_made_again(tmp_path: Path) -> None:
+    made, masks = make(tmp_path, "aa")
+    (tmp_path / "masks-aa").mkdir()
+    (tmp_path / "masks-aa" / "a.jpg.png").write_bytes(b"half")
+    folder = publish(tmp_path, made, masks)
+    assert (folder / "a.jpg.png").read_bytes() == b"aa 0"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["masks", "stage-aa"]
 
 
 def test_rejecting_and_deleting_mean_the_same(tmp_path: Path) -> None:

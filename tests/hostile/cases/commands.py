@@ -28,16 +28,18 @@ _LINES = Case(
         _line("an unknown option", ("check", "set", "--dance"), rf"--dance\. {_USAGE}"),
         _line("--help", ("--help",), "Photos in, a textured mesh out", 0),
         _line("check without an input", ("check",), rf"required: input\. {_USAGE}"),
-        _line("wrap without --out", ("wrap", "set"), rf"required: --out\. {_USAGE}"),
+        _line(
+            "wrap without --out", ("wrap", "set"), r"required: --out\. See batch\.py wrap --help"
+        ),
         _line(
             "an unknown preset",
             ("wrap", "set", "--preset", "x", *_OUT),
-            rf"invalid choice: 'x'.*{_USAGE}",
+            r"invalid choice: 'x'.*See batch\.py wrap --help",
         ),
         _line(
             "two resolutions",
             ("wrap", "set", "--points", "9", "--edge-length", "1", *_OUT),
-            rf"not allowed with.*{_USAGE}",
+            r"not allowed with.*See batch\.py wrap --help",
         ),
         _line(
             "pivots and a length",
@@ -64,24 +66,16 @@ _LINES = Case(
             3,
             begun,
         ),
-        _line("bake without a mesh", ("bake", "--out", "out"), rf"required: --mesh\. {_USAGE}"),
+        _line(
+            "bake without a mesh",
+            ("bake", "--out", "out"),
+            r"required: --mesh\. See batch\.py bake --help",
+        ),
         _line(
             "bake of a mesh that is gone",
             ("bake", "--out", "out", "--mesh", "gone.obj"),
             "out holds no finished training.*Run wrap",
             3,
-            begun,
-        ),
-        _line(
-            "work-tiles for ever",
-            ("work-tiles", "out", "--wait", "inf"),
-            "--wait is out of range.*Give from 0",
-        ),
-        _line(
-            "work-tiles without tiles",
-            ("work-tiles", "out"),
-            "out has no tiles to work on.*Start mesh --tiles N there first",
-            2,
             begun,
         ),
         _line(

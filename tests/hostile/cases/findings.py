@@ -93,7 +93,7 @@ _CIRCLES = Case(
         _circle("status", ("status", "set"), 2, "set holds no job.*Choose a job folder"),
         _circle("resume", ("resume", "set", "--no-blend"), 2, "does not exist.*Choose a folder"),
         _circle("mesh", ("mesh", "--out", "set", "--no-blend"), 2, "does not exist.*Choose"),
-        _circle("work-tiles", ("work-tiles", "set"), 2, "set is not a job folder.*Give the --out"),
+        _circle("run-part", ("run-part", "set", "train"), 1, "set is not a job folder.*Give the"),
         Variant(
             "as a region",
             steps(colmap(), link("a.json", "b.json"), link("b.json", "a.json")),

@@ -24,7 +24,7 @@ _MORE = ("more", "--out", "out", "--iterations", "5", "--no-blend")
 _UNREADABLE = "^continue with: resume .*out$"
 _EXPORT = ("export", "out", "--format", "glb", "--out", "new")
 _ESTIMATE = ("estimate-mesh", "--out", "out")
-_TILES = ("work-tiles", "out")
+_PART = ("run-part", "out", "train")
 _EVALUATE = ("evaluate", "out", "--truth", "out")
 
 
@@ -50,8 +50,9 @@ _LINKS = Case(
         *(_refused(entry, _RESUME) for entry in _FILES),
         *(
             _refused("result/scene.json", words)
-            for words in (_MESH, _MORE, _EXPORT, _ESTIMATE, _TILES, _EVALUATE)
+            for words in (_MESH, _MORE, _EXPORT, _ESTIMATE, _EVALUATE)
         ),
+        _linked("result/scene.json", _PART, rf"scene\.json.* is a link.*{_LINK}", 1),
         _linked("cancel", _CANCEL, "no job is running in .*out", 0),
         _linked("status.json", _STATUS, _UNREADABLE, 0),
         _linked("lock.json", _STATUS, "^cancelled$", 0),

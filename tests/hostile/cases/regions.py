@@ -174,7 +174,11 @@ _LENGTHS = Case(
     "Resolutions that no mesh has",
     (
         *(_length("--edge-length", value, _EDGE) for value in ("-1", "nan", "inf", "1e-320")),
-        _length("--edge-length", "five", "argument --edge-length: invalid float value: 'five'"),
+        _length(
+            "--edge-length",
+            "five",
+            "argument --edge-length: invalid float value: 'five'; give a positive",
+        ),
         _length("--points", "-1", "--points is out of range. Give "),
         _length("--points", "1000000000000", "--points is out of range. Give "),
         _length("--faces", "-5", "--faces is out of range. Give "),

@@ -18,7 +18,7 @@ from ...ply.table import vertex_layout
 from ...report_warning import ReportWarning
 from ..frames.normalisation import find_scene_frame
 from ..lenses.lens_fit import MIN_PHOTO_SIDE_PX, fit_lens
-from ..panoramas.panorama_views import VIEWS, are_panoramas, check_panorama
+from ..panoramas.panorama_views import VIEWS, check_panorama
 from ..photos.photo_finder import (
     PhotoIndex,
     find_mask,
@@ -32,6 +32,7 @@ from ..readers.splat_header import read_splat_header
 from ..video.probe import probe_video
 from ..video.video_file import container_of
 from ..video.video_warnings import hdr_warning, interlaced_warning
+from .panorama_input import shape_warning, takes_for_panoramas
 from .source_kind import SPLAT, VIDEO, SourceKind, read_poses, source_kind
 from .sparse_points import nothing_in_common, points_in_scene
 from .splat_cameras import NO_PHOTOS_HINT, NO_PHOTOS_WARNING
@@ -62,7 +63,7 @@ class Finding:
 _PANORAMAS = f"The photos are 360 degree panoramas; each is cut into {len(VIEWS)} views"
 
 
-def check_input(source: Path, *, worker: str = "") -> list[Finding]:
+def check_input(source: Path, *, worker: str = "", panoramas: str = "auto") -> list[Finding]:
     """Check an input without decoding photos or solving cameras.
 
     Parameters
@@ -70,6 +71,8 @@ def check_input(source: Path, *, worker: str = "") -> list[Finding]:
     source : Path
     worker : str
         The worker's Python, which opens videos; without, only their first bytes are looked at.
+    panoramas : {"auto", "on", "off"}
+        Whether photos without cameras are cut into views.
 
     Returns
     -------
@@ -94,7 +97,7 @@ def check_input(source: Path, *, worker: str = "") -> list[Finding]:
             assert kind.video is not None
             _check_video(kind.video, worker, findings)
         elif kind.kind == "photos":
-            _check_photos(kind, findings)
+            _check_photos(kind, findings, panoramas)
         else:
             _check_poses(kind, findings)
     except WrapError as error:
@@ -159,7 +162,7 @@ def _check_video(path: Path, worker: str, findings: list[Finding]) -> None:
     findings += [Finding("warning", warning.text, warning.hint) for warning in told]
 
 
-def _check_photos(kind: SourceKind, findings: list[Finding]) -> None:
+def _check_photos(kind: SourceKind, findings: list[Finding], panoramas: str) -> None:
     root = photo_root(kind.folder)
     photos = list_photos(root)
     names = [path.relative_to(root).as_posix() for path in photos]
@@ -169,9 +172,10 @@ def _check_photos(kind: SourceKind, findings: list[Finding]) -> None:
     findings.append(
         Finding("fact", "The input has no camera poses; they will be solved from the photos.")
     )
-    if are_panoramas(photos):
-        text = f"{_PANORAMAS} (--equirectangular off takes them for ordinary photos)."
-        findings.append(Finding("fact", text))
+    by_shape = shape_warning(photos, panoramas)
+    findings += [Finding("warning", warning.text, warning.hint) for warning in by_shape]
+    if not by_shape and takes_for_panoramas(photos, panoramas):
+        findings.append(Finding("fact", f"{_PANORAMAS}."))
 
 
 def second_copies_warning(root: Path) -> list[ReportWarning]:

@@ -26,6 +26,7 @@ from ..similarity import Similarity
 from .check import second_copies_warning
 from .coverage import coverage_warnings
 from .panorama_input import (
+    shape_warning,
     solve_views_of_panoramas,
     takes_for_panoramas,
     with_views_of_panoramas,
@@ -85,7 +86,7 @@ def load_scene(
         Of photos without poses; see :func:`~..poses.pose_solver.solve_poses`.
     equirectangular : {"auto", "on", "off"}
         Whether photos without poses are panoramas, which are cut into views; ``"auto"``: where
-        all are exactly twice as wide as high.
+        all are exactly twice as wide as high and none says another projection.
     reading : MaskReading
         How mask files are understood.
     units : UnitsRequest
@@ -121,7 +122,9 @@ def load_scene(
         require_extras(photos)
         warnings += second_copies_warning(root)
         # Frames of a video as wide as two of their heights are what phones film.
-        if takes_for_panoramas(photos, "off" if in_order else equirectangular):
+        mode = "off" if in_order else equirectangular
+        if takes_for_panoramas(photos, mode):
+            warnings += shape_warning(photos, mode)
             _refuse_places_of_panoramas(units)
             if turntable == "on":
                 warnings.append(_NO_TURNTABLE_OF_PANORAMAS)
@@ -129,6 +132,7 @@ def load_scene(
                 photos, kind, work_folder, solve_span, reading, seed=seed, threads=threads
             )
         else:
+            units.check_gps(photos)
             model = solve_poses(
                 root, photos, kind.mask_roots, work_folder, solve_span, seed=seed, threads=threads,
                 turntable=turntable, reading=reading, in_order=in_order,

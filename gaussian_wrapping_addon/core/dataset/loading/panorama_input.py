@@ -12,7 +12,7 @@ from ...progress import Progress
 from ...report_warning import UNREADABLE_HINT, ReportWarning
 from ..panoramas.panorama_cutting import CUT_FOLDER, CutView, Panorama, cut_panoramas
 from ..panoramas.panorama_solver import solve_panoramas
-from ..panoramas.panorama_views import VIEWS, are_panoramas, view_lens
+from ..panoramas.panorama_views import BY_SHAPE, VIEWS, panorama_evidence, view_lens
 from ..photos.mask_reading import MaskReading
 from ..photos.photo_finder import PhotoIndex, find_mask, photo_root, resolve_photo
 from ..poses.pose_solver import check_unreadable_share
@@ -24,8 +24,20 @@ _CUTTING = 0.3
 
 
 def takes_for_panoramas(photos: Sequence[Path], mode: str) -> bool:
-    """Whether photos without cameras are cut: ``"on"``, or ``"auto"`` where all are 2 to 1."""
-    return mode == "on" or (mode == "auto" and are_panoramas(photos))
+    """Whether photos without cameras are cut: ``"on"``, or ``"auto"`` where they look so."""
+    return mode == "on" or (mode == "auto" and bool(panorama_evidence(photos)))
+
+
+def shape_warning(photos: Sequence[Path], mode: str) -> list[ReportWarning]:
+    """Return the warning about photos that are cut for their shape alone, or none."""
+    if mode != "auto" or panorama_evidence(photos) != BY_SHAPE:
+        return []
+    text = (
+        "The photos are taken for 360 degree panoramas, as all are exactly twice as wide as high; "
+        f"each is cut into {len(VIEWS)} views. Nothing else in them says so."
+    )
+    hint = "Set 360° Photos to Off (--equirectangular off) if they are ordinary photos."
+    return [ReportWarning("panoramas-by-shape", text, hint)]
 
 
 def with_views_of_panoramas(

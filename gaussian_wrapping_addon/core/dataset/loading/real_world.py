@@ -26,7 +26,7 @@ from ..photos.photo_finder import PhotoIndex
 from ..similarity import Similarity
 from ..units.control_file import ControlFile, read_control_file
 from ..units.control_points import ControlFit, fit_control_points, observations
-from ..units.georeference import ENOUGH, GOOD, Georeference, georeference
+from ..units.georeference import ENOUGH, GOOD, Georeference, check_positions, georeference
 from ..units.marker_helper import MARKERS_EXTRA
 from ..units.marker_scale import MarkerScale, find_markers, scale_from_markers
 from ..units.real_units import CONTROL_POINTS, GPS, MARKERS, RealUnits
@@ -65,6 +65,24 @@ class UnitsRequest:
         if marker_spec(self.markers) is not None:
             load_extra(MARKERS_EXTRA, "--markers")
         return read_control_file(Path(self.control_points)) if self.control_points else None
+
+    def check_gps(self, photos: Sequence[Path]) -> None:
+        """Raise where GPS alone is to place the scene, and too few photos have a position.
+
+        Before cameras are solved, which takes minutes. Whether the positions determine the scene
+        is known afterwards.
+
+        Raises
+        ------
+        DatasetError
+        """
+        if self.georeference != "on" or self.control_points:
+            return
+        found = [read_gps_exif(path) for path in photos]
+        try:
+            check_positions([position for position in found if position is not None], len(photos))
+        except DatasetError as error:
+            raise _not_placed(error) from None
 
 
 BY_GPS_IF_GOOD = UnitsRequest()
@@ -110,10 +128,7 @@ def find_real_units(
             gps = georeference(cameras, positions, needs)
         except DatasetError as error:
             if request.georeference == "on" and control is None:
-                raise DatasetError(
-                    f"GPS does not place the scene: {error.message}",
-                    f"{error.hint} Or leave --georeference out.".strip(),
-                ) from None
+                raise _not_placed(error) from None
             note = error.message
     if gps is not None and gps.doubt:
         text = f"GPS places the scene badly: {gps.doubt}"
@@ -129,6 +144,13 @@ def find_real_units(
     if units is not None:
         _logger.info("metres from %s: %s", ", ".join(units.sources), units.details)
     return units, note
+
+
+def _not_placed(error: DatasetError) -> DatasetError:
+    return DatasetError(
+        f"GPS does not place the scene: {error.message}",
+        f"{error.hint} Or leave --georeference out.".strip(),
+    )
 
 
 def camera_of(view: PreparedView) -> Camera:

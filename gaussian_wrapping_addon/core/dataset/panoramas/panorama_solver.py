@@ -15,11 +15,12 @@ from ...errors import DatasetError
 from ...files import write_json
 from ...kernels.parallel import default_threads
 from ...limits import HELPER_DEADLINE_S, MIN_IMAGES
+from ...machine import helper_memory_limit_bytes
 from ...processes.helper_process import run_helper
 from ...progress import Progress
 from ...report_warning import ReportWarning
 from ..photos.photo_file import read_mask, read_photo, write_photo
-from ..poses.pose_solver import HELPER, memory_limit_bytes
+from ..poses.pose_solver import HELPER
 from ..readers.colmap_reader import ModelFiles, read_model
 from ..readers.source_model import PosedPhoto, SourceModel
 from .panorama_cutting import CutView
@@ -112,7 +113,7 @@ def solve_panoramas(
     }
     write_json(folder / "task.json", task)
     run_helper(
-        HELPER, folder, progress.span(0.08, 1.0), memory_bytes=memory_limit_bytes(),
+        HELPER, folder, progress.span(0.08, 1.0), memory_bytes=helper_memory_limit_bytes(),
         deadline_s=max(HELPER_DEADLINE_S, _SECONDS_A_PANORAMA * len(numbers)),
     )  # fmt: skip
     model = read_model(ModelFiles(folder / "model", ".bin"))

@@ -25,6 +25,11 @@ _TILT_DEG = 55.0
 _HORIZON, _TILTED = 8, 3
 
 
+_EQUIRECTANGULAR = "equirectangular"
+STATED, BY_SHAPE = "stated", "shape"
+"""How it is known that photos are panoramas."""
+
+
 @dataclass(frozen=True)
 class PanoramaView:
     """Direction of a view: to the right of the photo's middle, and above its horizon."""
@@ -69,18 +74,28 @@ def _has_panorama_size(width: int, height: int) -> bool:
     return width == 2 * height
 
 
-def are_panoramas(photos: Sequence[Path]) -> bool:
-    """Whether all photos that can be read are exactly twice as wide as high, by their headers."""
-    some = False
+def panorama_evidence(photos: Sequence[Path]) -> str:
+    """Return what tells that photos are panoramas, by the headers of those that can be read.
+
+    Returns
+    -------
+    str
+        :data:`BY_SHAPE` where all are exactly twice as wide as high, :data:`STATED` where one of
+        them also says that it is equirectangular. Empty where they are none: another shape, or one
+        says another projection.
+    """
+    stated: set[str] = set()
     for path in photos:
         try:
             header = read_photo_header(path)
         except DatasetError:
             continue
         if header is None or not _has_panorama_size(*header.upright_size):
-            return False
-        some = True
-    return some
+            return ""
+        stated.add(header.projection)
+    if stated - {"", _EQUIRECTANGULAR}:
+        return ""
+    return STATED if _EQUIRECTANGULAR in stated else BY_SHAPE if stated else ""
 
 
 def check_panorama(header: PhotoHeader, file_name: str) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Read size and EXIF orientation of a photo from its header, without decoding it.
+"""Read size, EXIF orientation and projection of a photo from its header, without decoding it.
 
 JPEG and PNG are parsed here, so that a Python with numpy alone (Blender's) can check an input;
 other formats are read by Pillow and the worker's extras if these are installed.
@@ -7,6 +7,7 @@ other formats are read by Pillow and the worker's extras if these are installed.
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from dataclasses import dataclass
@@ -21,6 +22,9 @@ from .raw_photo import raw_size
 _EXIF_ORIENTATION = 0x0112
 _JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _MAX_SEGMENTS = 4096
+_JPEG_XMP, _PNG_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"XML:com.adobe.xmp\0"
+_PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*([A-Za-z]{1,40})")
+"""In XMP, as an attribute or an element; XML is not parsed for one word."""
 _ANOTHER = "Export it again as JPEG or PNG, or remove it."
 
 
@@ -31,6 +35,8 @@ class PhotoHeader:
     width: int
     height: int
     orientation: int = 1
+    projection: str = ""
+    """Of a panorama, as JPEG and PNG say it in XMP (``GPano:ProjectionType``), in lower case."""
 
     @property
     def upright_size(self) -> tuple[int, int]:
@@ -91,7 +97,7 @@ def read_photo_header(path: Path) -> PhotoHeader | None:
 
 def _read_jpeg(stream: IO[bytes]) -> PhotoHeader:
     stream.read(2)
-    orientation = 1
+    orientation, projection = 1, ""
     for _ in range(_MAX_SEGMENTS):
         byte = stream.read(1)
         while byte and byte != b"\xff":
@@ -110,12 +116,14 @@ def _read_jpeg(stream: IO[bytes]) -> PhotoHeader:
             raise ValueError("a segment is shorter than its own length")
         if marker in _JPEG_SIZES:
             _, height, width = struct.unpack(">BHH", stream.read(5))
-            return PhotoHeader(width, height, orientation)
+            return PhotoHeader(width, height, orientation, projection)
         body = stream.read(length - 2)
         if len(body) < length - 2:
             raise ValueError("the file ends inside its header")
         if marker == 0xE1 and body.startswith(b"Exif\0\0"):
             orientation = _exif_orientation(body[6:])
+        elif marker == 0xE1 and body.startswith(_JPEG_XMP):
+            projection = _xmp_projection(body)
     raise ValueError("the header has too many segments")
 
 
@@ -129,7 +137,7 @@ def _read_png(stream: IO[bytes]) -> PhotoHeader:
     if zlib.crc32(kind + body) != crc:
         raise ValueError("the header's checksum is wrong")
     width, height = struct.unpack(">II", body[:8])
-    orientation = 1
+    orientation, projection = 1, ""
     for _ in range(_MAX_SEGMENTS):
         head = stream.read(8)
         if len(head) < 8:
@@ -137,11 +145,20 @@ def _read_png(stream: IO[bytes]) -> PhotoHeader:
         length, kind = struct.unpack(">I4s", head)
         if kind in (b"IDAT", b"IEND"):
             break
-        if kind == b"eXIf" and length <= limits.MAX_LINE_BYTES:
-            orientation = _exif_orientation(stream.read(length))
-            break
+        if kind in (b"eXIf", b"iTXt") and length <= limits.MAX_LINE_BYTES:
+            body = stream.read(length)
+            if kind == b"eXIf":
+                orientation = _exif_orientation(body)
+            elif body.startswith(_PNG_XMP):
+                projection = _xmp_projection(body)
+            length = 0
         stream.seek(length + 4, 1)
-    return PhotoHeader(width, height, orientation)
+    return PhotoHeader(width, height, orientation, projection)
+
+
+def _xmp_projection(body: bytes) -> str:
+    found = _PROJECTION.search(body)
+    return found[1].decode().lower() if found else ""
 
 
 def _exif_orientation(body: bytes) -> int:

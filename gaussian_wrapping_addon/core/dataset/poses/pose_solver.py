@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from ...errors import DatasetError
 from ...files import write_json
 from ...kernels.parallel import default_threads
 from ...limits import HELPER_DEADLINE_S, MIN_IMAGES
-from ...machine import total_memory_bytes
+from ...machine import helper_memory_limit_bytes
 from ...processes.helper_process import run_helper
 from ...progress import Progress
 from ...report_warning import UNREADABLE_HINT, ReportWarning
@@ -40,7 +40,7 @@ from ..photos.photo_file import (
 from ..photos.photo_finder import find_mask
 from ..readers.colmap_reader import ModelFiles, read_model
 from ..readers.source_model import PosedPhoto, SourceModel
-from .solution_findings import with_findings
+from .solution_findings import photos_in_parts, with_findings
 from .turntable_result import with_turntable
 
 MAX_SIFT_PX = 1600
@@ -53,9 +53,6 @@ HELPER = "dataset.poses.pose_solver_helper"
 """Module of the process that solves."""
 _SECONDS_A_PHOTO = 60.0
 """Longest time that solving may take: more than ten times what 400 photos took on two cores."""
-_MEMORY_SHARE = 0.9
-_MIN_MEMORY_BYTES = 8 << 30
-"""The limit includes reserved address space; below this the solver's threads may not start."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +164,7 @@ def solve_poses(
     }
     write_json(folder / "task.json", task)
     run_helper(
-        HELPER, folder, progress.span(0.08, 1.0), memory_bytes=memory_limit_bytes(),
+        HELPER, folder, progress.span(0.08, 1.0), memory_bytes=helper_memory_limit_bytes(),
         deadline_s=max(HELPER_DEADLINE_S, _SECONDS_A_PHOTO * len(prepared)),
     )  # fmt: skip
     model = read_model(ModelFiles(folder / "model", ".bin"))
@@ -175,8 +172,9 @@ def solve_poses(
     target = work_folder / TURNTABLE_FOLDER
     model = with_turntable(model, folder, sizes, target, wanted=turntable == "on")
     model = with_findings(model, folder, {p.name: n for p, n in zip(prepared, names, strict=True)})
+    in_parts = photos_in_parts(folder)
     _save_model(folder, work_folder)
-    return _with_source_names(model, prepared, names, bad, len(photos))
+    return _with_source_names(model, prepared, names, bad, len(photos), in_parts)
 
 
 def _with_source_names(
@@ -185,8 +183,12 @@ def _with_source_names(
     names: list[str],
     bad: list[str],
     offered: int,
+    in_parts: Collection[str] = (),
 ) -> SourceModel:
-    """Restore original names and full-size intrinsics of the solved photos."""
+    """Restore original names and full-size intrinsics of the solved photos.
+
+    Of photos that are not placed, those ``in_parts`` have a warning already.
+    """
     of_name = {p.name: (p, name) for p, name in zip(prepared, names, strict=True)}
     photos: list[PosedPhoto] = []
     for posed in model.photos:
@@ -202,7 +204,11 @@ def _with_source_names(
         )
     warnings = list(model.warnings)
     registered = {p.name for p in photos}
-    unregistered = [name for name in names if name not in registered]
+    unregistered = [
+        name
+        for photo, name in zip(prepared, names, strict=True)
+        if name not in registered and photo.name not in in_parts
+    ]
     if unregistered:
         listed = ", ".join(unregistered[:5]) + (" ..." if len(unregistered) > 5 else "")
         warnings.append(
@@ -272,7 +278,7 @@ def triangulate_points(
         "pairs": [[entries[i]["name"], entries[j]["name"]] for i, j in pairs],
     }
     write_json(folder / "task.json", task)
-    run_helper(HELPER, folder, progress.span(0.08, 1.0), memory_bytes=memory_limit_bytes())
+    run_helper(HELPER, folder, progress.span(0.08, 1.0), memory_bytes=helper_memory_limit_bytes())
     model = read_model(ModelFiles(folder / "model", ".bin"))
     shutil.rmtree(folder)
     return model.points, model.point_colors
@@ -342,9 +348,3 @@ def _save_model(folder: Path, work_folder: Path) -> None:
         shutil.rmtree(target)
     os.replace(folder / "model", target)
     shutil.rmtree(folder)
-
-
-def memory_limit_bytes() -> int | None:
-    """Return a share of the machine's memory, or ``None`` if unknown."""
-    total = total_memory_bytes()
-    return max(int(_MEMORY_SHARE * total), _MIN_MEMORY_BYTES) if total else None

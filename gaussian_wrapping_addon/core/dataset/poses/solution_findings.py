@@ -47,6 +47,11 @@ def with_findings(model: SourceModel, folder: Path, source_names: Mapping[str, s
     return dataclasses.replace(model, facts=facts, warnings=(*model.warnings, *warnings))
 
 
+def photos_in_parts(folder: Path) -> frozenset[str]:
+    """Return the photos, by the solver's names, of parts that a warning says stay apart."""
+    return frozenset(name for part in read_json(folder / SOLUTION_NAME)["apart"] for name in part)
+
+
 def findings(found: Mapping[str, Any], source_names: Mapping[str, str]) -> list[ReportWarning]:
     """Return the warnings of ``solution.json``."""
     warnings = []
@@ -90,7 +95,8 @@ def findings(found: Mapping[str, Any], source_names: Mapping[str, str]) -> list[
             ReportWarning(
                 "cameras-in-parts",
                 f"{_count(found['apart'])} photos fit each other but not the rest, in "
-                f"{len(found['apart'])} parts: {_listed(found['apart'], source_names)}.",
+                f"{len(found['apart'])} parts, and are not used: "
+                f"{_listed(found['apart'], source_names)}.",
                 "Take photos that connect the parts.",
             )
         )

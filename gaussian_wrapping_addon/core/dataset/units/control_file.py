@@ -98,7 +98,8 @@ def read_control_file(path: Path) -> ControlFile:
             raw = stream.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise DatasetError(
-            f"Control points {path} cannot be read: {error.strerror or error}.", "Check the path."
+            f"Control points {path} cannot be read: {error.strerror or error}.",
+            "Put the file back and resume the job, or start anew without control points.",
         ) from None
     if len(raw) > MAX_FILE_BYTES:
         raise DatasetError(f"{path} is larger than {MAX_FILE_BYTES >> 20} MiB.", _HINT)

@@ -116,13 +116,8 @@ def georeference(
         Too few positions, or they do not determine scale and up direction; says why.
     """
     known = [c for c in cameras if c.name in positions]
+    check_positions([positions[c.name] for c in known], len(cameras))
     used = [c for c in known if positions[c.name].altitude_m is not None]
-    if len(used) < MIN_POSITIONS:
-        what = "GPS altitude" if len(known) >= MIN_POSITIONS else "GPS position"
-        raise DatasetError(
-            f"{len(used)} of {len(cameras)} photos have a {what}; {MIN_POSITIONS} are needed.",
-            "Use photos as they come from the camera, with its location switched on.",
-        )
     gps = [positions[c.name] for c in used]
     places = np.array([(p.latitude_deg, p.longitude_deg, p.altitude_m or 0.0) for p in gps])
     origin = _origin(places)
@@ -166,6 +161,17 @@ def georeference(
         origin, fit.target_from_source, fit.scale_error, centers, target, fit.used, details,
         _doubt(fit, GOOD),
     )  # fmt: skip
+
+
+def check_positions(known: Sequence[GpsPosition], photos: int) -> None:
+    """Raise :class:`DatasetError` where too few of the photos have a position with altitude."""
+    used = sum(position.altitude_m is not None for position in known)
+    if used < MIN_POSITIONS:
+        what = "GPS altitude" if len(known) >= MIN_POSITIONS else "GPS position"
+        raise DatasetError(
+            f"{used} of {photos} photos have a {what}; {MIN_POSITIONS} are needed.",
+            "Use photos as they come from the camera, with its location switched on.",
+        )
 
 
 def _origin(places: np.ndarray) -> GeoPoint:

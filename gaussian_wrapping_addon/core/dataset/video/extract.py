@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from ...errors import DatasetError
 from ...files import read_json, write_json
 from ...kernels.parallel import default_threads
 from ...limits import MIN_IMAGES
-from ...machine import total_memory_bytes
+from ...machine import helper_memory_limit_bytes
 from ...processes.helper_process import run_helper
 from ...progress import Progress
 from ...report_warning import ReportWarning
@@ -24,8 +23,6 @@ from .video_warnings import hdr_warning, interlaced_warning
 _HELPER = "dataset.video.extract_helper"
 _DEADLINE_S = 4 * 3600.0
 """For an hour of 4K on a slow machine."""
-_MEMORY_SHARE = 0.9
-_MIN_MEMORY_BYTES = 4 << 30
 _LISTED_GAPS = 3
 _MOST_DAMAGED_SHARE = 0.02
 """Share of frames that may be missing without a warning: players skip them, too."""
@@ -83,8 +80,9 @@ def extract_frames(
     }  # fmt: skip
     write_json(task_folder / "task.json", task)
     run_helper(
-        _HELPER, task_folder, progress, deadline_s=_DEADLINE_S, memory_bytes=_memory_limit_bytes()
-    )
+        _HELPER, task_folder, progress, deadline_s=_DEADLINE_S,
+        memory_bytes=helper_memory_limit_bytes(),
+    )  # fmt: skip
     chosen = read_json(task_folder / CHOSEN_NAME)
     os.replace(task_folder / FRAMES_FOLDER, target)
     shutil.rmtree(task_folder)
@@ -137,9 +135,3 @@ def _warnings(video: Path, chosen: dict[str, Any]) -> list[ReportWarning]:
     if chosen["is_interlaced"]:
         found.append(interlaced_warning(video))
     return found
-
-
-def _memory_limit_bytes() -> int | None:
-    total = total_memory_bytes()
-    limit = math.floor(_MEMORY_SHARE * total) if total else 0
-    return max(limit, _MIN_MEMORY_BYTES) if limit else None

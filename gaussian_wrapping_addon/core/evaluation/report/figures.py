@@ -105,7 +105,7 @@ _COUNTS = frozenset(
         "tetrahedra_low", "texels_filled",
         "texels_overlapping", "texels_seen", "texels_seen_at_outlines_only",
         "texels_seen_badly", "texels_used",
-        "threads", "tile_processes", "turntable_photos", "undecided_tetrahedra",
+        "processes", "threads", "tile_processes", "turntable_photos", "undecided_tetrahedra",
         "unseen_evaluations",
         "unused_vertices",
         "vertices", "video_frames", "video_frames_blurred", "video_frames_damaged",

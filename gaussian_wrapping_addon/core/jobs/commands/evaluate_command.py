@@ -21,8 +21,9 @@ from ...errors import (
     unwritable_error,
 )
 from ...files import read_json, write_json
+from ...names import JOB_MARKER
 from ...processes.helper_process import emit
-from ..store.job_folder import MARKER, JobFolder
+from ..store.job_folder import JobFolder
 from .worker_call import run_command
 
 if TYPE_CHECKING:
@@ -165,7 +166,7 @@ def _against_truth(
         cameras_path = Path(given["cameras"])
         cameras = (
             job_cameras(cameras_path)
-            if (cameras_path / MARKER).exists()
+            if (cameras_path / JOB_MARKER).exists()
             else read_cameras(cameras_path)
         )
     mesh = read()
@@ -208,7 +209,7 @@ def job_mesh(folder: Path, region: str | None) -> Path:
     DatasetError
         The job has no results.
     """
-    if not (folder / MARKER).exists():
+    if not (folder / JOB_MARKER).exists():
         raise UsageError(
             f"{folder.name} is not a job folder.", "Give the folder of --out, or a mesh file."
         )

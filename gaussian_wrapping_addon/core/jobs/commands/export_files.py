@@ -24,10 +24,9 @@ from ...dataset.similarity import Similarity
 from ...errors import DatasetError, ParseError, UsageError, WrapError
 from ...export_formats import EXPORT_FORMATS, SHADINGS, WORKER_FORMATS
 from ...files import read_json, real_path, write_bytes
-from ...names import SPLAT_STEM, file_stems
+from ...names import JOB_MARKER, SPLAT_STEM, file_stems
 from ...regular_files import reject_foreign_entries
 from ...texture.files.file_checks import atlas_file
-from ..store.job_folder import MARKER
 from ..store.sidecar import write_sidecar
 from .worker_call import run_command
 
@@ -92,7 +91,7 @@ def result_of(folder: Path) -> Path:
         if (path / "scene.json").is_file():
             reject_foreign_entries(folder)
             return real_path(path)
-    if (folder / MARKER).exists():
+    if (folder / JOB_MARKER).exists():
         raise DatasetError(f"The job {folder} has no result yet.", "Resume it first.")
     raise UsageError(f"{folder} holds no job's result.", "Give the folder of a finished job.")
 

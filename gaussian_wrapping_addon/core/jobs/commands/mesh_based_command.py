@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from ...errors import DatasetError, ParseError, UsageError
 from ...files import read_json
+from ...names import JOB_MARKER
 from ...progress import Progress
 from ..stages.cameras_stage import MASKED
-from ..store.job_folder import MARKER, JobFolder
+from ..store.job_folder import JobFolder
 
 if TYPE_CHECKING:
     import numpy as np
@@ -52,7 +53,7 @@ def evaluate_mesh_based(
     longest = request.max_image_px or LONG_SIDE_PX
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
-        is_job = (request.photos / MARKER).exists()
+        is_job = (request.photos / JOB_MARKER).exists()
         if is_job:
             scene, held_out = job_scene(request.photos)
         else:

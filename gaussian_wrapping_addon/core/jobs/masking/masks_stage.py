@@ -14,6 +14,7 @@ from ...devices import DeviceChoice
 from ...errors import DatasetError, ParseError, UsageError, WrapError
 from ...files import read_json, write_bytes, write_json
 from ...limits import MIN_IMAGES
+from ...machine import helper_memory_limit_bytes
 from ...masks.mask_folder import (
     MOST_MASK_BYTES,
     MadeMask,
@@ -170,14 +171,13 @@ def _refuse_own_masks(scene: Scene, mask_mode: str) -> None:
 
 
 def _run_model(scene: Scene, job: JobFile, folder: Path, progress: Progress, threads: int) -> None:
-    from ...dataset.poses.pose_solver import memory_limit_bytes
     from ...processes.helper_process import run_helper
 
     photos = [os.path.abspath(view.photo_path) for view in scene.views]
     write_json(folder / "task.json", _task(job, photos, threads))
     run_helper(
         "masks.model_helper", folder, progress, deadline_s=SECONDS_A_PHOTO * (5 + len(photos)),
-        memory_bytes=memory_limit_bytes(),
+        memory_bytes=helper_memory_limit_bytes(),
     )  # fmt: skip
 
 
@@ -191,7 +191,6 @@ def check_mask_model(job: JobFile, folder: JobFolder, progress: Progress) -> Non
     """
     import tempfile
 
-    from ...dataset.poses.pose_solver import memory_limit_bytes
     from ...processes.helper_process import run_helper
 
     if not job.settings.mask_model or job.command != "wrap":
@@ -203,7 +202,7 @@ def check_mask_model(job: JobFile, folder: JobFolder, progress: Progress) -> Non
         write_json(Path(temporary) / "task.json", _task(job, [], 1))
         run_helper(
             "masks.model_helper", Path(temporary), progress, deadline_s=SECONDS_A_PHOTO,
-            memory_bytes=memory_limit_bytes(),
+            memory_bytes=helper_memory_limit_bytes(),
         )  # fmt: skip
 
 

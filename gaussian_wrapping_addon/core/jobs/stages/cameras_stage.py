@@ -48,7 +48,7 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
     DatasetError, ParseError
         The input cannot be used.
     UsageError
-        A splat is to get metres by photos, which it has none of.
+        A splat is to get metres by photos, or a video by GPS, which they have none of.
     """
     from ...array_file import is_whole
     from ...dataset.loading.load import load_scene
@@ -97,6 +97,12 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
         else:
             root, taken = source, None
             if wanted is not None:
+                if units.georeference == "on" and not units.control_points:
+                    raise UsageError(
+                        "Frames of a video have no GPS position.",
+                        "Leave georeference out; give markers, control points or a measured "
+                        "length.",
+                    )
                 span = progress.span(0.0, FRAMES_SHARE)
                 root, taken = run_frames(folder, job, wanted, span, threads=threads)
                 progress = progress.span(FRAMES_SHARE, 1.0)

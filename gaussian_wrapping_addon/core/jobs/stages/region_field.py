@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +17,64 @@ if TYPE_CHECKING:
     from ...dataset.photo_source import PhotoSource
     from ...dataset.scene import Scene
     from ...field.vacancy.vacancy import VacancyField
-    from ...gaussians.model import GaussianArrays
+    from ...gaussians.model import GaussianArrays, OrientedGaussians
+    from ...meshing.tiles.plan import Field
     from ...regions.convex_region import Region
     from ...settings import MeshingSettings, TrainingSettings
     from ..store.job_file import JobFile
+    from ..store.stage_folder import Stage
 
 _logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RegionInputs:
+    """What the mesh of a region is made from."""
+
+    scene: Scene
+    gaussians: OrientedGaussians
+    arrays: GaussianArrays
+    region: Region
+    """Scene frame."""
+    world_region: Region
+    field: Field
+
+
+def load_region(
+    job: JobFile, request: str, cameras: Stage, trained: Stage, device: DeviceChoice, threads: int
+) -> RegionInputs:
+    """Load a finished training and build the field of a region from it.
+
+    Parameters
+    ----------
+    request : str
+        The region's entry in the job's settings.
+    device : DeviceChoice
+        Where vacancy is evaluated, if it fits there.
+
+    Raises
+    ------
+    ParseError, DatasetError
+        A file of the stages is damaged or missing.
+    DeviceError
+        As :func:`field_device`.
+    """
+    from ...dataset.refined_scene import load_refined_scene
+    from ...field.vector_field import VectorField
+    from ...gaussians.gaussian_file import load_gaussians
+    from ...meshing.tiles.plan import Field
+
+    scene = load_refined_scene(cameras.folder, trained.folder)
+    gaussians = load_gaussians(trained.folder / "gaussians.npz")
+    arrays = gaussians.arrays()
+    body = job.region_bodies.get(request)
+    region, world_region = requested_region(request, body, scene, arrays)
+    vacancy = region_field(
+        scene, arrays, region, job.settings.training, job.meshing_of(request), threads=threads,
+        device=field_device(device, job.settings.device, arrays).device,
+    )  # fmt: skip
+    field = Field(vacancy, VectorField(arrays, threads=threads), threads)
+    return RegionInputs(scene, gaussians, arrays, region, world_region, field)
 
 
 def requested_region(

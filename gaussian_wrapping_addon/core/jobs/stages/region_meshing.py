@@ -1,51 +1,54 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Mesh a region in its stage folder, whole or in tiles, as requested or as memory allows."""
+"""Mesh a region in its stage folder, whole or in tiles, as requested or as memory allows.
+
+Tiles are parts of a job, which other processes may make (:mod:`..parts`): a region in tiles is
+planned here, and joined here once its tiles are there.
+"""
 
 from __future__ import annotations
 
 import logging
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...errors import MeshingError
 from ...progress import Progress
-from ...settings import JobSettings, MeshingSettings, from_json, to_json
-from ..store.claims import Claims, run_tasks
-from ..store.job_file import read_job
-from ..store.job_folder import JobFolder
-from ..store.stage_folder import read_done
-from .mesh_keys import mesh_stages
+from ...settings import MeshingSettings
 
 if TYPE_CHECKING:
     from ...dataset.camera import Camera
     from ...field.depth_samples import DepthSamples
     from ...field.vacancy.vacancy import VacancyField
-    from ...field.vector_field import VectorField
     from ...gaussians.model import GaussianArrays
     from ...mesh.surface_mesh import SurfaceMesh
     from ...meshing.cost.mesh_estimate import MeshEstimate
     from ...meshing.cost.pivot_estimate import PivotEstimate
     from ...meshing.tiles.plan import Field
     from ...regions.convex_region import Region
+    from ...report_warning import ReportWarning
 
 _logger = logging.getLogger(__name__)
 
 TILES_FOLDER = "tiles"
 """Subfolder of the stage's folder while tiles are being meshed."""
 
-CLAIMS_FOLDER = "claims"
-
 MAX_SPACING_SAMPLES = 5_000
 """Approximate number of depth samples at which the resolution of the photos is evaluated."""
 
 
+class TilesPlanned(Exception):  # noqa: N818 - no error: the tiles are made next
+    """A region is planned in tiles, some of which are not made yet."""
+
+    def __init__(self, stage_folder: Path) -> None:
+        super().__init__(stage_folder)
+        self.stage_folder = stage_folder
+
+
 def mesh_in_stage(
     stage_folder: Path,
-    vacancy: VacancyField,
-    vectors: VectorField,
+    field: Field,
     arrays: GaussianArrays,
     cameras: Sequence[Camera],
     region: Region,
@@ -53,12 +56,18 @@ def mesh_in_stage(
     progress: Progress,
     *,
     seed: int,
-    threads: int,
     edge_length_scene: float,
-    depth_samples: DepthSamples,
-    origin: dict[str, Any],
+    sampled: Callable[[], DepthSamples],
+    warnings: Sequence[ReportWarning] = (),
 ) -> tuple[SurfaceMesh, dict[str, Any]]:
-    """Estimate the mesh of a region, then make it, whole or in tiles.
+    """Estimate the mesh of a region, then make it; or plan its tiles; or join them.
+
+    Parameters
+    ----------
+    sampled : callable
+        Samples depth maps; not called where tiles are planned already.
+    warnings : sequence of ReportWarning
+        Of the plan, for the report.
 
     Returns
     -------
@@ -68,38 +77,84 @@ def mesh_in_stage(
 
     Raises
     ------
+    TilesPlanned
+        Tiles are to be made first.
     ResourceError
         The mesh does not fit into memory.
     MeshingError
         The region holds no surface.
     """
     from ...meshing.primal_adaptive import mesh_region
-    from ...meshing.tiles.plan import Field
-    from ...meshing.tiles.store import LIST_NAME
+    from ...meshing.tiles.store import is_planned, save_plan
+    from ...meshing.tiles.tiled_mesh import plan_tiles
 
+    folder = stage_folder / TILES_FOLDER
+    if is_planned(folder):
+        return _joined(stage_folder, field, meshing, progress)
+    depth_samples = sampled()
     expected = estimate_region_mesh(
-        vacancy, cameras, region, meshing, edge_length_scene, depth_samples
+        field.vacancy, cameras, region, meshing, edge_length_scene, depth_samples
     )
     for line in expected.lines():
         _logger.info("region %s, estimated %s", region.name, line)
-    memory_bytes = free_bytes(stage_folder, threads)
-    begun = (stage_folder / TILES_FOLDER / LIST_NAME).is_file()
+    memory_bytes = free_bytes(stage_folder, field.threads)
     tiled = meshing.tiles != "off" and (
-        meshing.tiles != "auto" or begun or expected.tiles_for(memory_bytes)
+        meshing.tiles != "auto" or bool(expected.tiles_for(memory_bytes))
     )
     expected.refuse(memory_bytes, tiled=tiled)
+    told = {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": tiled}
     if tiled:
-        mesh = mesh_tiled_in_stage(
-            stage_folder, Field(vacancy, vectors, threads), arrays, cameras, region, meshing,
-            progress, tiles=0 if meshing.tiles == "auto" else int(meshing.tiles), seed=seed,
-            edge_length_scene=edge_length_scene, depth_samples=depth_samples, origin=origin,
+        tiles = 0 if meshing.tiles == "auto" else int(meshing.tiles)
+        plan = plan_tiles(
+            field, arrays, cameras, region, meshing, progress, tiles=tiles, seed=seed,
+            edge_length_scene=edge_length_scene, depth_samples=depth_samples,
         )  # fmt: skip
-    else:
-        mesh = mesh_region(
-            vacancy, vectors, arrays, cameras, region, meshing, progress, seed=seed,
-            threads=threads, edge_length_scene=edge_length_scene, depth_samples=depth_samples,
-        )  # fmt: skip
-    return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": tiled}
+        noted = {"estimate": told, "warnings": [warning.to_json() for warning in warnings]}
+        save_plan(folder, plan, noted)
+        raise TilesPlanned(stage_folder)
+    mesh = mesh_region(
+        field.vacancy, field.vectors, arrays, cameras, region, meshing, progress, seed=seed,
+        threads=field.threads, edge_length_scene=edge_length_scene, depth_samples=depth_samples,
+    )  # fmt: skip
+    _note(mesh, warnings)
+    return mesh, told
+
+
+def _note(mesh: SurfaceMesh, warnings: Sequence[ReportWarning]) -> None:
+    if warnings:
+        before = mesh.provenance.get("warnings", [])
+        mesh.provenance["warnings"] = [*before, *(warning.to_json() for warning in warnings)]
+
+
+def _joined(
+    stage_folder: Path, field: Field, meshing: MeshingSettings, progress: Progress
+) -> tuple[SurfaceMesh, dict[str, Any]]:
+    """Join the tiles of a planned region.
+
+    Raises
+    ------
+    TilesPlanned
+        Some are missing.
+    """
+    from ...meshing.tiles.store import (
+        faces_path,
+        gathered_path,
+        load_faces,
+        load_gathered,
+        load_plan,
+    )
+    from ...meshing.tiles.tiled_mesh import join_tiles
+
+    folder = stage_folder / TILES_FOLDER
+    plan, noted = load_plan(folder)
+    paths = [faces_path(folder, tile) for tile in range(len(plan.tiling))]
+    if not all(path.is_file() for path in [gathered_path(folder), *paths]):
+        raise TilesPlanned(stage_folder)
+    parts = [load_faces(path) for path in paths]
+    mesh = join_tiles(field, plan, load_gathered(gathered_path(folder)), parts, meshing, progress)
+    if noted.get("warnings"):
+        mesh.provenance["warnings"] = list(noted["warnings"])
+    return mesh, dict(noted.get("estimate", {}))
 
 
 def mesh_by_pivots_in_stage(
@@ -114,6 +169,7 @@ def mesh_by_pivots_in_stage(
     seed: int,
     threads: int,
     depth_samples: DepthSamples | None,
+    warnings: Sequence[ReportWarning] = (),
 ) -> tuple[SurfaceMesh, dict[str, Any]]:
     """Estimate the mesh of a region by pivots, then make it; see :func:`mesh_in_stage`."""
     from ...meshing.pivot_meshing import mesh_by_pivots
@@ -126,6 +182,7 @@ def mesh_by_pivots_in_stage(
     mesh = mesh_by_pivots(
         vacancy, arrays, cameras, region, meshing, progress, seed=seed, depth_samples=depth_samples
     )
+    _note(mesh, warnings)
     return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": False}
 
 
@@ -188,69 +245,6 @@ def free_bytes(folder: Path, threads: int) -> int:
     return int(MEMORY_SHARE_LEFT * this_machine(folder, threads).memory_bytes)
 
 
-def mesh_tiled_in_stage(
-    stage_folder: Path,
-    field: Field,
-    arrays: GaussianArrays,
-    cameras: Sequence[Camera],
-    region: Region,
-    meshing: MeshingSettings,
-    progress: Progress,
-    *,
-    tiles: int,
-    seed: int,
-    edge_length_scene: float,
-    depth_samples: DepthSamples | None,
-    origin: dict[str, Any],
-) -> SurfaceMesh:
-    """Mesh a region tile by tile, alone or together with other processes.
-
-    Finished tiles of an interrupted run are re-used.
-
-    Parameters
-    ----------
-    tiles : int
-        0 makes as many as the request needs.
-    origin : dict
-        From which other processes rebuild the same field (:func:`tiles_origin`).
-    """
-    from ...meshing.tiles.store import (
-        LIST_NAME,
-        faces_path,
-        gathered_path,
-        load_faces,
-        load_gathered,
-        load_plan,
-        save_plan,
-    )
-    from ...meshing.tiles.tiled_mesh import join_tiles, plan_tiles
-    from .tile_tasks import tile_tasks
-
-    folder = stage_folder / TILES_FOLDER
-    if not (folder / LIST_NAME).is_file():
-        save_plan(
-            folder,
-            plan_tiles(
-                field, arrays, cameras, region, meshing, progress.span(0.0, 0.2), tiles=tiles,
-                seed=seed, edge_length_scene=edge_length_scene, depth_samples=depth_samples,
-            ),
-            origin,
-        )  # fmt: skip
-    plan, _ = load_plan(folder)
-    claims = Claims(folder / CLAIMS_FOLDER)
-    run_tasks(tile_tasks(folder, plan, field), claims, progress.span(0.2, 0.9))
-    parts = [load_faces(faces_path(folder, tile)) for tile in range(len(plan.tiling))]
-    all_points = load_gathered(gathered_path(folder))
-    mesh = join_tiles(field, plan, all_points, parts, meshing, progress.span(0.9, 1.0))
-    mesh.provenance["tile_processes"] = claims.worker_count()
-    return mesh
-
-
-def tiles_origin(cameras: Path, training: Path, settings: JobSettings) -> dict[str, Any]:
-    """Return the inputs from which another process rebuilds the same field, as JSON values."""
-    return {"cameras": cameras.name, "training": training.name, "settings": to_json(settings)}
-
-
 def remove_tiles(stage_folder: Path) -> None:
     """Remove the tile files once the mesh is saved."""
     folder = stage_folder / TILES_FOLDER
@@ -262,69 +256,3 @@ def remove_tiles(stage_folder: Path) -> None:
     except OSError:
         aside = folder
     shutil.rmtree(aside, ignore_errors=True)
-
-
-def unfinished_tile_lists(folder: JobFolder) -> list[Path]:
-    """Return the folders of the unfinished tile lists of the job in a folder.
-
-    Lists of earlier jobs, which nothing will join, do not count. The job's worker need not be
-    alive: another machine could not tell.
-    """
-    from ...meshing.tiles.store import LIST_NAME
-
-    found = sorted(folder.stages.glob(f"mesh-*/{TILES_FOLDER}/{LIST_NAME}"))
-    unfinished = [path.parent for path in found if read_done(path.parent.parent) is None]
-    if not unfinished or folder.read_status().state == "DONE":
-        return []
-    own_stages = mesh_stages(folder, read_job(folder.job_path))
-    return [path for path in unfinished if path.parent.name in own_stages]
-
-
-def work_on_tile_list(
-    stages: Path,
-    folder: Path,
-    progress: Progress,
-    done_here: list[str],
-    *,
-    threads: int,
-    device: str,
-) -> None:
-    """Work on a tile list in a separate process; append the names of completed tasks.
-
-    Parameters
-    ----------
-    device : str
-        The setting of this process.
-
-    Raises
-    ------
-    ParseError, DatasetError
-        A stage named by the list is not in the job folder.
-    """
-    from ...dataset.refined_scene import load_refined_scene
-    from ...devices import choose_device
-    from ...field.vector_field import VectorField
-    from ...files import resolve_inside
-    from ...gaussians.gaussian_file import load_gaussians
-    from ...meshing.tiles.plan import Field
-    from ...meshing.tiles.store import load_plan
-    from .region_field import field_device, region_field
-    from .tile_tasks import tile_tasks
-
-    plan, origin = load_plan(folder)
-    stage_folders = [
-        resolve_inside(stages, str(origin.get(key, ""))) for key in ("cameras", "training")
-    ]
-    if None in stage_folders:
-        raise MeshingError("The tile list names no stages of this job.", "Mesh the region again.")
-    cameras, training = (stage for stage in stage_folders if stage is not None)
-    scene = load_refined_scene(cameras, training)
-    arrays = load_gaussians(training / "gaussians.npz").arrays()
-    settings = from_json(JobSettings, origin.get("settings"), "settings").validated()
-    vacancy = region_field(
-        scene, arrays, plan.region, settings.training, settings.meshing, threads=threads,
-        device=field_device(choose_device(device), device, arrays).device,
-    )  # fmt: skip
-    field = Field(vacancy, VectorField(arrays, threads=threads), threads)
-    tasks = tile_tasks(folder, plan, field)
-    run_tasks(tasks, Claims(folder / CLAIMS_FOLDER), progress, done_here=done_here)

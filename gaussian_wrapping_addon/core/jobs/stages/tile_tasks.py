@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tasks of a tiled mesh, which any number of processes can share."""
+"""The parts of a tiled mesh: points of a tile, all points, faces of a tile."""
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import cached_property
 from pathlib import Path
 
+from ...meshing.tiles.kinds import GATHER, POINTS, TILE_KINDS
 from ...meshing.tiles.plan import Field, TilePlan
 from ...meshing.tiles.store import (
     faces_path,
     gathered_path,
     load_gathered,
+    load_plan,
     load_points,
     points_path,
     save_faces,
@@ -18,49 +20,58 @@ from ...meshing.tiles.store import (
     save_points,
 )
 from ...meshing.tiles.tile_faces import tile_faces
-from ...meshing.tiles.tile_points import gather, tile_points
+from ...meshing.tiles.tile_points import GatheredPoints, gather, tile_points
 from ...progress import Progress
-from ..store.claims import Task
 
 
-def tile_tasks(folder: Path, plan: TilePlan, field: Field) -> list[Task]:
-    """Return the tasks of a tile list: points of each tile, all points, faces of each tile."""
-    count = len(plan.tiling)
-    all_points = cache(lambda: load_gathered(gathered_path(folder)))
+def tile_file(folder: Path, kind: str, tile: int) -> Path:
+    """Return the file that a part of a tiled mesh makes."""
+    if kind == GATHER:
+        return gathered_path(folder)
+    return (points_path if kind == POINTS else faces_path)(folder, tile)
 
-    def make_points(tile: int, progress: Progress) -> None:
-        save_points(points_path(folder, tile), tile_points(field, plan, tile, progress))
 
-    def gather_points(progress: Progress) -> None:
-        progress.update(0.0, "bringing the tiles' points together")
-        parts = [load_points(points_path(folder, tile)) for tile in range(count)]
-        save_gathered(gathered_path(folder), gather(plan, parts))
+class TileMaker:
+    """Makes the parts of one planned region; each can be made again, with the same result.
 
-    def make_faces(tile: int, progress: Progress) -> None:
-        part = tile_faces(field, plan, all_points(), tile, progress)
-        save_faces(faces_path(folder, tile), part)
+    Parameters
+    ----------
+    folder : Path
+        Of the tiles, with their plan.
+    """
 
-    def all_sampled() -> bool:
-        return all(points_path(folder, tile).is_file() for tile in range(count))
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
 
-    gathered = gathered_path(folder).is_file
-    tasks = [
-        Task(
-            f"points-{tile:04d}",
-            points_path(folder, tile).is_file,
-            lambda: True,
-            partial(make_points, tile),
-        )
-        for tile in range(count)
-    ]
-    tasks.append(Task("points", gathered, all_sampled, gather_points))
-    tasks += [
-        Task(
-            f"faces-{tile:04d}",
-            faces_path(folder, tile).is_file,
-            gathered,
-            partial(make_faces, tile),
-        )
-        for tile in range(count)
-    ]
-    return tasks
+    @cached_property
+    def plan(self) -> TilePlan:
+        """The plan of the region."""
+        return load_plan(self._folder)[0]
+
+    @cached_property
+    def _all_points(self) -> GatheredPoints:
+        return load_gathered(gathered_path(self._folder))
+
+    def make_all(self, field: Field, progress: Progress) -> None:
+        """Make all parts that are missing, one after another."""
+        count = len(self.plan.tiling)
+        todo = [(kind, tile) for kind in TILE_KINDS for tile in range(count)]
+        todo = [(kind, tile) for kind, tile in todo if kind != GATHER or tile == 0]
+        for number, (kind, tile) in enumerate(todo):
+            if not tile_file(self._folder, kind, tile).is_file():
+                span = progress.span(number / len(todo), (number + 1) / len(todo))
+                self.make(kind, tile, field, span)
+
+    def make(self, kind: str, tile: int, field: Field, progress: Progress) -> Path:
+        """Make a part and return its file."""
+        path = tile_file(self._folder, kind, tile)
+        if kind == POINTS:
+            save_points(path, tile_points(field, self.plan, tile, progress))
+        elif kind == GATHER:
+            progress.update(0.0, "bringing the tiles' points together")
+            count = len(self.plan.tiling)
+            parts = [load_points(points_path(self._folder, number)) for number in range(count)]
+            save_gathered(path, gather(self.plan, parts))
+        else:
+            save_faces(path, tile_faces(field, self.plan, self._all_points, tile, progress))
+        return path

@@ -118,7 +118,8 @@ def make_job(
     _check_source(str(real_path(source)))
     own = _checked_lengths(dict(edge_lengths or {}), settings.regions)
     lengths: dict[str, float] = {}
-    if not source.exists():
+    # A finished training may hold all that it needs of its input, such as the frames of a video.
+    if command == "wrap" and not source.exists():
         raise DatasetError(f"{source} does not exist.", "Check the path.")
     names: list[str] = []
     bodies: dict[str, Any] = {}

@@ -7,6 +7,7 @@ stop), ``stages/<name>-<hash>/`` (``done.json`` last), ``result/``.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -14,15 +15,19 @@ from typing import Any
 
 from ... import limits
 from ...errors import DISK_FULL_ERRNOS, ParseError, UsageError, known_error, unwritable_error
-from ...files import overwrite_json, read_json, write_json
+from ...files import overwrite_json, read_json, seconds_since_written, write_json
 from ...names import JOB_MARKER
-from ...processes.process_identity import owner_alive, process_start_ticks
+from ...processes.process_identity import (
+    host_and_pid_namespace,
+    is_here,
+    owner_alive,
+    process_start_ticks,
+)
 from ...regular_files import read_bounded, reject_foreign_entries, touch_regular
 
 FOREIGN_LOCK_HINT = "If it is no job of this add-on, delete lock.json there."
 STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
 ACTIVE_STATES = ("NEW", "RUNNING", "CANCELLING")
-MARKER = JOB_MARKER
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,8 @@ class JobStatus:
     pid: int = 0
     pid_started: int = 0
     """Start time of the process in system ticks: detects a re-used pid."""
+    place: str = ""
+    """Where the pid is one: host, boot and namespace; empty for this computer."""
     heartbeat_s: float = 0.0
     """Unix time of the last heartbeat."""
     result: str = ""
@@ -169,11 +176,11 @@ class JobFolder:
             if self.root.exists() and not self.root.is_dir():
                 raise UsageError(f"{self.root} is a file.", "Choose a folder for the results.")
             self.root.mkdir(parents=True, exist_ok=True)
-            if not os.path.lexists(self.root / MARKER) and any(self.root.iterdir()):
+            if not os.path.lexists(self.root / JOB_MARKER) and any(self.root.iterdir()):
                 raise UsageError(
                     f"{self.root} holds other files.", "Choose a new or empty folder for results."
                 )
-            touch_regular(self.root / MARKER)
+            touch_regular(self.root / JOB_MARKER)
             self.stages.mkdir(exist_ok=True)
         except OSError as error:
             raise known_error(error, self.root) or unwritable_error(self.root, error) from None
@@ -195,7 +202,7 @@ class JobFolder:
 
     def is_job(self) -> bool:
         """Whether a job was started here."""
-        return (self.root / MARKER).exists() and self.job_path.exists()
+        return (self.root / JOB_MARKER).exists() and self.job_path.exists()
 
     def read_status(self) -> JobStatus:
         """Return the status; a running job whose process is gone is reported as LOST."""
@@ -218,10 +225,10 @@ class JobFolder:
         except (OSError, ParseError, TypeError, ValueError):
             return JobStatus()
 
-    @staticmethod
-    def _gone(status: JobStatus) -> bool:
-        running = status.state in ("RUNNING", "CANCELLING")
-        return running and not owner_alive(status.pid, status.pid_started)
+    def _gone(self, status: JobStatus) -> bool:
+        if status.state not in ("RUNNING", "CANCELLING"):
+            return False
+        return not _lives(status.pid, status.pid_started, status.place, self.status_path)
 
     def write_status(self, status: JobStatus) -> None:
         """Write the status atomically."""
@@ -244,9 +251,12 @@ class JobFolder:
         UsageError
             Another process holds the folder.
         """
-        mine = {"pid": os.getpid(), "started": process_start_ticks(os.getpid())}
-        owner = self._lock_owner()
-        if owner == (mine["pid"], mine["started"]):
+        mine = {
+            "pid": os.getpid(),
+            "started": process_start_ticks(os.getpid()),
+            "place": host_and_pid_namespace(),
+        }
+        if self._lock_owner() == tuple(mine.values()):
             return
         self._drop_stale_lock()
         # A hard link to a complete file is atomic and succeeds for one process only.
@@ -255,9 +265,10 @@ class JobFolder:
         try:
             os.link(ready, self.lock_path)
         except FileExistsError:
-            pid = (self._lock_owner() or (0, 0))[0]
+            pid, _, place = self._lock_owner() or (0, 0, "")
+            where = "" if is_here(place) else f" of {place.split(' ')[0]}"
             raise UsageError(
-                f"Process {pid} is working in {self.root}.",
+                f"Process {pid}{where} is working in {self.root}.",
                 f"Wait for it, cancel it, or choose another folder. {FOREIGN_LOCK_HINT}",
             ) from None
         except OSError:
@@ -276,7 +287,7 @@ class JobFolder:
         except OSError:
             return
         owner = self._lock_owner()
-        if owner is not None and owner_alive(*owner):
+        if owner is not None and _lives(*owner, self.lock_path):
             return
         aside = self.lock_path.with_name(f"lock.{os.getpid()}.stale")
         try:
@@ -294,18 +305,34 @@ class JobFolder:
         finally:
             aside.unlink(missing_ok=True)
 
-    def _lock_owner(self) -> tuple[int, int] | None:
+    def _lock_owner(self) -> tuple[int, int, str] | None:
+        """Return pid, start time and place of the process that holds the folder."""
         try:
             owner = _read_small(self.lock_path)
-            return int(owner["pid"]), int(owner["started"])
-        except (OSError, ParseError, KeyError, TypeError, ValueError):
+            return int(owner["pid"]), int(owner["started"]), str(owner.get("place", ""))
+        except (OSError, ParseError, KeyError, TypeError, ValueError, AttributeError):
             return None
 
     def locked(self) -> bool:
-        """Whether a living process holds the folder."""
+        """Whether a living process holds the folder; on another computer, one that shows it."""
         owner = self._lock_owner()
-        return owner is not None and owner_alive(*owner)
+        return owner is not None and _lives(*owner, self.lock_path)
+
+    def show_life(self) -> None:
+        """Show other computers that the process that holds the folder lives."""
+        with contextlib.suppress(OSError):
+            os.utime(self.lock_path)
 
     def unlock(self) -> None:
         """Release the folder."""
         self.lock_path.unlink(missing_ok=True)
+
+
+def _lives(pid: int, started: int, place: str, record: Path) -> bool:
+    """Tell whether the process that a file names lives, by the file's age if it is elsewhere."""
+    if is_here(place):
+        return owner_alive(pid, started)
+    try:
+        return seconds_since_written(record) < limits.SILENT_S
+    except OSError:
+        return False

@@ -19,8 +19,8 @@ from ...dataset.photos.photo_finder import second_copies
 from ...dataset.readers.programs.program_files import find_program_cameras
 from ...errors import DatasetError, ParseError, WrapError
 from ...files import read_json, write_json
+from ...names import JOB_MARKER
 from ...progress import Progress
-from .job_folder import MARKER
 
 _logger = logging.getLogger(__name__)
 
@@ -66,6 +66,8 @@ def stage_key(*parts: Any) -> str:
 def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
     """List the files of an input with size and modification time, for :func:`stage_key`.
 
+    An input that is gone has none.
+
     Photos are not read: size and time detect a change, as in build systems.
 
     Raises
@@ -76,6 +78,8 @@ def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
     if source.is_file() and source.suffix.lower() == ".ply":
         state = source.stat()
         return [(source.name, state.st_size, state.st_mtime_ns)]
+    if not source.exists():
+        return []
     root = source if source.is_dir() else source.parent
     # Other programs write such files beside photos, too, and change them: notes of photo managers.
     suffixes = (*INPUT_SUFFIXES, *(CAMERA_SUFFIXES if _has_camera_files(source) else ()))
@@ -88,7 +92,7 @@ def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
                 f"{root} holds more than {limits.MAX_SOURCE_FILES} files.",
                 "Give the folder of the photos alone.",
             )
-        if MARKER in names:
+        if JOB_MARKER in names:
             subfolders.clear()  # a job folder beside a transforms.json is not input
             continue
         subfolders[:] = sorted(s for s in subfolders if not s.startswith("."))

@@ -14,6 +14,7 @@ from ...dataset.camera import Camera
 from ...mesh.surface_sampling import POINTS_PER_SQUARE
 from ...progress import Progress
 from ...regions.convex_region import Region
+from ...regions.tiling import Tiling, split_evenly
 from ...report_warning import ReportWarning
 from ..points.candidate_surface import CandidateSurface
 from ..points.region_caps import Caps, cap_points
@@ -21,7 +22,6 @@ from ..points.resolution import DenseRequest, ResolutionRequest, dense_request, 
 from ..points.spacing import Spacing
 from ..points.surface_points import SurfaceSampler
 from .steiner_points import CLEARANCE_CAP_RADII, CLEARANCE_RADII, lattice_side, steiner_lattice
-from .tiling import Tiling, split_evenly
 
 TILE_POINTS = 75_000
 """Most surface points of a tile if the number of tiles is automatic: its memory stays small

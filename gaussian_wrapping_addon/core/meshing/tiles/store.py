@@ -16,6 +16,7 @@ from ...array_file import read_arrays
 from ...errors import ParseError
 from ...files import read_json, write_bytes, write_json
 from ...regions.convex_region import Region
+from ...regions.tiling import Tiling
 from ...report_warning import read_warnings
 from ..points.candidate_surface import CandidateSurface
 from ..points.region_caps import Caps
@@ -24,10 +25,9 @@ from ..points.surface_points import SurfacePoints
 from .plan import TilePlan
 from .tile_faces import TileFaces
 from .tile_points import GatheredPoints
-from .tiling import Tiling
 
 LIST_NAME = "tiles.json"
-VERSION = 1
+VERSION = 2
 _PLAN_ARRAYS = (
     "vertices", "faces", "fillers", "region", "cap_points", "cap_normals", "cap_radii",
     "cap_priority", "spacing_points", "spacing_radii",
@@ -51,13 +51,22 @@ def gathered_path(folder: Path) -> Path:
     return folder / "points.npz"
 
 
-def save_plan(folder: Path, plan: TilePlan, origin: dict[str, Any]) -> None:
+def is_planned(folder: Path) -> bool:
+    """Return whether a folder holds a plan; one of another version does not count."""
+    try:
+        values = read_json(folder / LIST_NAME)
+    except (OSError, ParseError):
+        return False
+    return isinstance(values, dict) and values.get("version") == VERSION
+
+
+def save_plan(folder: Path, plan: TilePlan, noted: dict[str, Any]) -> None:
     """Write a plan; its JSON file comes last.
 
     Parameters
     ----------
-    origin : dict
-        JSON values by which another process finds the Gaussians and cameras.
+    noted : dict
+        JSON values that are kept with it for whoever joins the tiles.
     """
     folder.mkdir(parents=True, exist_ok=True)
     _save(
@@ -73,7 +82,7 @@ def save_plan(folder: Path, plan: TilePlan, origin: dict[str, Any]) -> None:
         {
             "version": VERSION,
             "region": plan.region.name,
-            "origin": origin,
+            "noted": noted,
             "seed": plan.seed,
             "radius": plan.spacing.nominal,
             "limited": plan.spacing.limited,
@@ -97,7 +106,7 @@ def _finite(corner: np.ndarray) -> list[float | None]:
 
 
 def load_plan(folder: Path) -> tuple[TilePlan, dict[str, Any]]:
-    """Read a plan and its origin.
+    """Read a plan and what was noted with it.
 
     Raises
     ------
@@ -135,7 +144,7 @@ def load_plan(folder: Path) -> tuple[TilePlan, dict[str, Any]]:
             float(values["share"]),
             int(values["sightings"]),
         )  # fmt: skip
-        return plan, dict(values["origin"])
+        return plan, dict(values["noted"])
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise ParseError(path, "whole file", f"{error}.", "Mesh the region again.") from None
 

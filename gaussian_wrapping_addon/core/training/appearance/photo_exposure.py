@@ -110,6 +110,8 @@ class Exposure:
         self.gradient = np.zeros(6)
         """Gradient of the last backward pass, for the next step; not part of the state."""
         self._store = ArrayStore()
+        self.active = True
+        """Whether steps change exposures."""
         if log_gains is not None:
             start = np.asarray(log_gains, np.float64)
             if start.shape != (count, 3):
@@ -204,7 +206,7 @@ class Exposure:
 
         A non-finite gradient is skipped.
         """
-        if not np.isfinite(self.gradient).all():
+        if not self.active or not np.isfinite(self.gradient).all():
             return
         self.values[view] -= self.adam.step(view, self.gradient, rate).astype(np.float32)
         self.pin()
@@ -231,6 +233,8 @@ class Exposure:
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of the arrays that the next iteration depends on, by name."""
         own: dict[str, np.ndarray] = {"values": self.values.copy(), "trained": self.trained.copy()}
+        if not self.active:
+            own["active"] = np.array(False)
         return own | self.adam.to_arrays()
 
     @classmethod
@@ -254,6 +258,7 @@ class Exposure:
             raise ValueError(f"values of the exposures: {values.dtype} {values.shape}")
         made.values[...] = values
         made.adam.load(arrays)
+        made.active = bool(arrays.get("active", True))
         return made
 
     @staticmethod

@@ -53,6 +53,29 @@ def contributions(
     return share / max(1, count)
 
 
+def largest_contributors(weights: np.ndarray, share: float) -> np.ndarray:
+    """Return the Gaussians that a view needs: all but the least, which make up ``share`` of it.
+
+    Parameters
+    ----------
+    weights : (n,) float64
+        Contribution of each Gaussian to the view, at least 0.
+    share : float
+        In [0, 1).
+
+    Returns
+    -------
+    (k,) int64
+    """
+    seen = np.flatnonzero(weights > 0.0)
+    if len(seen) == 0:
+        return seen
+    amount = weights[seen]
+    order = np.argsort(amount, kind="stable")
+    running = np.cumsum(amount[order])
+    return seen[order[running > share * running[-1]]]
+
+
 def needed_by_a_view(
     gaussians: OrientedGaussians,
     views: Iterable[WrapView],
@@ -91,21 +114,22 @@ def needed_by_a_view(
     for view in views:
         statistics = renderer.render(raw, view.camera, options).statistics
         assert statistics is not None
-        seen = np.flatnonzero(statistics.weight_sum > 0.0)
-        amount = statistics.weight_sum[seen].astype(np.float64)
+        amount = statistics.weight_sum.astype(np.float64)
         if weights is not None:
-            amount *= weights[seen]
-        order = np.argsort(amount, kind="stable")
-        running = np.cumsum(amount[order])
-        if len(seen):
-            needed[seen[order[running > share * running[-1]]]] = True
+            amount *= weights
+        needed[largest_contributors(amount, share)] = True
     return needed
 
 
 def prune_contributors(adam: Adam, needed: np.ndarray) -> int:
-    """Keep the Gaussians of a mask, unless it is empty; return the number of those removed."""
-    keep = np.flatnonzero(needed)
-    if len(keep) == 0 or len(keep) == len(needed):
+    """Keep the Gaussians of a mask, unless it is empty; return the number of those removed.
+
+    Frozen Gaussians are kept, and the mask of the others must not be empty.
+    """
+    if not needed[adam.frozen :].any():
+        return 0
+    keep = np.flatnonzero(needed | (np.arange(len(needed)) < adam.frozen))
+    if len(keep) == len(needed):
         return 0
     adam.rebuild(keep, np.zeros(len(keep), np.bool_), {})
     return len(needed) - len(keep)

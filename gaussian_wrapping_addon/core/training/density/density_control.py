@@ -77,6 +77,11 @@ class DensityStatistics:
         self.gradient_abs += weight * statistics.grad_abs_px
         self.views += statistics.visible
 
+    def beyond(self, first: int) -> DensityStatistics:
+        """Return those of all Gaussians but the first ones, in the host's memory."""
+        sums = (self.gradient, self.gradient_abs, self.views)
+        return DensityStatistics(*(array[first:] for array in sums))
+
 
 @dataclass(frozen=True)
 class DensityChange:
@@ -106,11 +111,11 @@ def densify_and_prune(
     Parameters
     ----------
     adam : Adam
-        Rebuilt; new Gaussians start with zero moments.
+        Rebuilt; new Gaussians start with zero moments. Frozen ones are neither parents nor pruned.
     statistics : DensityStatistics
         Statistics of the current Gaussians.
     limit : int
-        Largest number of Gaussians.
+        Largest number of Gaussians that are not frozen.
     random : numpy.random.Generator
         Draws the means of new Gaussians from the distributions of the old ones.
     weights : (n,), optional
@@ -122,10 +127,16 @@ def densify_and_prune(
     """
     log_scales = adam.array("log_scales")
     opacity = 1.0 / (1.0 + np.exp(-adam.array("opacity_logits").astype(np.float64)))
-    keep = opacity >= min_opacity
-    if not keep.any():
-        keep[np.argmax(opacity)] = True
-    chosen = _qualified(statistics, keep, limit - int(keep.sum()), weights, least_score)
+    keep, frozen = opacity >= min_opacity, adam.frozen
+    trained = keep[frozen:]  # a view
+    if not trained.any():
+        trained[np.argmax(opacity[frozen:])] = True
+    chosen = np.zeros(len(keep), np.bool_)
+    chosen[frozen:] = _qualified(
+        statistics.beyond(frozen), trained, limit - int(trained.sum()),
+        None if weights is None else weights[frozen:], least_score,
+    )  # fmt: skip
+    keep[:frozen] = True
     small = log_scales.max(axis=1) <= np.log(CLONE_SIZE)
     cloned = np.nonzero(chosen & small)[0]
     split = np.nonzero(chosen & ~small)[0]
@@ -179,7 +190,7 @@ def _offsets(adam: Adam, rows: np.ndarray, random: np.random.Generator) -> np.nd
 
 
 def reset_opacity(adam: Adam) -> None:
-    """Cap all effective opacities at 0.01 and reset their moments.
+    """Cap all effective opacities but frozen ones at 0.01 and reset their moments.
 
     See docs/method.md, section 4.1.
     """
@@ -187,6 +198,6 @@ def reset_opacity(adam: Adam) -> None:
     log_factor = (gaussians.log_scales - gaussians.scales().log()).sum(1).numpy()  # (n,) <= 0
     log_cap = np.minimum(np.log(RESET_OPACITY) - log_factor, np.log1p(-1e-6))
     cap = log_cap - np.log(-np.expm1(log_cap))  # logit of the raw opacity
-    logits = adam.array("opacity_logits")
-    np.minimum(logits, cap, out=logits)
+    logits = adam.array("opacity_logits")[adam.frozen :]
+    np.minimum(logits, cap[adam.frozen :], out=logits)
     adam.reset_moments("opacity_logits")

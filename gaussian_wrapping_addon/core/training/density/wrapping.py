@@ -53,11 +53,13 @@ def start_orientation(
 
     Each view votes for the side that it sees, weighted by the Gaussian's blending weight; the sign
     parameter becomes +-``first_sign``, or stays 0 if no view sees the Gaussian (docs/method.md,
-    section 1.3). Gaussians that are oriented already, those of a splat, keep their orientation.
+    section 1.3). Gaussians that are oriented already, those of a splat, keep their orientation,
+    and so do frozen ones.
     """
     gaussians = adam.gaussians()
     length = np.linalg.norm(gaussians.detached().normals().numpy(), axis=1)  # (n,)
     missing = length < tolerances.ORIENTED_MIN_NORM
+    missing[: adam.frozen] = False
     if not missing.any():
         return
     cameras = (view.camera for view in views)
@@ -109,7 +111,8 @@ def wrap(adam: Adam, errors: np.ndarray, share: float, limit: int) -> int:
     See docs/method.md, section 4.2.
 
     Original and clone are shrunk along the normal to half the volume and each moved by 0.1 standard
-    deviations along it, the clone backwards. Gaussians without orientation are skipped.
+    deviations along it, the clone backwards. Gaussians without orientation are skipped, and frozen
+    ones, which neither share nor limit counts.
 
     Parameters
     ----------
@@ -129,10 +132,12 @@ def wrap(adam: Adam, errors: np.ndarray, share: float, limit: int) -> int:
     """
     gaussians = adam.gaussians().detached()
     count = len(gaussians)
-    room = min(math.floor(share * count), limit - count)
+    trained = count - adam.frozen
+    room = min(math.floor(share * trained), limit - trained)
     normals = gaussians.normals().numpy().astype(np.float64)
     length = np.linalg.norm(normals, axis=1)
     usable = (errors > 0.0) & (length >= tolerances.ORIENTED_MIN_NORM)
+    usable[: adam.frozen] = False
     room = min(room, int(usable.sum()))
     if room <= 0:
         return 0

@@ -60,6 +60,9 @@ class Adam:
         self.all_moments = np.zeros((len(gaussians), 2, SH_COLUMN + harmonics), np.float32)
         """(n, 2, c) first and second moments, in the columns of :mod:`.adam_kernels`."""
         self.steps = np.zeros(len(gaussians), np.int32)
+        self.frozen = 0
+        """So many Gaussians, the first ones, keep every bit of their values and moments. What adds,
+        removes or sets Gaussians leaves them alone, and first."""
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -92,6 +95,7 @@ class Adam:
         twin = Adam(self.gaussians())
         twin.all_moments[...] = self.all_moments
         twin.steps[...] = self.steps
+        twin.frozen = self.frozen
         return twin
 
     def step_rows(
@@ -105,12 +109,12 @@ class Adam:
         """Step the Gaussians that a view has seen, in place.
 
         A Gaussian counts as seen if any of its gradients is not 0. Listed Gaussians that are hidden
-        behind others keep their values, moments and steps, like those not listed.
+        behind others keep their values, moments and steps, like those not listed and frozen ones.
 
         Parameters
         ----------
         gradients : VisibleGradients
-            No Gaussian is listed twice.
+            No Gaussian is listed twice; in increasing order where some are frozen.
         rates : mapping of name to (c,) float32
             Learning rate of each column of the flattened tensor, >= 0; absent tensors are not
             changed.
@@ -128,14 +132,15 @@ class Adam:
         flat += [self.array(name).reshape(-1) for name in COLUMNS]
         flat += [self.array("sh").reshape(rows, 3 * coefficients)]
         table = corrections()
+        first = int(np.searchsorted(gradients.ids, self.frozen)) if self.frozen else 0
 
         def run(begin: int, end: int) -> None:
             adam_rows(
-                begin, end, gradients.ids, *flat, self.all_moments, self.steps, table, packed,
-                3 * used,
+                first + begin, first + end, gradients.ids, *flat, self.all_moments, self.steps,
+                table, packed, 3 * used,
             )  # fmt: skip
 
-        run_chunks(run, even_bounds(listed, threads, 2), threads)
+        run_chunks(run, even_bounds(listed - first, threads, 2), threads)
 
     def rebuild(
         self, parents: np.ndarray, fresh: np.ndarray, changes: Mapping[str, np.ndarray]

@@ -45,6 +45,7 @@ class DeviceAdam(Adam):
         self._held: dict[str, Tensor] = {}
         self._held_moments: np.ndarray | None = None
         self._held_steps: np.ndarray | None = None
+        self.frozen = adam.frozen
 
     def __len__(self) -> int:
         return len(self.device_steps)
@@ -101,6 +102,7 @@ class DeviceAdam(Adam):
         copy = Adam(OrientedGaussians(**{n: _copied(t) for n, t in self.tensors.items()}))
         copy.all_moments[...] = _copied(self.device_moments).numpy()
         copy.steps = _copied(self.device_steps).numpy()
+        copy.frozen = self.frozen
         return copy
 
     def copy(self) -> DeviceAdam:
@@ -153,17 +155,18 @@ class DeviceAdam(Adam):
         columns = self.device_moments.shape[2]
         packed = torch.from_numpy(packed_rates(columns, rates)).to(self.device, non_blocking=True)
         names = ("quats", "orientation", "means", "opacity_logits", "log_scales", "sh")
+        first = self.frozen
         self.kernels.launch(
             "adam_rows",
-            -(-len(self) // _WARPS),
-            len(self),
+            -(-(len(self) - first) // _WARPS),
+            len(self) - first,
             columns,
             SH_COLUMN + 3 * used,
             3 * coefficients,
-            *(self.tensors[name] for name in names),
-            *(gradients[name] for name in names),
-            self.device_moments,
-            self.device_steps,
+            *(self.tensors[name][first:] for name in names),
+            *(gradients[name][first:] for name in names),
+            self.device_moments[first:],
+            self.device_steps[first:],
             self._corrections,
             len(self._corrections) - 1,
             packed,

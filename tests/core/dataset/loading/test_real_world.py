@@ -170,6 +170,24 @@ def test_bad_gps_is_refused_or_noted(tmp_path: Path) -> None:
         loaded(bare, georeference="on")
 
 
+def test_photos_without_gps_are_refused_before_cameras_are_solved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("cameras are solved")
+
+    monkeypatch.setattr(load, "solve_poses", never)
+    folder = write_set(tmp_path / "set", gps=False)
+    (folder / "transforms.json").unlink()
+    words = "GPS does not place the scene: 0 of 12 photos have a GPS position; 5 are needed"
+    with pytest.raises(DatasetError, match=words) as refused:
+        loaded(folder, georeference="on")
+    assert "leave --georeference out" in refused.value.hint
+    UnitsRequest("on", control_points="x").check_gps([])  # control points place it
+    with pytest.raises(AssertionError, match="cameras are solved"):
+        loaded(folder)
+
+
 @pytest.mark.parametrize("format", ["ply", "glb", "obj"])
 def test_the_sidecar_leads_from_the_mesh_to_the_gps_positions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str

@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from benchmarks.camera_files import writers
 from benchmarks.camera_files.writers import Shots
@@ -26,9 +27,11 @@ from gaussian_wrapping_addon.core.dataset.loading.source_kind import read_poses,
 from gaussian_wrapping_addon.core.dataset.matching.match_pairs import pairs_by_pose
 from gaussian_wrapping_addon.core.dataset.panoramas.panorama_solver import panorama_pairs
 from gaussian_wrapping_addon.core.dataset.panoramas.panorama_views import (
+    BY_SHAPE,
     FIELD_OF_VIEW_DEG,
+    STATED,
     VIEWS,
-    are_panoramas,
+    panorama_evidence,
     panorama_pixels,
     view_lens,
     view_name,
@@ -177,16 +180,56 @@ def test_photos_of_another_shape_are_refused(tmp_path: Path) -> None:
 def test_only_sets_of_panoramas_are_taken_for_them(tmp_path: Path) -> None:
     names = write_panoramas(tmp_path, 3, 64)
     files = [tmp_path / name for name in names]
-    assert are_panoramas(files)
-    facts = [f.message for f in check_input(tmp_path) if f.severity == "fact"]
-    assert any("360 degree panoramas; each is cut into 14 views" in fact for fact in facts)
+    assert panorama_evidence(files) == BY_SHAPE
+    (warning,) = [f for f in check_input(tmp_path) if f.severity == "warning" and f.hint]
+    assert "taken for 360 degree panoramas, as all are exactly twice as wide" in warning.message
+    assert "--equirectangular off" in warning.hint
+    for mode, count in (("off", 0), ("on", 1)):
+        found = check_input(tmp_path, panoramas=mode)
+        assert sum("360" in finding.message for finding in found) == count
+        assert all("exactly twice" not in finding.message for finding in found)
     assert input_facts(tmp_path).photos == 3 * len(VIEWS)
     ordinary = dataclasses.replace(JobSettings(), equirectangular="off")
     assert input_facts(tmp_path, ordinary).photos == 3
     Image.new("RGB", (66, 32), "white").save(tmp_path / "other.png")
-    assert not are_panoramas([*files, tmp_path / "other.png"])
+    assert not panorama_evidence([*files, tmp_path / "other.png"])
     assert input_facts(tmp_path).photos == 4
-    assert not are_panoramas([])
+    assert not panorama_evidence([])
+
+
+XMP = (
+    b"<x:xmpmeta xmlns:x='adobe:ns:meta/'><rdf:Description "
+    b'xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"%s</rdf:Description></x:xmpmeta>'
+)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+@pytest.mark.parametrize(
+    ("said", "evidence"),
+    [
+        (b' GPano:ProjectionType="equirectangular">', STATED),
+        (b"><GPano:ProjectionType> Equirectangular </GPano:ProjectionType>", STATED),
+        (b" GPano:ProjectionType = 'cylindrical'>", ""),
+        (b' GPano:StitchingSoftware="x">', BY_SHAPE),
+    ],
+)
+def test_what_photos_say_of_their_projection_counts(
+    tmp_path: Path, said: bytes, evidence: str, suffix: str
+) -> None:
+    files = [tmp_path / f"hall{i}.{suffix}" for i in range(3)]
+    text = PngInfo()
+    text.add_itxt("XML:com.adobe.xmp", (XMP % said).decode())
+    for file in files[:2]:
+        more = {"xmp": XMP % said} if suffix == "jpg" else {"pnginfo": text}
+        Image.new("RGB", (128, 64), "white").save(file, **more)
+    Image.new("RGB", (128, 64), "white").save(files[2])
+    assert panorama_evidence(files) == evidence
+    found = check_input(tmp_path)
+    warned = any("exactly twice" in finding.message for finding in found)
+    stated = any("The photos are 360 degree panoramas" in finding.message for finding in found)
+    assert (warned, stated) == (evidence == BY_SHAPE, evidence == STATED)
+    Image.new("RGB", (130, 64), "white").save(files[2])
+    assert not panorama_evidence(files)  # cut, or not all are panoramas
 
 
 def test_places_that_views_do_not_have_are_refused_at_once(tmp_path: Path) -> None:

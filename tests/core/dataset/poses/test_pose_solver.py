@@ -18,11 +18,16 @@ from gaussian_wrapping_addon.core.dataset.loading.start_points import (
     random_points,
 )
 from gaussian_wrapping_addon.core.dataset.photos.photo_exif import read_lens_exif
+from gaussian_wrapping_addon.core.dataset.poses import pose_solver
+from gaussian_wrapping_addon.core.dataset.poses.solution_findings import SOLUTION_NAME
+from gaussian_wrapping_addon.core.dataset.poses.standing_still import TURNTABLE_NAME
 from gaussian_wrapping_addon.core.dataset.quaternion import quaternion_from_rotation
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError
+from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
 from tests.core.dataset.model_writers import ring_model, write_binary
+from tests.core.dataset.poses.test_solution_findings import RIGHT
 from tests.synthetic import look_at
 
 BANANAS = Path(__file__).parents[4] / "examples" / "bananas"
@@ -160,6 +165,36 @@ def _texture_free(folder: Path) -> Path:
     for i in range(4):
         Image.new("RGB", (120, 90), (100 + i, 90, 80)).save(folder / f"{i}.png")
     return folder
+
+
+def test_a_part_that_stays_apart_has_one_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for number in range(7):
+        Image.new("RGB", (80, 60), (40 * number, 0, 0)).save(photos / f"shot{number}.png")
+
+    def solve(_: str, folder: Path, *__: object, **___: object) -> None:
+        model = ring_model(4)
+        for number, image in enumerate(model.images):
+            image.name = f"{number:06d}.jpg"
+        write_binary(model, folder / "model")
+        write_json(folder / TURNTABLE_NAME, {"photos": 0})
+        apart = [["000004.jpg", "000005.jpg"]]
+        write_json(folder / SOLUTION_NAME, {**RIGHT, "parts": [[]], "apart": apart})
+
+    monkeypatch.setattr(pose_solver, "run_helper", solve)
+    solved = pose_solver.solve_poses(
+        photos, sorted(photos.iterdir()), [], tmp_path / "work", Progress(), threads=1
+    )
+    told = {warning.code: warning.text for warning in solved.warnings}
+    assert sorted(told) == ["cameras-in-parts", "photos-not-placed"]
+    assert "shot4.png, shot5.png" in told["cameras-in-parts"]
+    assert (
+        "1 of 7 photos could not be placed and are not used: shot6.png"
+        in (told["photos-not-placed"])
+    )
 
 
 def test_photos_without_texture_are_refused(tmp_path: Path) -> None:

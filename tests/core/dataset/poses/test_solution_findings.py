@@ -12,6 +12,7 @@ import pytest
 from gaussian_wrapping_addon.core.dataset.poses.solution_findings import (
     SOLUTION_NAME,
     findings,
+    photos_in_parts,
     with_findings,
 )
 from gaussian_wrapping_addon.core.dataset.readers.source_model import SourceModel
@@ -58,5 +59,6 @@ def test_warnings_are_logged_and_facts_added(
         model = with_findings(SourceModel("photos", ()), tmp_path, NAMES)
     assert [warning.code for warning in model.warnings] == ["cameras-in-parts"]
     assert "walk/10.JPG" in caplog.text
+    assert photos_in_parts(tmp_path) == {"000010.jpg"}
     assert model.facts["pairs_verified"] == 40
     assert model.facts["mapper"] == "incremental"

@@ -13,7 +13,7 @@ from scipy.io import savemat
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.evaluation.surface.samples import sample_uniformly
-from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER
+from gaussian_wrapping_addon.core.names import JOB_MARKER
 from gaussian_wrapping_addon.core.texture.files.textured_files import write_mesh_ply
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -57,7 +57,7 @@ def ring_of_cameras(names: list[str], distance: float, middle: np.ndarray) -> li
 def write_job(folder: Path, mesh: Mesh, cameras: list[Camera], job_from_truth: Similarity) -> Path:
     """Write the results that a job would leave, of a mesh and cameras of the truth's frame."""
     (folder / "result" / "auto").mkdir(parents=True)
-    (folder / MARKER).touch()
+    (folder / JOB_MARKER).touch()
     colors = np.full((len(mesh[0]), 3), 128, np.uint8)
     path = folder / "result" / "auto" / "mesh.ply"
     write_mesh_ply(path, job_from_truth.points(mesh[0]), mesh[1].astype(np.int32), colors)

@@ -19,10 +19,9 @@ from gaussian_wrapping_addon.core.field.vacancy import cuda_vacancy
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
 from gaussian_wrapping_addon.core.jobs.stages import region_field
-from gaussian_wrapping_addon.core.jobs.stages.mesh_stage import run_mesh
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage, read_done
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage
 from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
 from gaussian_wrapping_addon.core.meshing.points.pivots import pivot_rule
 from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import bounding_points, delaunay
@@ -36,6 +35,7 @@ from gaussian_wrapping_addon.core.render.cuda.device_renderer import DeviceRende
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
+from tests.core.jobs.mesh_walk import walk_mesh
 from tests.core.render.cuda.emulation import EmulatedKernels
 
 PROCESSOR = choose_device("cpu")
@@ -49,14 +49,7 @@ def mesh_of(folder: JobFolder, meshing: MeshingSettings, device: DeviceChoice = 
     path = write_cube(folder.root / "ball.json")
     settings = dataclasses.replace(earlier.settings, meshing=meshing, regions=(str(path),))
     job: JobFile = make_job("mesh", Path(earlier.source), settings)
-    stages = {}
-    for name in ("cameras", "train"):
-        (found,) = folder.stages.glob(f"{name}-*")
-        stages[name] = Stage(name, found.name.partition("-")[2], found, read_done(found), True)
-    return run_mesh(
-        folder, job, str(path), "ball", stages["cameras"], stages["train"], Progress(), threads=1,
-        device=device,
-    )  # fmt: skip
+    return walk_mesh(folder, job, "ball", device)
 
 
 @pytest.mark.parametrize("method", ["pam", "pivots"])

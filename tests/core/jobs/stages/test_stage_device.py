@@ -4,34 +4,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from gaussian_wrapping_addon.core import devices
 from gaussian_wrapping_addon.core.devices import DeviceChoice, choose_device, whole_views
 from gaussian_wrapping_addon.core.evaluation.report import pictures
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
-from gaussian_wrapping_addon.core.jobs.runner import STAGE_VERSIONS
 from gaussian_wrapping_addon.core.jobs.stages import (
-    region_field,
-    region_meshing,
     training_stage,
 )
 from gaussian_wrapping_addon.core.jobs.stages.training_stage import GAUSSIANS_NAME, run_training
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage, read_done
-from gaussian_wrapping_addon.core.meshing.tiles import store
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage, read_done
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.training import trainer
 from gaussian_wrapping_addon.core.training.devices import chosen
 from gaussian_wrapping_addon.core.training.result import TrainingResult
 from tests.core.jobs.finished_sphere import write_finished_sphere
-from tests.core.meshing.meshing_scenes import cube
 
 GPU = DeviceChoice("cuda:1", "Some GPU", "It passed.")
 
@@ -88,37 +80,3 @@ def test_the_training_gets_the_device_and_notes_it(
     again = trained(folder, choose_device("cpu"))
     assert (again.reused, again.folder, again.done["device"]) == (True, done.folder, "cuda:1")
     assert given == expected
-
-
-class _Asked(Exception):  # noqa: N818 - no error: ends where the field would be made
-    pass
-
-
-def test_a_helper_at_tiles_uses_its_own_device_not_the_jobs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = write_finished_sphere(tmp_path)
-    settings = replace(read_job(folder.job_path).settings, device="cuda:5")
-    origin = region_meshing.tiles_origin(
-        stage_of(folder, "cameras").folder, stage_of(folder, "train").folder, settings
-    )
-    plan = SimpleNamespace(region=cube(1.4))
-    asked: list[str] = []
-
-    def choose(setting: str) -> DeviceChoice:
-        asked.append(setting)
-        return GPU
-
-    def field(*_: object, device: str, **__: object) -> None:
-        asked.append(device)
-        raise _Asked
-
-    monkeypatch.setattr(store, "load_plan", lambda _: (plan, origin))
-    monkeypatch.setattr(devices, "choose_device", choose)
-    monkeypatch.setattr(region_field, "stage_device", lambda chosen, *_: chosen)
-    monkeypatch.setattr(region_field, "region_field", field)
-    with pytest.raises(_Asked):
-        region_meshing.work_on_tile_list(
-            folder.stages, tmp_path, Progress(), [], threads=1, device="cuda:1"
-        )
-    assert asked == ["cuda:1", "cuda:1"]

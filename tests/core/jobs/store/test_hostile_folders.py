@@ -21,7 +21,6 @@ from gaussian_wrapping_addon.core.jobs import client as client_module
 from gaussian_wrapping_addon.core.jobs import worker
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.commands.export_files import result_of
-from gaussian_wrapping_addon.core.jobs.commands.tile_worker import work_on_tiles
 from gaussian_wrapping_addon.core.jobs.store import job_folder
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
@@ -234,9 +233,7 @@ def test_a_lock_that_is_a_pipe_is_replaced(folder: JobFolder) -> None:
     assert folder.locked()
 
 
-@pytest.mark.parametrize(
-    "use", [lambda f: work_on_tiles(f, 1, 0.0, "cpu"), lambda f: result_of(f.root)]
-)
+@pytest.mark.parametrize("use", [lambda f: result_of(f.root)])
 def test_commands_on_a_job_refuse_links(
     folder: JobFolder, outside: Path, use: Callable[[JobFolder], None]
 ) -> None:

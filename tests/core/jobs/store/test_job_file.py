@@ -24,9 +24,9 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import (
     reject_region_conflicts,
     write_job,
 )
-from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER, JobFolder
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import stage_key
-from gaussian_wrapping_addon.core.names import region_name, region_names
+from gaussian_wrapping_addon.core.names import JOB_MARKER, region_name, region_names
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings, preset
 
@@ -124,7 +124,7 @@ def test_a_job_that_would_replace_another_result_never_starts(tmp_path: Path) ->
     job, photos = tmp_path / "job", tmp_path / "photos"
     photos.mkdir()
     (job / "result" / "a_b").mkdir(parents=True)
-    (job / MARKER).touch()
+    (job / JOB_MARKER).touch()
     (job / "result" / "a_b" / "region.json").write_text('{"blender_object_name": "a_b"}')
     requests = []
     for number, name in enumerate(("a b", "a_b")):
@@ -198,7 +198,7 @@ def test_a_region_that_is_no_file_is_told_by_all_commands(
     path = str(tmp_path / region)
     with pytest.raises(DatasetError, match=message):
         make_job("mesh", tmp_path, JobSettings(regions=(path,)))
-    for name in (MARKER, "job.json"):
+    for name in (JOB_MARKER, "job.json"):
         (tmp_path / name).write_text("{}")
     request = {"out": str(tmp_path), "region": path, "threads": 1, "meshing": {}}
     assert estimate_mesh_command.main([json.dumps(request)]) == EXIT_BAD_DATA

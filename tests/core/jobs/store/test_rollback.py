@@ -11,17 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.commands.tile_worker import work_on_tiles
-from gaussian_wrapping_addon.core.jobs.stages.mesh_keys import mesh_stages
-from gaussian_wrapping_addon.core.jobs.stages.region_meshing import unfinished_tile_lists
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
 from gaussian_wrapping_addon.core.jobs.store.rollback import NAME, finished_job, save_rollback
-from gaussian_wrapping_addon.core.meshing.tiles.store import LIST_NAME
-from gaussian_wrapping_addon.core.settings import JobSettings, TextureSettings
+from gaussian_wrapping_addon.core.settings import JobSettings
 
 WORKER = """
 import sys
@@ -134,34 +129,6 @@ def test_a_mesh_that_was_stopped_can_be_resumed_but_is_not_the_finished_job(
     assert sorted(p.name for p in folder.stages.glob("mesh-*")) == [
         "mesh-auto-begun", "mesh-first-done",
     ]  # fmt: skip
-
-
-def test_tiles_are_open_for_the_job_that_they_are_of_alone(folder: JobFolder) -> None:
-    write_json(folder.stages / "train-before" / "done.json", {})
-    stopped = begin(folder, regions=("all",))
-    (name,) = mesh_stages(folder, stopped)
-    tiles = folder.stages / name / "tiles"
-    tiles.mkdir(parents=True)
-    write_json(tiles / LIST_NAME, {})
-    for state in ("NEW", "LOST", "CANCELLED", "FAILED"):
-        folder.write_status(JobStatus(state))
-        assert unfinished_tile_lists(folder) == [tiles]
-    # The texture is another one, the mesh the same.
-    begin(folder, regions=("auto", "all"), texture=TextureSettings(size_px=256))
-    assert unfinished_tile_lists(folder) == [tiles]
-    begin(folder, regions=("auto",))
-    assert unfinished_tile_lists(folder) == []
-    with pytest.raises(UsageError, match="no tiles to work on"):
-        work_on_tiles(folder, 1, 0.0, "cpu")
-    assert work(folder, 'MeshingError("a")') == 3
-    assert not tiles.exists()
-    # Nor where the job is done and another one, which ended well, has left them.
-    begin(folder, regions=("all",))
-    tiles.mkdir(parents=True)
-    write_json(tiles / LIST_NAME, {})
-    begin(folder, regions=("auto",))
-    assert work(folder, "") == 0
-    assert unfinished_tile_lists(folder) == []
 
 
 def test_a_mesh_that_ends_well_is_the_finished_job(folder: JobFolder) -> None:

@@ -10,13 +10,13 @@ import pytest
 
 from gaussian_wrapping_addon.core.dataset.photos.photo_finder import list_photos
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
     record_interrupted_time,
     run_stage,
     source_fingerprint,
     stage_key,
 )
+from gaussian_wrapping_addon.core.names import JOB_MARKER
 from gaussian_wrapping_addon.core.progress import Progress
 
 
@@ -73,7 +73,7 @@ def test_fingerprint_leaves_out_jobs_notes_and_second_copies(tmp_path: Path) -> 
     (tmp_path / "list.csv").write_text("name,stars\na.jpg,5\n")
     job = tmp_path / "a_wrap"
     job.mkdir()
-    (job / MARKER).touch()
+    (job / JOB_MARKER).touch()
     (job / "frame.jpg").write_bytes(b"333")
     assert source_fingerprint(tmp_path) == before
     (tmp_path / "b.nef").write_bytes(b"4444")
@@ -83,7 +83,7 @@ def test_fingerprint_leaves_out_jobs_notes_and_second_copies(tmp_path: Path) -> 
 def test_photos_of_a_job_are_no_input(tmp_path: Path) -> None:
     job = tmp_path / "clip_wrap" / "stages" / "frames"
     job.mkdir(parents=True)
-    (tmp_path / "clip_wrap" / MARKER).touch()
+    (tmp_path / "clip_wrap" / JOB_MARKER).touch()
     (job / "frame.jpg").write_bytes(b"1")
     assert list_photos(tmp_path) == []
     assert [path.name for path in list_photos(job)] == ["frame.jpg"]

@@ -19,11 +19,14 @@ from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.dataset.video import extract
-from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
 from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
+from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
+from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS
 from gaussian_wrapping_addon.core.jobs.video.frames_stage import frames_request
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings
@@ -166,13 +169,52 @@ def test_photos_have_no_frames(tmp_path: Path) -> None:
     assert frames_request(job_of(tmp_path / "photos")) is None
 
 
-def test_a_video_that_is_gone_stops_no_mesh_of_its_training(video: Path) -> None:
-    job = job_of(video)
-    video.unlink()
-    request = frames_request(job)
-    assert request is not None
-    with pytest.raises(DatasetError, match="cannot be read"):
-        extract.extract_frames(request.video, video.parent / "work", Progress())
+@pytest.mark.parametrize("gone", ["the video", "its folder"])
+def test_a_video_that_is_gone_stops_no_mesh_of_its_training(
+    tmp_path: Path, gone: str, loaded: list[Path], extracted: list[Path]
+) -> None:
+    (tmp_path / "filmed").mkdir()
+    video = write(tmp_path / "filmed" / "clip.mp4", pan(range(0, 600, 20)))
+    source = video if gone == "the video" else video.parent
+    folder, job = folder_in(tmp_path), job_of(source)
+    stage = run_cameras(folder, job, Progress(), threads=1)
+    key, _ = training_keys(STAGE_VERSIONS["train"], stage.key, job)
+    (folder.stages / f"train-{key}").mkdir()
+    write_json(folder.stages / f"train-{key}" / "done.json", {"finished_unix_s": 1.0})
+    shutil.rmtree(video.parent)
+    mesh = make_job("mesh", source, job.settings)
+    again = run_cameras(folder, mesh, Progress(), threads=1)
+    assert (again.folder, len(loaded), len(extracted)) == (stage.folder, 1, 1)
+    assert all(view.photo_path.is_file() for view in load_saved_scene(again.folder).views)
+    with pytest.raises(DatasetError, match="does not exist"):
+        make_job("wrap", source, job.settings)
+    shutil.rmtree(next(folder.stages.glob("frames-*")))
+    with pytest.raises(DatasetError, match=r"frame-\d+\.jpg no longer exists"):
+        load_saved_scene(again.folder)
+
+
+def test_frames_have_no_gps(tmp_path: Path, video: Path, extracted: list[Path]) -> None:
+    with pytest.raises(UsageError, match="Frames of a video have no GPS position"):
+        run_cameras(folder_in(tmp_path), job_of(video, georeference="on"), Progress(), threads=1)
+    assert extracted == []
+
+
+def test_a_resumed_job_whose_control_points_are_gone_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("cameras are solved")
+
+    monkeypatch.setattr(load, "solve_poses", never)
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_bytes(b"picture")
+    points = tmp_path / "points.txt"
+    points.write_text("LOCAL\n")
+    job = job_of(tmp_path / "photos", control_points=str(points), video_frames=0)
+    points.unlink()
+    with pytest.raises(DatasetError, match=r"points\.txt cannot be read: No such file") as refused:
+        run_cameras(folder_in(tmp_path), job, Progress(), threads=1)
+    assert refused.value.hint.startswith("Put the file back and resume the job")
 
 
 def test_the_report_counts_what_was_left_out(

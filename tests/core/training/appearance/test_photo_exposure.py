@@ -274,3 +274,14 @@ def test_measuring_fits_one_half_and_corrects_the_other() -> None:
     again = corrected_for_measuring(render, other)
     assert np.array_equal(again[:, :30], corrected[:, :30])
     assert not np.array_equal(again[:, 30:], corrected[:, 30:])
+
+
+def test_exposures_that_are_given_stay() -> None:
+    exposure = Exposure(3, [0, 1, 2], np.random.default_rng(0).normal(size=(3, 3), scale=0.1))
+    assert "active" not in exposure.to_arrays()
+    exposure.active = False
+    again = Exposure.restore(exposure.to_arrays())
+    again.gradient[:] = 1.0
+    again.step(1, 0.01)
+    assert np.array_equal(again.values, exposure.values)
+    assert not again.adam.steps.any()

@@ -111,3 +111,13 @@ def test_never_all_are_removed() -> None:
     assert prune_contributors(adam, np.ones(5, bool)) == 0
     assert prune_contributors(adam, np.arange(5) >= 2) == 2
     assert len(adam) == 3
+
+
+def test_frozen_ones_are_needed_by_definition() -> None:
+    adam = Adam(random_gaussians(10, dtype=torch.float32))
+    adam.frozen = 4
+    means = adam.array("means").copy()
+    needed = np.array([False] * 6 + [True, False, False, True])
+    assert prune_contributors(adam, needed) == 4
+    assert np.array_equal(adam.array("means"), means[[0, 1, 2, 3, 6, 9]])
+    assert prune_contributors(adam, np.array([True] * 4 + [False] * 2)) == 0

@@ -159,3 +159,44 @@ def test_opacity_reset_caps_the_effective_opacity() -> None:
     assert np.allclose(after[~faint], RESET_OPACITY, rtol=1e-3)
     assert not any(moment.any() for moment in adam.moments("opacity_logits"))
     assert all((moment == 1).all() for moment in adam.moments("means"))
+
+
+def behind_frozen(rest: OrientedGaussians, frozen: int) -> Adam:
+    """Return an optimiser of frozen Gaussians, some transparent, and these after them."""
+    front = random_gaussians(frozen, 9, dtype=torch.float32, filter_size=0.0)
+    front.opacity_logits[::3] = -9.0
+    adam = filled(front.joined(rest))
+    adam.frozen = frozen
+    return adam
+
+
+def test_frozen_ones_stay_and_change_nothing_for_the_others() -> None:
+    sizes = [0.5 * CLONE_SIZE, 4.0 * CLONE_SIZE] * 10
+    rest = gaussians_of_sizes(sizes)
+    rest.opacity_logits[5] = -9.0
+    values = np.random.default_rng(1).uniform(0.1, 2.0, 20).tolist()
+    alone, adam = filled(rest), behind_frozen(rest, 30)
+    front = adam.gaussians().detached().select(torch.arange(30))
+    weights = np.random.default_rng(2).uniform(1, 2, 20)
+    one = densify_and_prune(alone, with_gradients(values), 25, np.random.default_rng(0), weights)
+    # Their gradients would come first.
+    other = densify_and_prune(
+        adam, with_gradients([50.0] * 30 + values), 25, np.random.default_rng(0),
+        np.concatenate([np.full(30, 9.0), weights]),
+    )  # fmt: skip
+    assert one == other
+    assert one.pruned == 1
+    assert len(adam) == 30 + len(alone) == 55
+    found = adam.gaussians().detached()
+    for name, tensor in alone.gaussians().detached().tensors():
+        assert torch.equal(getattr(found, name)[30:], tensor), name
+        assert torch.equal(getattr(found, name)[:30], getattr(front, name)), name
+    assert np.array_equal(adam.all_moments[30:], alone.all_moments)
+    reset_opacity(adam)
+    reset_opacity(alone)
+    assert np.array_equal(adam.array("opacity_logits")[:30], front.opacity_logits.numpy())
+    assert np.array_equal(adam.array("opacity_logits")[30:], alone.array("opacity_logits"))
+    # Of the others one is always left.
+    few = behind_frozen(gaussians_of_sizes([1.0, 1.0], opacity=0.001), 30)
+    densify_and_prune(few, with_gradients([0.0] * 32), 100, np.random.default_rng(0))
+    assert len(few) == 31

@@ -138,3 +138,29 @@ def test_errors_point_at_the_gaussians_with_wrong_normals() -> None:
     # One that is masked everywhere has no error.
     masked = [WrapView(v.camera, np.zeros((48, 48), bool)) for v in views()]
     assert not normal_errors(flipped, masked, threads=1).any()
+
+
+def test_frozen_ones_are_neither_cloned_nor_turned() -> None:
+    rest, front = (
+        random_gaussians(40, 2, dtype=torch.float32),
+        random_gaussians(25, 3, dtype=torch.float32),
+    )
+    for some in (rest, front):
+        some.orientation[:, 3] += 0.3 * torch.sign(some.orientation[:, 3])
+    errors = np.random.default_rng(0).uniform(0.1, 1, 40)
+    for share, limit in ((0.3, 100), (1.0, 47)):
+        alone, adam = Adam(rest), Adam(front.joined(rest))
+        adam.frozen = 25
+        clones = wrap(alone, errors, share, limit)
+        assert wrap(adam, np.concatenate([np.full(25, 2.0), errors]), share, limit) == clones > 0
+        found = adam.gaussians().detached()
+        for name, tensor in alone.gaussians().detached().tensors():
+            assert torch.equal(getattr(found, name)[25:], tensor), name
+            assert torch.equal(getattr(found, name)[:25], getattr(front, name)), name
+    without = sphere_gaussians(60)
+    without = without.replaced(orientation=torch.zeros(60, 4))
+    adam = Adam(without)
+    adam.frozen = 20
+    start_orientation(adam, views(), threads=1)
+    assert not adam.array("orientation")[:20].any()
+    assert adam.array("orientation")[20:].any()

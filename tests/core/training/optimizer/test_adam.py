@@ -174,3 +174,24 @@ def test_numbers_that_are_not_finite_are_found() -> None:
     assert adam.is_finite()
     adam.array("quats")[3, 1] = np.inf
     assert not adam.is_finite()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_frozen_rows_stay_and_the_others_step_as_without_them(threads: int) -> None:
+    plain, partly = filled(), filled()
+    partly.frozen = 20
+    before = partly.copy()
+    assert before.frozen == 20
+    ids = np.sort(np.random.default_rng(4).permutation(50)[:35])
+    for turn in range(3):
+        for adam in (plain, partly):
+            gradients = random_gradients(adam, turn, ids)
+            adam.step_rows(gradients, all_rates(adam), threads=threads)
+    for name in partly.values:
+        assert np.array_equal(partly.array(name)[:20], before.array(name)[:20]), name
+        assert np.array_equal(partly.array(name)[20:], plain.array(name)[20:]), name
+    assert not partly.steps[:20].any()
+    assert not partly.all_moments[:20].any()
+    assert np.array_equal(partly.all_moments[20:], plain.all_moments[20:])
+    assert np.array_equal(partly.steps[20:], plain.steps[20:])
+    assert partly.steps.any()

@@ -100,3 +100,29 @@ def test_a_copy_is_apart(request: pytest.FixtureRequest, device: str) -> None:
     assert not found.is_finite()
     assert twin.is_finite()
     assert np.isfinite(twin.array("means")).all()
+
+
+@pytest.mark.parametrize("frozen", [7, COUNT])
+@pytest.mark.parametrize("device", DEVICES)
+def test_frozen_rows_keep_every_bit(
+    request: pytest.FixtureRequest, device: str, frozen: int
+) -> None:
+    _, plain = pair(device, request)
+    host = plain.on_host()
+    host.frozen = frozen
+    partly = DeviceAdam(host, plain.kernels, plain.device)
+    before = partly.copy().on_host()
+    rates = {**RATES, "sh": RATES["sh"][: 3 * host.shape("sh")[1]]}
+    assert before.frozen == frozen
+    for turn in range(3):
+        dense = random_gradients(host, turn)[1]
+        for adam in (plain, partly):
+            adam.step_all({n: t.to(adam.device) for n, t in dense.items()}, rates, sh_degree=1)
+    for name in partly.tensors:
+        found = partly.array(name)
+        assert np.array_equal(found[:frozen], before.array(name)[:frozen]), name
+        assert np.array_equal(found[frozen:], plain.array(name)[frozen:]), name
+    assert not partly.steps[:frozen].any()
+    assert np.array_equal(partly.steps[frozen:], plain.steps[frozen:])
+    assert np.array_equal(partly.all_moments[frozen:], plain.all_moments[frozen:])
+    assert plain.steps[:frozen].any()

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Certificates by which the computers of a farm know each other and encrypt what they say.
+
+One authority signs one certificate for all: who holds the folder belongs to the farm.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+from pathlib import Path
+
+from ..errors import UsageError, unwritable_error
+from ..processes.worker_extras import load_extra
+
+CA_NAME, CERTIFICATE_NAME, KEY_NAME = "ca.pem", "farm.pem", "farm-key.pem"
+FOLDER_VARIABLE = "GW_CERTIFICATES"
+VALID_DAYS = 825
+_SECRET = 0o600
+
+
+def checked_folder(folder: str) -> Path:
+    """Return the folder of the certificates; that of the environment where none is given.
+
+    Raises
+    ------
+    UsageError
+        None is named, or files are missing in it.
+    """
+    named = folder or os.environ.get(FOLDER_VARIABLE, "")
+    if not named:
+        raise UsageError(
+            "An address with tls:// needs certificates.",
+            f"Give their folder (--certificates, or {FOLDER_VARIABLE}); batch.py farm "
+            "make-certificates DIR makes some.",
+        )
+    path = Path(named)
+    missing = [n for n in (CA_NAME, CERTIFICATE_NAME, KEY_NAME) if not (path / n).is_file()]
+    if missing:
+        raise UsageError(
+            f"{path} holds no {missing[0]}.",
+            "Make certificates with batch.py farm make-certificates DIR, and copy the folder to "
+            "all computers.",
+        )
+    return path
+
+
+def make_certificates(folder: Path) -> None:
+    """Make an authority and a certificate; the authority's key is not kept.
+
+    Raises
+    ------
+    MissingExtraError
+        The package for certificates is missing.
+    UsageError
+        There are some already: computers that have them would be left behind.
+    ResourceError
+        The folder cannot be written.
+    """
+    load_extra("farm", "Certificates")
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import NameOID
+
+    names = (CA_NAME, CERTIFICATE_NAME, KEY_NAME)
+    there = [name for name in names if (folder / name).exists()]
+    if there:
+        raise UsageError(f"{folder} has {there[0]} already.", "Give another folder.")
+    now = datetime.datetime.now(datetime.UTC)
+
+    def certificate(
+        name: str, key: ec.EllipticCurvePrivateKey, issuer: str,
+        issuer_key: ec.EllipticCurvePrivateKey, is_authority: bool,
+    ) -> x509.Certificate:  # fmt: skip
+        def named(text: str) -> x509.Name:
+            return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
+
+        return (
+            x509.CertificateBuilder()
+            .subject_name(named(name))
+            .issuer_name(named(issuer))
+            .public_key(key.public_key())
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(now - datetime.timedelta(days=1))  # clocks differ
+            .not_valid_after(now + datetime.timedelta(days=VALID_DAYS))
+            .add_extension(x509.BasicConstraints(ca=is_authority, path_length=None), critical=True)
+            .add_extension(
+                x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False
+            )
+            .add_extension(
+                x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key()),
+                critical=False,
+            )
+            .sign(issuer_key, hashes.SHA256())
+        )
+
+    ca_key, key = (ec.generate_private_key(ec.SECP256R1()) for _ in range(2))
+    authority = "Gaussian Wrapping farm"
+    pem = serialization.Encoding.PEM
+    secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    ca = certificate(authority, ca_key, authority, ca_key, True).public_bytes(pem)
+    own = certificate("farm", key, authority, ca_key, False).public_bytes(pem)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in zip(names, (ca, own, secret), strict=True):
+            number = os.open(folder / name, os.O_CREAT | os.O_EXCL | os.O_WRONLY, _SECRET)
+            with os.fdopen(number, "wb") as stream:
+                stream.write(data)
+    except OSError as error:
+        raise unwritable_error(folder, error) from None

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Child processes by Dask: a cluster of this computer, or the scheduler at an address.
+
+Names and results travel over the network, data over the folder that all computers share.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import WorkerError
+from ..processes.worker_extras import load_extra
+from ..settings.farm import LOCAL
+from . import child
+from .addresses import checked_address
+from .certificates import CA_NAME, CERTIFICATE_NAME, KEY_NAME, checked_folder
+
+if TYPE_CHECKING:
+    from distributed import Client, Future, LocalCluster
+
+_logger = logging.getLogger(__name__)
+
+HTTP = "127.0.0.1:0"
+"""Where Dask serves its pages: it cannot be told not to, but nobody else sees them."""
+CONNECT_S = 15.0
+"""Longest time until a scheduler has answered."""
+KILLED_WORKERS = 2
+"""Dask gives a task up that has taken more workers than this with it."""
+_POLL_S = 0.05
+_CLOSE_S = 5.0
+_LOST = ("cancelled", "lost")
+
+
+class FarmLostError(WorkerError):
+    """The scheduler is gone, with all that it knew."""
+
+    can_resume = True
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a child process ended."""
+
+    name: str
+    code: int
+    error: str = ""
+    hint: str = ""
+    host: str = ""
+
+
+class DaskTasks:
+    """A connection to a Dask cluster.
+
+    Parameters
+    ----------
+    address : str
+        ``"local"``, or that of a scheduler: ``tls://HOST:PORT``, ``tcp://`` on this computer only.
+    processes : int
+        Workers of a local cluster.
+    certificates : str
+        Folder of the certificates for ``tls://``.
+
+    Raises
+    ------
+    MissingExtraError
+        The worker lacks Dask.
+    UsageError
+        The address is none, is not encrypted, or the certificates are missing.
+    WorkerError
+        No scheduler answers there.
+    """
+
+    def __init__(self, address: str, processes: int, certificates: str = "") -> None:
+        self._address = checked_address(address)
+        load_extra("farm", "Several processes or computers")
+        import cloudpickle
+        import dask
+        from distributed import Client, LocalCluster
+
+        cloudpickle.register_pickle_by_value(child)
+        self._run = child.sendable()
+        self._futures: dict[str, Future] = {}
+        self._cluster: LocalCluster | None = None
+        self._processes = processes
+        dask.config.set(
+            {
+                "distributed.scheduler.allowed-failures": KILLED_WORKERS,
+                "distributed.comm.retry.count": 3,
+                "distributed.admin.log-length": 100,
+            }
+        )
+        logging.getLogger("distributed").setLevel(logging.ERROR)
+        target: Any = self._address
+        if self._address == LOCAL:
+            self._cluster = target = LocalCluster(
+                n_workers=processes, threads_per_worker=1, processes=True, memory_limit=0,
+                host="127.0.0.1", dashboard_address=HTTP, scheduler_kwargs={"dashboard": False},
+                worker_dashboard_address=HTTP,
+            )  # fmt: skip
+        try:
+            self._client: Client = Client(
+                target, timeout=CONNECT_S, set_as_default=False,
+                security=security_of(self._address, certificates),
+            )  # fmt: skip
+        except (OSError, TimeoutError) as error:
+            raise WorkerError(
+                f"No Dask scheduler answers at {self._address} ({error or 'no answer'}).",
+                "Start one there: batch.py farm scheduler. Both sides need the same certificates.",
+            ) from None
+
+    @property
+    def slots(self) -> int:
+        """How many children may run at a time; at least one, as workers may still come."""
+        if self._cluster is not None:
+            return self._processes
+        workers = self._client.scheduler_info(n_workers=-1).get("workers", {})
+        return max(1, sum(int(worker["nthreads"]) for worker in workers.values()))
+
+    def submit(self, name: str, key: str, request: dict[str, Any]) -> None:
+        """Have a child run somewhere (see :func:`.child.run_child`).
+
+        Parameters
+        ----------
+        name : str
+            By which it is found again.
+        key : str
+            Unique: by it the scheduler knows the task.
+        """
+        self._futures[name] = self._client.submit(self._run, request, key=key, pure=False)
+
+    def ended(self, seconds: float) -> list[Ended]:
+        """Return which children have ended; wait at most so long for the first.
+
+        Raises
+        ------
+        FarmLostError
+            The scheduler is gone.
+        """
+        until_s = time.monotonic() + seconds
+        while True:
+            found = [name for name, future in self._futures.items() if future.done()]
+            if found:
+                return [self._take(name) for name in found]
+            if self._client.status not in ("running", "connecting", "newly-created"):
+                raise self._lost()
+            if time.monotonic() >= until_s:
+                return []
+            time.sleep(_POLL_S)
+
+    def _take(self, name: str) -> Ended:
+        from distributed.scheduler import KilledWorker
+
+        future = self._futures.pop(name)
+        if future.status in _LOST:
+            raise self._lost()
+        try:
+            result = dict(future.result(timeout=_CLOSE_S))
+        except KilledWorker as error:
+            host = getattr(error.last_worker, "host", "")
+            return Ended(
+                name, 1, f"It took {KILLED_WORKERS + 1} Dask workers with it, the last on {host}.",
+                "See the logs of the workers.", host,
+            )  # fmt: skip
+        except Exception as error:  # whatever a worker raises arrives here
+            return Ended(name, 2, f"{type(error).__name__}: {error}")
+        texts = [str(result.get(key, "")) for key in ("error", "hint", "host")]
+        return Ended(name, int(result.get("code", 2)), *texts)
+
+    def _lost(self) -> FarmLostError:
+        return FarmLostError(
+            f"The Dask scheduler at {self._address} is gone.",
+            "Start it again and resume: parts that are done stay, the rest is submitted again.",
+        )
+
+    def close(self, grace_s: float) -> None:
+        """Wait so long for children that were told to stop, then give the cluster back."""
+        until_s = time.monotonic() + grace_s
+        while time.monotonic() < until_s and self._client.status == "running":
+            if all(future.done() for future in self._futures.values()):
+                break
+            time.sleep(_POLL_S)
+        try:
+            self._client.cancel(list(self._futures.values()), force=True)
+            self._client.close(timeout=_CLOSE_S)
+            if self._cluster is not None:
+                self._cluster.close(timeout=_CLOSE_S)
+        except Exception as error:  # a cluster that is gone already
+            _logger.warning("the Dask cluster did not close: %s", error)
+
+
+def request_of(
+    folder: Path, module: str, arguments: dict[str, Any], command: list[str] | None
+) -> dict[str, Any]:
+    """Return a request for :func:`.child.run_child` about a folder.
+
+    The folder is named relative to the shared folder of this computer, if it lies in it.
+
+    Parameters
+    ----------
+    command : list of str or None
+        For children on this computer.
+    """
+    shared = os.environ.get(child.SHARED_VARIABLE, "")
+    is_shared = bool(shared) and command is None and folder.is_relative_to(Path(shared).resolve())
+    name = folder.relative_to(Path(shared).resolve()).as_posix() if is_shared else str(folder)
+    return {
+        "module": module, "arguments": arguments, "folder": name, "is_shared": is_shared,
+        "command": command,
+    }  # fmt: skip
+
+
+def security_of(address: str, certificates: str) -> Any:
+    """Return what Dask needs for an address; ``None`` where nothing is encrypted.
+
+    Raises
+    ------
+    UsageError
+        Certificates are needed and missing.
+    """
+    if not address.startswith("tls://"):
+        return None
+    from distributed.security import Security
+
+    folder = checked_folder(certificates)
+    return Security(
+        tls_ca_file=str(folder / CA_NAME), tls_client_cert=str(folder / CERTIFICATE_NAME),
+        tls_client_key=str(folder / KEY_NAME), require_encryption=True,
+        tls_scheduler_cert=str(folder / CERTIFICATE_NAME),
+        tls_scheduler_key=str(folder / KEY_NAME),
+        tls_worker_cert=str(folder / CERTIFICATE_NAME), tls_worker_key=str(folder / KEY_NAME),
+    )  # fmt: skip

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The ``farm worker`` command: this computer runs parts for a Dask scheduler until it is ended.
+
+Runs in the worker's Python; writes one JSON object per line, in the protocol of commands.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from ....cluster import child
+from ....cluster.addresses import checked_address
+from ....cluster.dask_tasks import HTTP, security_of
+from ....errors import UsageError
+from ....processes.worker_environment import PACKAGES_OPTION
+from ....processes.worker_extras import load_extra
+from ..worker_call import run_command
+
+SILENCE_S = 30.0
+"""Time without a scheduler after which the worker ends."""
+_ENTRY = Path(__file__).resolve().parents[3] / "processes" / "worker_main.py"
+
+
+def main(arguments: list[str]) -> int:
+    """Run for ``arguments = [{"address", "certificates", "shared", "slots"} as JSON]``."""
+
+    def work() -> Iterator[str]:
+        request = json.loads(arguments[0])
+        address = checked_address(str(request["address"]))
+        shared = str(request["shared"])
+        if shared and not Path(shared).is_dir():
+            raise UsageError(f"{shared} is not a folder.", "Mount the shared folder, or name it.")
+        load_extra("farm", "A worker")
+        logging.getLogger("distributed").setLevel(logging.ERROR)
+        security = security_of(address, str(request["certificates"]))
+        os.environ[child.ENTRY_VARIABLE] = str(_ENTRY)
+        os.environ[child.PACKAGES_VARIABLE] = str(sys._xoptions.get(PACKAGES_OPTION) or "")
+        if shared:
+            os.environ[child.SHARED_VARIABLE] = shared
+        yield f"this computer works for {address}; end it with Ctrl-C"
+        asyncio.run(_run(address, security, int(request["slots"])))
+        yield "the scheduler has ended"
+
+    return run_command(work)
+
+
+async def _run(address: str, security: object, slots: int) -> None:
+    from distributed import Nanny
+
+    try:
+        nanny = await Nanny(
+            address, nthreads=slots, memory_limit=0, security=security, dashboard=False,
+            dashboard_address=HTTP,
+            death_timeout=SILENCE_S,
+        )  # fmt: skip
+    except (OSError, TimeoutError) as error:
+        raise UsageError(
+            f"No scheduler answers at {address} ({error or 'no answer'}).",
+            "Start it first: batch.py farm scheduler. Both need the same certificates.",
+        ) from None
+    await nanny.finished()

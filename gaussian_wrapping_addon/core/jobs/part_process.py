@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The ``run-part`` command: run one part of a job in a process of its own.
+
+Runs in the worker's Python, on any computer that sees the job folder. Writes one JSON object per
+line to stdout, in the protocol of :mod:`.commands.run_in_worker`. The exit code is one of
+:mod:`.parts.exit_codes`.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+
+from .. import limits
+from ..devices import choose_device
+from ..errors import Cancelled, UsageError, WorkerError, WrapError
+from ..files import seconds_since_written
+from ..kernels.parallel import default_threads
+from ..processes.helper_process import emit, kill_helpers
+from ..processes.parent_death import end_with_parent
+from ..processes.process_identity import Caller
+from ..progress import Progress
+from .failure import failure_of
+from .parts.code_version import code_version
+from .parts.exit_codes import (
+    CANCELLED,
+    DONE,
+    MAY_WORK_ELSEWHERE,
+    NEVER,
+    OTHER_CODE,
+    part_exit_code,
+)
+from .parts.graph import Part, PartsGraph, read_parts
+from .parts.lease import PartLease
+from .parts.part_runner import PartResult, PartRunner
+from .parts.part_state import PartState, read_state, states_folder
+from .parts.planning import plan_hash
+from .parts.walk import HERE
+from .store.job_file import JobFile, read_job
+from .store.job_folder import JobFolder, JobStatus
+from .store.rollback import discard_rollback
+
+_logger = logging.getLogger(__name__)
+
+TELL_EVERY_S = 30.0
+"""Farms take a task that says nothing for minutes for dead."""
+POLL_S = 1.0
+
+
+def main(arguments: list[str]) -> int:
+    """Run ``arguments = [{"out", "part", "threads", "device", "attempt", "driven"} as JSON]``.
+
+    ``driven``: whether a process that walks the parts holds the folder; the part ends with it.
+    """
+    end_with_parent()
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    request = json.loads(arguments[0])
+    folder = JobFolder(Path(request["out"]))
+    try:
+        return _run(folder, request)
+    except WrapError as error:
+        emit(error=error.message, hint=error.hint)
+        return part_exit_code(error)
+
+
+def _run(folder: JobFolder, request: dict[str, object]) -> int:
+    if not folder.is_job():
+        raise UsageError(f"{folder.root} is not a job folder.", "Give the --out of a job.")
+    folder.check_entries()
+    graph = read_parts(folder.root)
+    if graph.code != code_version():
+        emit(
+            error=f"This computer has version {code_version()} of the program, the job was planned "
+            f"by {graph.code}.",
+            hint="Install the same version on all computers.",
+        )
+        return OTHER_CODE
+    job = read_job(folder.job_path)
+    if plan_hash(job) != graph.plan:
+        raise UsageError(f"{folder.root} was planned for another job.", "Plan it again: parts DIR.")
+    part = graph.part(str(request["part"]))
+    driven = bool(request["driven"])
+    if _was_done(folder, graph, part):
+        return DONE
+    _check_needs(folder, graph, part)
+    if part.kind in HERE and not driven:
+        folder.lock()
+        try:
+            code = _hold(folder, _with_photos(job, graph, folder), graph, part, request)
+            if code == DONE:  # it is the last one
+                result = str(folder.result) if folder.result.is_dir() else ""
+                folder.write_status(JobStatus("DONE", part.kind, 1.0, result=result))
+                discard_rollback(folder)
+            return code
+        finally:
+            folder.unlock()
+    return _hold(folder, _with_photos(job, graph, folder), graph, part, request)
+
+
+def _was_done(folder: JobFolder, graph: PartsGraph, part: Part) -> bool:
+    state = read_state(folder.root, part.name)
+    if state is None or not state.done_in(folder.root, graph.plan):
+        return False
+    emit(line=f"part {part.name} was done before")
+    return True
+
+
+def _check_needs(folder: JobFolder, graph: PartsGraph, part: Part) -> None:
+    for name in part.needs:
+        state = read_state(folder.root, name)
+        if state is None or not state.done_in(folder.root, graph.plan):
+            raise WorkerError(f"Part {part.name} needs {name}, which is not done.", "Run it first.")
+
+
+def _with_photos(job: JobFile, graph: PartsGraph, folder: JobFolder) -> JobFile:
+    """Return the job with the path of its photos as this computer sees them."""
+    if os.path.lexists(job.source) or not graph.source:
+        return job
+    here = os.path.normpath(folder.root / graph.source)
+    return replace(job, source=here) if os.path.lexists(here) else job
+
+
+class _Watch:
+    """Tells whether the part is to stop, and why."""
+
+    def __init__(self, folder: JobFolder, lease: PartLease, driven: bool) -> None:
+        self._folder = folder
+        self._lease = lease
+        self._driven = driven
+        self._caller = Caller()
+        self._terminated = False
+        self._driver_is_gone = False
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._terminate)
+
+    def _terminate(self, _number: int, _frame: FrameType | None) -> None:
+        self._terminated = True
+
+    def reason(self) -> str:
+        """Return why the part is to stop; empty to go on."""
+        if self._lease.is_lost:
+            return "another process has taken it over"
+        if self._driver_is_gone:
+            return "the process that walks the parts has ended"
+        return "its process was ended" if self._terminated else ""
+
+    def cancelled(self) -> bool:
+        """Return whether to stop."""
+        return bool(self.reason()) or self._folder.cancel_path.exists()
+
+    def keep(self, ended: threading.Event) -> None:
+        """Look after caller, driver and cancel file, and say that it works; runs in a thread."""
+        stop_s, told_s = None, time.monotonic()
+        while not ended.wait(POLL_S):
+            if time.monotonic() - told_s >= TELL_EVERY_S:
+                told_s = time.monotonic()
+                self._lease.tell()
+            if self._caller.ended():
+                self._exit()
+            if self._driven and self._gone():
+                self._driver_is_gone = True
+            if self.cancelled():
+                stop_s = stop_s or time.monotonic()
+                if time.monotonic() - stop_s > limits.CANCEL_ALONE_S:
+                    self._exit()
+
+    def _gone(self) -> bool:
+        """Return whether the process that walks the parts has shown nothing for long."""
+        if self._folder.locked():
+            return False
+        try:
+            return seconds_since_written(self._folder.lock_path) > limits.SILENT_S
+        except OSError:
+            return True  # it has released the folder, or the folder is gone
+
+    def _exit(self) -> None:
+        kill_helpers()
+        self._lease.finish("FAILED", error="It was ended.", exit_code=MAY_WORK_ELSEWHERE)
+        os._exit(CANCELLED if self._folder.cancel_path.exists() else MAY_WORK_ELSEWHERE)
+
+
+def _hold(
+    folder: JobFolder, job: JobFile, graph: PartsGraph, part: Part, request: dict[str, object]
+) -> int:
+    """Run a part while holding its lease; return the exit code."""
+    attempt = int(str(request["attempt"]))
+    lease = PartLease(folder.root, part.name, graph.plan, attempt)
+    watch = _Watch(folder, lease, bool(request["driven"]))
+    ended = threading.Event()
+    threading.Thread(target=watch.keep, args=(ended,), daemon=True).start()
+    try:
+        # Another process may still run it, for a walk that has ended.
+        if not lease.take(watch.cancelled if request["driven"] else None):
+            emit(line=f"part {part.name} was done by another process")
+            return DONE
+        result = _work(folder, job, graph, part, request, lease, watch)
+    except Cancelled as cancelled:
+        reason = watch.reason()
+        code = MAY_WORK_ELSEWHERE if reason else CANCELLED
+        message = f"Part {part.name} stopped: {reason}." if reason else cancelled.message
+        lease.finish("FAILED", error=message, exit_code=code)
+        emit(error=message, hint="")
+        return code
+    except Exception as error:
+        failure = failure_of(error, folder.root)
+        if not failure.is_known:
+            _logger.exception("unexpected failure")
+        code = part_exit_code(error) if isinstance(error, WrapError) else _code_of(failure.code)
+        lease.finish("FAILED", error=failure.error, hint=failure.hint, exit_code=code)
+        emit(error=failure.error, hint=failure.hint)
+        return code
+    finally:
+        ended.set()
+    state = lease.finish("DONE", fraction=1.0, exit_code=DONE, outputs=result.outputs)
+    emit(line=f"part {part.name} is done, {state.seconds:.0f} s")
+    return DONE
+
+
+def _code_of(job_code: int) -> int:
+    return MAY_WORK_ELSEWHERE if job_code == 4 else NEVER
+
+
+def _work(
+    folder: JobFolder,
+    job: JobFile,
+    graph: PartsGraph,
+    part: Part,
+    request: dict[str, object],
+    lease: PartLease,
+    watch: _Watch,
+) -> PartResult:
+    threads = int(str(request["threads"])) or default_threads()
+    wanted = str(request["device"] or job.settings.device)
+    device = choose_device("cpu" if job.command == "bake" else wanted)
+    _logger.info("part %s, device: %s", part.name, device.sentence())
+    runner = PartRunner(
+        folder, job, lambda: graph, threads=threads, device=device,
+        begun_s=begun_s(folder, graph), is_alone=False,
+    )  # fmt: skip
+    return runner.run(part, Progress(part.kind, lease.event, watch.cancelled))
+
+
+def begun_s(folder: JobFolder, graph: PartsGraph) -> float:
+    """Return when the first part of a plan was begun; now, if none was."""
+    begun = [time.time()]
+    for path in states_folder(folder.root).glob("*.json"):
+        state: PartState | None = read_state(folder.root, path.stem)
+        if state is not None and state.plan == graph.plan:
+            begun.append(state.begun_s)
+    return min(begun)

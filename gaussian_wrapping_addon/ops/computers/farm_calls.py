@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Requests to a farm in a thread, one at a time, and their outcome for the panel."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+from ...core.errors import WrapError
+from ...core.farm.flamenco.job_state import FarmState
+from ..common.background import Lane
+from ..common.redrawing import redraw_sidebars
+
+_logger = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How the last request ended."""
+
+    good: bool
+    lines: tuple[str, ...]
+    """Sentences: what was found, or what was wrong and the next step."""
+
+
+@dataclass
+class _Memory:
+    outcome: Outcome | None = None
+    about: str = ""
+    """The address or folder that the last request is about."""
+
+
+_lane = Lane(of_file=True)
+_memory = _Memory()
+_states: dict[str, FarmState] = {}
+"""What a Manager last said of the job of a folder."""
+
+
+def is_busy() -> bool:
+    """Return whether a request runs."""
+    return _lane.busy
+
+
+def asks_about(about: str) -> bool:
+    """Return whether a request runs that is about an address or folder."""
+    return _lane.busy and _memory.about == about
+
+
+def outcome(about: str) -> Outcome | None:
+    """Return how the last request ended, if it was about this address or folder."""
+    found = _memory.outcome
+    return found if found is not None and _memory.about == about else None
+
+
+def state_of(folder: str) -> FarmState | None:
+    """Return what a Manager last said of the job of a folder."""
+    return _states.get(folder)
+
+
+def keep_state(folder: str, state: FarmState | None) -> None:
+    """Keep what a Manager says of the job of a folder; None forgets it."""
+    _states.pop(folder, None)
+    if state is not None:
+        _states[folder] = state
+
+
+def call(
+    about: str, request: Callable[[], Result], then: Callable[[Result], tuple[str, ...]]
+) -> None:
+    """Run a request in the thread.
+
+    Parameters
+    ----------
+    about : str
+        The address or folder that it is about.
+    request : callable
+        Runs in the thread; touches nothing of Blender.
+    then : callable
+        Receives the result on the main thread; returns sentences on it.
+    """
+    _lane.cancel()
+    _memory.outcome, _memory.about = None, about
+
+    def keep(result: Result) -> None:
+        _end(Outcome(True, then(result)))
+
+    def keep_failure(error: Exception) -> None:
+        if not isinstance(error, WrapError | OSError):
+            _logger.error("a request to a farm", exc_info=error)
+        lines = (error.message, error.hint) if isinstance(error, WrapError) else (str(error),)
+        _end(Outcome(False, tuple(filter(None, lines))))
+
+    _lane.submit(request, keep, failed=keep_failure)
+
+
+def stop() -> None:
+    """Forget everything; a request that runs ends by itself within seconds."""
+    _lane.stop()
+    _memory.outcome = None
+    _states.clear()
+
+
+def _end(outcome: Outcome) -> None:
+    _memory.outcome = outcome
+    redraw_sidebars()

@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Schedulers and workers started by hand: lost, of another version, on another computer with TLS.
+
+The other computer is a network namespace with its own address, and its own path of the shared
+folder.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.core.cluster.certificates import FOLDER_VARIABLE, make_certificates
+from gaussian_wrapping_addon.core.jobs.client import JobClient
+from gaussian_wrapping_addon.core.jobs.store.job_file import write_job
+from gaussian_wrapping_addon.core.names import SHARED_VARIABLE
+from tests.core.jobs import farm_jobs
+from tests.core.jobs.farm_jobs import (
+    kill,
+    running,
+    same_mesh,
+    states,
+    tiled_sphere,
+    wait,
+    wait_until,
+)
+
+pytest.importorskip("distributed", reason="Dask is not installed: set-up-worker --add farm")
+pytestmark = [
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs signals and namespaces"),
+    pytest.mark.timeout(900),
+]
+PACKAGE = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon"
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+class Farm:
+    """Commands ``farm ...`` that run until the test ends."""
+
+    def __init__(self) -> None:
+        self.started: list[subprocess.Popen[str]] = []
+
+    def start(
+        self, *words: str, says: str, before: Sequence[str] = (), package: Path = PACKAGE
+    ) -> subprocess.Popen[str]:
+        """Start a command and wait until it says that it works."""
+        process = subprocess.Popen(
+            [*before, sys.executable, str(package / "batch.py"), "farm", *words],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        )  # fmt: skip
+        self.started.append(process)
+        assert process.stdout is not None
+        said = ""
+        while says not in said:
+            line = process.stdout.readline()
+            assert line, said
+            said += line
+        return process
+
+    def end(self) -> None:
+        for process in self.started:
+            end(process)
+
+
+def end(process: subprocess.Popen[str]) -> None:
+    """Kill a command with its children."""
+    for pid in descendants(process.pid):
+        kill(pid)
+    process.kill()
+    process.wait()
+
+
+def descendants(pid: int) -> list[int]:
+    found = [int(p.name) for p in Path("/proc").iterdir() if p.name.isdecimal()]
+    children = [child for child in found if farm_jobs.parent_of(child) == pid]
+    return [d for child in children for d in [*descendants(child), child]]
+
+
+@pytest.fixture
+def farm() -> Iterator[Farm]:
+    made = Farm()
+    yield made
+    made.end()
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> farm_jobs.JobFolder:
+    """Mesh the sphere in tiles in one process."""
+    folder, job = tiled_sphere(tmp_path_factory.mktemp("alone"), 2)
+    assert farm_jobs.run(folder, job).state == "DONE"
+    return folder
+
+
+def test_a_scheduler_that_is_killed_ends_the_job_with_a_sentence_and_loses_nothing(
+    farm: Farm, alone: farm_jobs.JobFolder, tmp_path: Path
+) -> None:
+    address = f"tcp://127.0.0.1:{free_port()}"
+    scheduler = farm.start("scheduler", address, says="listens at")
+    worker = farm.start("worker", address, says="works for")
+    folder, job = tiled_sphere(tmp_path, 2, computers=address)
+    client = JobClient.start(folder.root, job, python=sys.executable)
+
+    def look() -> None:
+        if scheduler.poll() is None and any(
+            name.startswith("faces") for name, _ in running(folder)
+        ):
+            end(scheduler)
+
+    status = wait(client, look)
+    assert status.state == "FAILED", status
+    assert f"The Dask scheduler at {address} is gone." in status.error
+    assert "resume" in status.hint
+    wait_until(lambda: not list(running(folder)), 30.0)
+    end(worker)
+    done = {name: state.token for name, state in states(folder).items() if state.state == "DONE"}
+    assert "gather-ball" in done
+    farm.start("scheduler", address, says="listens at")
+    farm.start("worker", address, says="works for")
+    status = wait(JobClient.resume(folder.root, python=sys.executable))
+    assert status.state == "DONE", status
+    assert same_mesh(folder, alone)
+    kept = set(done) - {"cameras"}
+    assert {name: states(folder)[name].token for name in kept} == {n: done[n] for n in kept}
+
+
+def test_a_worker_of_another_version_is_told(farm: Farm, tmp_path: Path) -> None:
+    other = tmp_path / "older" / PACKAGE.name
+    shutil.copytree(PACKAGE, other, ignore=shutil.ignore_patterns("__pycache__"))
+    (other / "core" / "limits.py").open("a").write("\n# older\n")
+    address = f"tcp://127.0.0.1:{free_port()}"
+    farm.start("scheduler", address, says="listens at")
+    farm.start("worker", address, says="works for", package=other)
+    folder, job = tiled_sphere(tmp_path / "job", 2, computers=address)
+    status = farm_jobs.run(folder, job)
+    assert status.state == "FAILED"
+    assert "Part cameras failed on" in status.error
+    assert "version" in status.error
+    assert "Install the same version" in status.hint
+    assert [state.state for state in states(folder).values()] == []
+
+
+def _namespaces() -> str:
+    """Return why no network namespace can be made here; empty if one can."""
+    if os.geteuid() != 0:
+        return "only root makes network namespaces"
+    if shutil.which("ip") is None or shutil.which("unshare") is None:
+        return "ip or unshare is not installed"
+    tried = subprocess.run(
+        ["ip", "netns", "add", "gwrap-try"], capture_output=True, text=True, check=False
+    )
+    subprocess.run(["ip", "netns", "del", "gwrap-try"], capture_output=True, check=False)
+    return "" if tried.returncode == 0 else f"no namespace can be made: {tried.stderr.strip()}"
+
+
+START = f"""
+import sys; sys.path[:0] = {sys.path!r}
+from pathlib import Path
+from gaussian_wrapping_addon.core.jobs.client import JobClient
+from gaussian_wrapping_addon.core.jobs.store.job_file import write_job
+from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
+root, job = map(Path, sys.argv[1:])
+JobClient.start(root, read_job(job), python=sys.executable)._process.wait()
+"""
+"""Starts a job and waits for it, for a namespace of its own."""
+
+
+class Link:
+    """Two network namespaces with a link between them."""
+
+    NAMES = ("gwrap-here", "gwrap-there")
+    HERE, THERE = "10.231.7.1", "10.231.7.2"
+
+    def __init__(self) -> None:
+        self.remove()
+        one, two = self.NAMES
+        for words in (
+            f"netns add {one}", f"netns add {two}",
+            f"link add gwh0 netns {one} type veth peer name gwh1 netns {two}",
+            f"-n {one} addr add {self.HERE}/24 dev gwh0",
+            f"-n {two} addr add {self.THERE}/24 dev gwh1",
+            f"-n {one} link set gwh0 up", f"-n {two} link set gwh1 up",
+            f"-n {one} link set lo up", f"-n {two} link set lo up",
+        ):  # fmt: skip
+            subprocess.run(["ip", *words.split()], check=True, capture_output=True)
+
+    def set(self, state: str) -> None:
+        """Cut the link (``down``) or mend it (``up``)."""
+        subprocess.run(["ip", "-n", self.NAMES[1], "link", "set", "gwh1", state], check=True)
+
+    def remove(self) -> None:
+        for name in self.NAMES:
+            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+@pytest.fixture
+def link() -> Iterator[Link]:
+    reason = _namespaces()
+    if reason:
+        pytest.skip(reason)
+    made = Link()
+    yield made
+    made.remove()
+
+
+def test_two_computers_with_tls_other_paths_and_a_cut_link(
+    farm: Farm, link: Link, alone: farm_jobs.JobFolder, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    shared, seen = tmp_path / "shared", tmp_path / "mounted elsewhere"
+    shared.mkdir()
+    seen.mkdir()
+    make_certificates(tmp_path / "keys")
+    monkeypatch.setenv(SHARED_VARIABLE, str(shared))
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "keys"))
+    address = f"tls://{link.HERE}:8786"
+    here = ["ip", "netns", "exec", link.NAMES[0]]
+    # The other side sees the folder at another path, and not at this one.
+    mount = f'mount --bind "{shared}" "{seen}" && mount -t tmpfs none "{shared}" && exec "$@"'
+    there = [
+        "ip", "netns", "exec", link.NAMES[1], "unshare", "-m", "sh", "-c", mount, "sh",
+    ]  # fmt: skip
+    farm.start("scheduler", address, says="listens at", before=here)
+    farm.start("worker", address, "--shared", str(seen), says="works for", before=there)
+    folder, job = tiled_sphere(shared / "ball", 2, computers=address)
+    write_job(tmp_path / "job.json", job)
+    with subprocess.Popen(
+        [*here, sys.executable, "-c", START, str(folder.root), str(tmp_path / "job.json")],
+        start_new_session=True,
+    ) as driver:
+        cut_s = 0.0
+        end_s = time.monotonic() + farm_jobs.DEADLINE_S
+        while driver.poll() is None:
+            assert time.monotonic() < end_s
+            begun_faces = any(name.startswith("faces") for name in states(folder))
+            if begun_faces and not cut_s:
+                cut_s = time.monotonic()
+                link.set("down")
+            if cut_s and time.monotonic() - cut_s > 5.0:
+                link.set("up")
+            time.sleep(0.1)
+    status = folder.read_status()
+    assert cut_s
+    assert status.state == "DONE", status
+    assert same_mesh(folder, alone)

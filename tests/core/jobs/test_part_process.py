@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``run-part``: a job made part by part, as a farm does, is the job; and its exit codes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.core.jobs.client import prepare_job
+from gaussian_wrapping_addon.core.jobs.parts.graph import PARTS_NAME, read_parts, write_parts
+from gaussian_wrapping_addon.core.jobs.parts.part_state import new_state, read_state, write_state
+from gaussian_wrapping_addon.core.jobs.parts.planning import plan_if_missing
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.processes.helper_process import child_command
+from tests.core.jobs import farm_jobs
+from tests.core.jobs.farm_jobs import mesh_in, same_mesh, states, tiled_sphere
+
+
+def start(folder: JobFolder, part: str, **changes: object) -> subprocess.Popen[str]:
+    request = {
+        "out": str(folder.root), "part": part, "threads": 1, "device": "", "attempt": 1,
+        "driven": False, **changes,
+    }  # fmt: skip
+    return subprocess.Popen(
+        child_command("jobs.part_process", json.dumps(request)),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+
+
+def run(folder: JobFolder, part: str, **changes: object) -> tuple[int, str]:
+    """Run a part; return its exit code and what it said."""
+    process = start(folder, part, **changes)
+    out, errors = process.communicate(timeout=240)
+    assert "Traceback" not in errors, errors
+    return process.returncode, out
+
+
+@pytest.fixture
+def planned(tmp_path: Path) -> JobFolder:
+    """Return a job of two tiles whose parts are planned and not run."""
+    folder, job = tiled_sphere(tmp_path, 2)
+    prepare_job(folder.root, job)
+    plan_if_missing(folder)
+    return folder
+
+
+@pytest.mark.timeout(900)
+def test_a_job_made_part_by_part_is_the_job(planned: JobFolder, tmp_path: Path) -> None:
+    names = [part.name for part in read_parts(planned.root).parts]
+    assert len([name for name in names if name.startswith("faces")]) == 2
+    assert run(planned, names[-1])[0] == 2, "what it needs is not done"
+    for name in names:
+        code, said = run(planned, name)
+        assert code == 0, said
+        assert f"part {name} is done" in said
+    assert planned.read_status().state == "DONE"
+    (tmp_path / "whole").mkdir()
+    whole, job = tiled_sphere(tmp_path / "whole", 2)
+    assert farm_jobs.run(whole, job).state == "DONE"
+    assert same_mesh(planned, whole)
+    assert run(planned, "plan-ball") == (0, '{"line": "part plan-ball was done before"}\n')
+
+
+@pytest.mark.timeout(900)
+def test_a_list_that_cannot_grow_makes_its_tiles_in_one_part(tmp_path: Path) -> None:
+    folder, job = tiled_sphere(tmp_path, 2)
+    prepare_job(folder.root, job)
+    plan_if_missing(folder)
+    graph = read_parts(folder.root)
+    kept = [p for p in graph.parts if p.kind not in ("points", "gather", "faces")]
+    kept = [dataclasses.replace(p, needs=("plan-ball",)) if p.kind == "mesh" else p for p in kept]
+    write_parts(folder.root, dataclasses.replace(graph, parts=tuple(kept)))
+    for part in kept:
+        assert run(folder, part.name)[0] == 0
+    (tmp_path / "whole").mkdir()
+    whole, job = tiled_sphere(tmp_path / "whole", 2)
+    assert farm_jobs.run(whole, job).state == "DONE"
+    assert same_mesh(folder, whole)
+    assert len(mesh_in(folder)[1]) > 100
+
+
+def test_exit_codes_say_what_a_farm_may_do(planned: JobFolder) -> None:
+    code, said = run(planned, "no-such-part")
+    assert (code, "has no part no-such-part" in said) == (1, True)
+    code, said = run(planned, "train")
+    assert (code, "needs cameras, which is not done" in said) == (2, True)
+    graph = read_parts(planned.root)
+    write_parts(planned.root, dataclasses.replace(graph, code="0" * 12))
+    code, said = run(planned, "cameras")
+    assert (code, "Install the same version" in said) == (3, True)
+    write_parts(planned.root, dataclasses.replace(graph, plan="other"))
+    code, said = run(planned, "cameras")
+    assert (code, "planned for another job" in said) == (1, True)
+    (planned.root / PARTS_NAME).write_text("{")
+    code, said = run(planned, "cameras")
+    assert (code, "parts.json" in said) == (1, True)
+    write_parts(planned.root, graph)
+    assert states(planned) == {}
+    planned.cancel_path.touch()
+    assert run(planned, "cameras")[0] == 5
+    planned.cancel_path.unlink()
+    write_state(planned.root, "cameras", new_state(graph.plan, 1))  # of this process, which lives
+    code, said = run(planned, "cameras")
+    assert (code, f"is run by process {os.getpid()}" in said) == (2, True)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM")
+def test_a_part_that_is_told_to_end_says_that_it_may_work_elsewhere(planned: JobFolder) -> None:
+    for name in ("cameras", "train"):
+        assert run(planned, name)[0] == 0
+    process = start(planned, "plan-ball")
+    end_s = time.monotonic() + 60.0
+    while (state := read_state(planned.root, "plan-ball")) is None or state.fraction == 0.0:
+        if process.poll() is not None:
+            pytest.skip("it was faster")
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+    process.send_signal(signal.SIGTERM)
+    out, _ = process.communicate(timeout=60)
+    state = read_state(planned.root, "plan-ball")
+    assert state is not None
+    assert (process.returncode, state.state) in ((2, "FAILED"), (0, "DONE"))
+    if process.returncode:
+        assert "its process was ended" in out

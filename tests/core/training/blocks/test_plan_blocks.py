@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Plans of blocks: cells, photos, what is trained and what stands still."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gaussian_wrapping_addon.core.errors import Cancelled, UsageError
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
+from gaussian_wrapping_addon.core.training.blocks.block_settings import BlockSettings
+from gaussian_wrapping_addon.core.training.blocks.photo_choice import chosen_photos
+from gaussian_wrapping_addon.core.training.blocks.plan_blocks import plan_blocks
+from tests.core.training.blocks.row_scene import SETTINGS, known_coarse, row_scene, two_blocks
+
+
+@given(seed=st.integers(0, 10**6), cells=st.integers(1, 6), coverage=st.floats(0.5, 1.0))
+@settings(max_examples=60, deadline=None)
+def test_photos_of_a_cell_show_most_of_it_and_each_is_needed(
+    seed: int, cells: int, coverage: float
+) -> None:
+    random = np.random.default_rng(seed)
+    shown = random.exponential(size=(12, cells)) * (random.random((12, cells)) < 0.6)
+    chosen = chosen_photos(shown, coverage)
+    assert chosen.any(1).all(), "every photo belongs to a block"
+    lonely = (chosen.sum(1) == 1) & (chosen.argmax(1) == shown.argmax(1))
+    for cell in range(cells):
+        weights, total = shown[:, cell], shown[:, cell].sum()
+        mine = chosen[:, cell]
+        held = weights[mine].sum()
+        assert held >= coverage * total * (1 - 1e-12)
+        for photo in np.flatnonzero(mine & ~lonely):  # the others may have nowhere else to go
+            assert held - weights[photo] < coverage * total or weights[photo] > weights[mine].min()
+
+
+@pytest.mark.parametrize("blocks", [2, 4])
+def test_cells_and_their_photos_lie_along_the_row(blocks: int) -> None:
+    plan, (scene, _) = two_blocks(blocks), row_scene()
+    means = plan.coarse.gaussians.means.double().numpy()
+    owner = plan.tiling.owner(means)
+    assert set(owner) == set(range(blocks))
+    assert {axis for _, axis, _ in plan.tiling.splits} == {0}
+    assert set(plan.views) == {view for block in plan.blocks for view in block.views}
+    assert not set(range(0, 24, 8)) & set(plan.views), "held-out photos are in no block"
+    lasting = [block.pixels for block in plan.blocks]
+    assert max(lasting) <= 1.35 * np.mean(lasting)
+    for index, block in enumerate(plan.blocks):
+        low, high = plan.tiling.box(index)
+        reach = plan.margins[index]
+        assert reach[0] > 0.0
+        rows = np.concatenate([block.trained, block.still])
+        assert len(np.unique(rows)) == len(rows)
+        inside = ((means >= low - reach) & (means <= high + reach)).all(1)
+        assert inside[block.trained].all()
+        # All of the cell is trained here, or stays: nothing is lost.
+        mine = np.flatnonzero(owner == index)
+        assert set(mine) == (set(block.trained) & set(mine)) | set(plan.kept(index))
+        # A camera looks straight at the row: what it is far away from, it does not show.
+        for view in block.views:
+            x = scene.views[view].camera.center[0]
+            assert low[0] - 2.6 < x < high[0] + 2.6
+    assert 0 < len(plan.blocks[0].views) < len(plan.views)
+
+
+def test_a_plan_is_the_same_each_time_and_on_any_number_of_threads() -> None:
+    scene, photos = row_scene()
+    again = plan_blocks(
+        known_coarse(), scene, photos, SETTINGS, BlockSettings(2), Progress(), threads=2
+    )
+    assert again.digest == two_blocks().digest
+    other = plan_blocks(
+        known_coarse(), scene, photos, SETTINGS, BlockSettings(2, margin=0.3), Progress(), threads=1
+    )
+    assert other.digest != again.digest
+    assert all(
+        set(narrow.trained) < set(wide.trained)
+        for narrow, wide in zip(again.blocks, other.blocks, strict=True)
+    )
+
+
+def test_what_the_photos_of_a_block_hardly_show_stands_still() -> None:
+    """Pruning and growth look at the block's photos alone: it would be lost."""
+    scene, photos = row_scene()
+    plan = plan_blocks(
+        known_coarse(), scene, photos, SETTINGS, BlockSettings(2, coverage=0.5), Progress(),
+        threads=1,
+    )  # fmt: skip
+    raw, renderer = RawArrays.from_gaussians(plan.coarse.gaussians), ViewRenderer()
+    options = RenderOptions(depth=False, sh_degree=0, threads=1, statistics=True)
+    weights = {}
+    for view in plan.views:
+        statistics = renderer.render(raw, scene.views[view].camera, options).statistics
+        assert statistics is not None
+        weights[view] = statistics.weight_sum.astype(float)
+    total = np.sum(list(weights.values()), 0)
+    kept = 0
+    for index, block in enumerate(plan.blocks):
+        held = np.sum([weights[view] for view in block.views], 0)
+        assert (held[block.trained] >= 0.5 * total[block.trained]).all()
+        assert (held[plan.kept(index)] < 0.5 * total[plan.kept(index)]).all()
+        kept += len(plan.kept(index))
+        # What stands still is seen; nearly all that is seen is there.
+        assert (held[block.still] > 0.0).all()
+        there = np.concatenate([block.trained, block.still])
+        for view in block.views:
+            assert weights[view][there].sum() >= 0.995 * weights[view].sum()
+    assert kept > 0
+
+
+def test_points_near_a_border_are_those_close_to_its_plane() -> None:
+    plan = two_blocks()
+    (_, axis, at), = plan.tiling.splits  # fmt: skip
+    points = np.random.default_rng(2).uniform(-5, 5, (500, 3))
+    assert (plan.near_border(points, 0.7) == (np.abs(points[:, axis] - at) <= 0.7)).all()
+
+
+def test_limits_of_blocks_add_up_to_that_of_the_whole() -> None:
+    plan = two_blocks(4)
+    owner = plan.tiling.owner(plan.coarse.gaussians.means.double().numpy())
+    kept = sum(len(plan.kept(index)) for index in range(4))
+    expected = kept
+    for index, block in enumerate(plan.blocks):
+        share = (owner[block.trained] == index).mean()
+        expected += block.max_gaussians * share
+    assert 0.98 * SETTINGS.max_gaussians <= expected <= SETTINGS.max_gaussians
+
+
+def test_what_cannot_be_divided_is_refused_and_planning_can_be_cancelled() -> None:
+    scene, photos = row_scene()
+    with pytest.raises(UsageError, match="22 blocks: 21 photos"):
+        plan_blocks(known_coarse(), scene, photos, SETTINGS, BlockSettings(22), Progress())
+    for wrong in ({"blocks": 0}, {"margin": -0.1}, {"coverage": float("nan")}, {"blocks": 1025}):
+        with pytest.raises(UsageError):
+            BlockSettings(**wrong)
+    with pytest.raises(Cancelled):
+        plan_blocks(
+            known_coarse(), scene, photos, SETTINGS, BlockSettings(2),
+            Progress("plan", None, lambda: True),
+        )  # fmt: skip
