@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -114,10 +115,39 @@ def without_warnings() -> Iterator[None]:
     """Let Pillow warn of nothing on the terminal while the block opens and decodes.
 
     It warns of EXIF entries that are cut, and of sizes that our own check of the header allows.
+    The filters belong to the process: photos are read on several threads, so that the first to
+    come sets them and the last to go restores them.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    _quiet.enter()
+    try:
         yield
+    finally:
+        _quiet.leave()
+
+
+class _QuietFilters:
+    """Filters that ignore every warning while at least one thread wants them."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._wanted_by = 0
+        self._earlier = contextlib.ExitStack()
+
+    def enter(self) -> None:
+        with self._lock:
+            if not self._wanted_by:
+                self._earlier.enter_context(warnings.catch_warnings())
+                warnings.simplefilter("ignore")
+            self._wanted_by += 1
+
+    def leave(self) -> None:
+        with self._lock:
+            self._wanted_by -= 1
+            if not self._wanted_by:
+                self._earlier.close()
+
+
+_quiet = _QuietFilters()
 
 
 def forbid_ghostscript() -> None:

@@ -7,13 +7,18 @@ import ast
 import json
 import os
 import struct
+import threading
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import EpsImagePlugin, Image
 
-from gaussian_wrapping_addon.core.dataset.photos.image_formats import IMAGE_FORMATS
+from gaussian_wrapping_addon.core.dataset.photos.image_formats import (
+    IMAGE_FORMATS,
+    without_warnings,
+)
 from gaussian_wrapping_addon.core.dataset.photos.photo_exif import read_lens_exif
 from gaussian_wrapping_addon.core.dataset.photos.photo_file import read_mask, read_photo
 from gaussian_wrapping_addon.core.dataset.photos.photo_header import read_photo_header
@@ -158,3 +163,30 @@ def test_pillow_opens_files_in_one_place_only() -> None:
         and getattr(node.func.value, "id", "") in ("Image", "PIL")
     }
     assert places == {"core/dataset/photos/image_formats.py"}
+
+
+def test_threads_that_overlap_hear_no_warning_and_restore_the_filters() -> None:
+    """The one that entered first leaves first, as two threads that read photos may."""
+    first_entered, first_left, second_entered = (threading.Event() for _ in range(3))
+
+    def first() -> None:
+        with without_warnings():
+            first_entered.set()
+            second_entered.wait(10)
+        first_left.set()
+
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        before = list(warnings.filters)
+        thread = threading.Thread(target=first)
+        thread.start()
+        assert first_entered.wait(10)
+        with without_warnings():
+            second_entered.set()
+            assert first_left.wait(10)
+            warnings.warn("of a cut entry", stacklevel=1)
+        thread.join()
+        after = list(warnings.filters)
+        warnings.warn("heard again", stacklevel=1)
+    assert [str(one.message) for one in heard] == ["heard again"]
+    assert after == before
