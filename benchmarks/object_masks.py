@@ -68,9 +68,7 @@ def objects(judge: Job, box: Path) -> dict[str, np.ndarray]:
     inside = region.contains(judge.gaussians.means.double().numpy(), 0.0)
     held_out = held_out_views(judge.scene, HELD_OUT_EVERY)
     cameras = [judge.photos.camera(index) for index in held_out]
-    shares = silhouettes(
-        judge.gaussians, inside, cameras, ViewRenderer(), lambda _: None, threads=1
-    )
+    shares = silhouettes(judge.gaussians, inside, cameras, ViewRenderer(), threads=1)
     return {
         judge.scene.views[index].camera.name: ndimage.binary_erosion(
             share >= THRESHOLD, iterations=ERODED_PX

@@ -40,7 +40,7 @@ FOLDERS = (
     "core/evaluation/color_field", "core/evaluation/views", "core/evaluation/report",
     "core/evaluation",
     "core/cluster", "core/jobs/store", "core/jobs/video", "core/jobs/stages", "core/jobs/masking",
-    "core/jobs/baking", "core/jobs/parts", "core/jobs",
+    "core/jobs/training", "core/jobs/baking", "core/jobs/parts", "core/jobs",
     "core/jobs/commands", "core/jobs/commands/farm", "core/setup", "core/farm",
     "core/farm/flamenco",
     "ops/common", "ops/cameras", "ops/regions", "ops/placement", "ops/results", "ops/baking",
@@ -50,7 +50,7 @@ FOLDERS = (
     "ui/translations", "ui/common", "ui/worker", "ui/jobs", "ui/presets", "ui/dataset",
     "ui/training", "ui/computers", "ui/masks", "ui/regions", "ui/meshing", "ui/baking",
     "ui/results", "ui/placement", "ui",
-    "command_line/options", "command_line", "",
+    "command_line/options", "command_line/farm", "command_line", "",
 )  # fmt: skip
 
 # What a part may not import although it is listed earlier: part -> parts.

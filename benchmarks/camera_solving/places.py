@@ -77,7 +77,7 @@ def _walk(count: int, half: float, chance: np.random.Generator) -> list[Camera]:
         height = 1.7 + 0.5 * np.sin(k / 9.0)
         center = np.array([*(spots[k] + chance.uniform(-0.15, 0.15, 2)), height])
         forward = np.array([np.cos(heading[k]), np.sin(heading[k]), 0.05])
-        cameras.append(_camera(k, center, forward))
+        cameras.append(camera_at(k, center, forward))
     return cameras
 
 
@@ -99,11 +99,11 @@ def hall(count: int) -> Place:
         angle = 2 * np.pi * k / count
         center = np.array([1.6 * np.cos(angle), 1.6 * np.sin(angle), 1.5])
         center = center + chance.uniform(-0.3, 0.3, 3)
-        cameras.append(_camera(k, center, np.array([np.cos(angle), np.sin(angle), 0.18])))
+        cameras.append(camera_at(k, center, np.array([np.cos(angle), np.sin(angle), 0.18])))
     return Place(boxes, tuple(cameras))
 
 
-def _camera(number: int, center: np.ndarray, forward: np.ndarray) -> Camera:
+def camera_at(number: int, center: np.ndarray, forward: np.ndarray) -> Camera:
     z = forward / np.linalg.norm(forward)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x = x / np.linalg.norm(x)

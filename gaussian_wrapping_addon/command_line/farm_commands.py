@@ -6,9 +6,10 @@ from __future__ import annotations
 import logging
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from .common import Commands
+from .farm.dask_commands import DASK_COMMANDS
 
 if TYPE_CHECKING:
     from ..core.farm.part_states import PartBoard
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 _logger = logging.getLogger("gaussian_wrapping")
 
 _DEFAULT_PRIORITY = 50
-_DEFAULT_PORT = 8786
 
 
 def add_farm(commands: Commands) -> None:
@@ -174,79 +174,7 @@ def _job_type(options: Namespace) -> int:
     return EXIT_DONE
 
 
-def _add_make_certificates(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "make-certificates", help="make the certificates by which computers know each other"
-    )
-    parser.add_argument("folder", type=Path, metavar="DIR", help="new folder for them")
-    parser.set_defaults(run=_make_certificates)
-
-
-def _make_certificates(options: Namespace) -> int:
-    from ..core.files import real_path
-
-    return _in_worker("certificates", {"folder": str(real_path(options.folder))})
-
-
-def _add_scheduler(commands: Commands) -> None:
-    parser = commands.add_parser("scheduler", help="run a Dask scheduler on this computer")
-    parser.add_argument(
-        "address", nargs="?", default=f"tls://0.0.0.0:{_DEFAULT_PORT}", metavar="tls://HOST:PORT",
-        help="where it listens",
-    )  # fmt: skip
-    _add_certificates(parser)
-    parser.set_defaults(run=_scheduler)
-
-
-def _scheduler(options: Namespace) -> int:
-    request = {"address": options.address, "certificates": options.certificates}
-    return _in_worker("scheduler", request)
-
-
-def _add_worker(commands: Commands) -> None:
-    parser = commands.add_parser("worker", help="let this computer work for a Dask scheduler")
-    parser.add_argument("address", metavar="tls://HOST:PORT", help="of the scheduler")
-    _add_certificates(parser)
-    parser.add_argument(
-        "--shared", default="", metavar="DIR",
-        help="the folder that all computers share, as this one sees it",
-    )  # fmt: skip
-    parser.add_argument("--slots", type=int, default=1, help="parts side by side (default: 1)")
-    parser.set_defaults(run=_worker)
-
-
-def _worker(options: Namespace) -> int:
-    from ..core.errors import UsageError
-    from ..core.files import real_path
-    from ..core.settings.choices import MAX_PROCESSES
-
-    if not 1 <= options.slots <= MAX_PROCESSES:
-        raise UsageError("--slots is out of range.", f"Give from 1 to {MAX_PROCESSES}.")
-    request = {
-        "address": options.address, "certificates": options.certificates,
-        "shared": str(real_path(options.shared)) if options.shared else "",
-        "slots": options.slots,
-    }  # fmt: skip
-    return _in_worker("worker", request)
-
-
-def _add_certificates(parser: ArgumentParser) -> None:
-    parser.add_argument(
-        "--certificates", default="", metavar="DIR", help="folder of the farm's certificates"
-    )
-
-
-def _in_worker(module: str, request: dict[str, Any]) -> int:
-    from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.run_in_worker import run_in_worker
-
-    return run_in_worker(
-        request, python=worker_python(), module=f"jobs.commands.farm.{module}", what="command"
-    )
-
-
 _FARM_COMMANDS = (
-    _add_make_certificates, _add_scheduler, _add_worker, _add_submit, _add_status, _add_retry,
-    _add_cancel, _add_job_type,
+    *DASK_COMMANDS, _add_submit, _add_status, _add_retry, _add_cancel, _add_job_type,
 )  # fmt: skip
 """In the order shown by ``farm --help``."""

@@ -212,14 +212,19 @@ def _queue(options: Namespace) -> int:
     from ..core.files import real_path
     from ..core.jobs.client import prepare_job, worker_python
     from ..core.jobs.commands.run_in_worker import run_in_worker
+    from ..core.jobs.store.job_folder import JobFolder
 
     root, out = real_path(options.input), real_path(options.out)
     if out == root or out.is_relative_to(root):
         raise UsageError(f"{options.out} lies inside {options.input}.", "Give a folder beside it.")
+    if JobFolder(out).locked():
+        raise UsageError(f"A queue is running in {out}.", "Wait for it, or end it first.")
     names, refused = [], 0
     for folder in _folders(root):
         try:
             job = checked_job(folder, options)
+            # The queue spreads jobs, not their parts: those would wait for places that jobs hold.
+            job = replace(job, settings=replace(job.settings, computers=""))
             if not _is_same(out / folder.name, job):
                 prepare_job(out / folder.name, job)
             names.append(folder.name)
@@ -261,14 +266,16 @@ def _folders(root: Path) -> list[Path]:
 
 
 def _is_same(folder: Path, job: JobFile) -> bool:
-    """Return whether a folder holds this job already, begun or finished."""
+    """Return whether a folder holds this job already, begun or finished, and run the same way."""
     from ..core.errors import WrapError
     from ..core.jobs.parts.planning import plan_hash
     from ..core.jobs.store.job_file import read_job
     from ..core.jobs.store.job_folder import JobFolder
 
     try:
-        return plan_hash(read_job(JobFolder(folder).job_path)) == plan_hash(job)
+        known = read_job(JobFolder(folder).job_path)
+        same = known.settings.computers == job.settings.computers
+        return same and plan_hash(known) == plan_hash(job)
     except (WrapError, OSError):
         return False
 

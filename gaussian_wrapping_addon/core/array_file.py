@@ -12,7 +12,7 @@ import os
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -54,7 +54,8 @@ def read_arrays(
     optional : iterable of str
         Arrays that it may hold; the others are not read.
     most_bytes : int, optional
-        Largest size of all entries when unpacked; without it compressed entries are refused.
+        Largest size of those that are read when unpacked; without it compressed entries are
+        refused.
     hint : str
         The next step for the user, for the error.
 
@@ -65,9 +66,10 @@ def read_arrays(
     """
     try:
         with open_regular(path) as stream, zipfile.ZipFile(stream) as archive:
-            _check_entries(archive, stream, most_bytes)
             held = [entry.removesuffix(".npy") for entry in archive.namelist()]
             wanted = held if names is None else [*names, *(n for n in optional if n in held)]
+            entries = [archive.getinfo(f"{name}.npy") for name in wanted]
+            _check_entries(entries, stream, most_bytes)
             return {name: _array(archive, f"{name}.npy") for name in wanted}
     except OSError as error:
         raise ParseError(
@@ -89,7 +91,7 @@ def is_whole(path: Path, most_bytes: int | None = None) -> bool:
     """
     try:
         with open_regular(path) as stream, zipfile.ZipFile(stream) as archive:
-            _check_entries(archive, stream, most_bytes)
+            _check_entries(archive.infolist(), stream, most_bytes)
             return archive.testzip() is None
     except FileNotFoundError:
         return False
@@ -102,9 +104,10 @@ def is_whole(path: Path, most_bytes: int | None = None) -> bool:
         return False
 
 
-def _check_entries(archive: zipfile.ZipFile, stream: IO[bytes], most_bytes: int | None) -> None:
-    """Raise ValueError where reading could take more memory or time than allowed."""
-    entries = archive.infolist()
+def _check_entries(
+    entries: Sequence[zipfile.ZipInfo], stream: IO[bytes], most_bytes: int | None
+) -> None:
+    """Raise ValueError where reading these could take more memory or time than allowed."""
     if most_bytes is None:
         most_bytes = os.fstat(stream.fileno()).st_size
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):

@@ -27,6 +27,8 @@ MAX_MODEL_BYTES = 2 * 1024**3
 """Largest segmentation model: that of one ONNX file."""
 MAX_MESH_POINTS = 5_000_000
 MAX_TILES = 4096
+MAX_BLOCKS = 1024
+"""Of a training: a plan keeps a flag for each Gaussian and block."""
 MAX_PARTS = 50_000
 """Of a job: those of a few regions of the most tiles."""
 MAX_PARTS_BYTES = 32 * 1024 * 1024
@@ -39,6 +41,14 @@ MIN_IMAGES = 3
 RENDER_BUDGET_BYTES = 512 * 1024 * 1024
 """Memory for lists and gradients of tile intersections in one rendering: with it, a million
 Gaussians train at 1600 x 1200 pixels within 4 GB."""
+PHOTO_MEMORY_SHARE = 0.25
+"""Of the free memory, for decoded photos: Gaussians, images and depth maps need the rest."""
+MIN_PHOTO_MEMORY_BYTES = 256 * 1024 * 1024
+MAX_PHOTO_MEMORY_BYTES = 8 * 1024**3
+UNKNOWN_PHOTO_MEMORY_BYTES = 1024**3
+"""Where the system does not tell how much memory is free."""
+DECODED_PHOTOS_DISK_SHARE = 0.5
+"""Of the free disk, for decoded photos that do not fit into memory: checkpoints need little."""
 
 SHORTEST_EDGE = 1e-30
 """Of a mesh, in world units. Shorter lengths could become 0 in other units: automatic."""

@@ -125,11 +125,16 @@ def is_real_folder(path: Path) -> bool:
     return stat.S_ISDIR(found.st_mode) and not _is_link(found)
 
 
-def reject_foreign_entries(root: Path) -> None:
+def reject_foreign_entries(root: Path, *, but: frozenset[str] = frozenset()) -> None:
     """Raise if a folder holds, at any depth, anything but regular files and folders.
 
     The folder itself may be reached through links. What disappears meanwhile is no error: a job
     may be running.
+
+    Parameters
+    ----------
+    but : frozenset of str
+        Names of folders that are not looked into.
 
     Raises
     ------
@@ -142,7 +147,7 @@ def reject_foreign_entries(root: Path) -> None:
         try:
             with os.scandir(folder) as entries:
                 for entry in sorted(entries, key=lambda one: one.name):
-                    _check_entry(entry, waiting)
+                    _check_entry(entry, waiting, but)
         except FileNotFoundError:
             continue
         except OSError as error:
@@ -151,14 +156,17 @@ def reject_foreign_entries(root: Path) -> None:
             ) from None
 
 
-def _check_entry(entry: os.DirEntry[str], folders: list[Path]) -> None:
+def _check_entry(
+    entry: os.DirEntry[str], folders: list[Path], but: frozenset[str] = frozenset()
+) -> None:
     try:
         found = entry.stat(follow_symlinks=False)
     except FileNotFoundError:
         return
     link = _is_link(found)
     if stat.S_ISDIR(found.st_mode) and not link:
-        folders.append(Path(entry.path))
+        if entry.name not in but:
+            folders.append(Path(entry.path))
     elif link or not stat.S_ISREG(found.st_mode):
         kind = "a link" if link else _kind(found.st_mode)
         raise DatasetError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import os
-import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,13 +14,16 @@ from pathlib import Path
 import bpy
 import pytest
 
+from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.farm import part_states
 from gaussian_wrapping_addon.core.farm.flamenco.job_record import read_record
 from gaussian_wrapping_addon.core.farm.flamenco.submission import SHARED_VARIABLE
+from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.processes.process_identity import process_alive
 from gaussian_wrapping_addon.ops.common import background, known_jobs
-from gaussian_wrapping_addon.ops.computers import farm_actions, farm_calls, part_watch
+from gaussian_wrapping_addon.ops.computers import dask_test, farm_actions, farm_calls, part_watch
 from gaussian_wrapping_addon.ops.jobs.panel_settings import job_settings
 from gaussian_wrapping_addon.ui.computers import computers_panel
 from tests.blender.fake_layout import FakeLayout, draw
@@ -54,9 +57,9 @@ def url(stub: StubManager) -> Iterator[str]:
         yield str(address)
 
 
-def wait_for(holds: Callable[[], bool]) -> None:
+def wait_for(holds: Callable[[], bool], seconds: float = 20.0) -> None:
     """Play the timer, which never fires in background Blender, until something holds."""
-    end_s = time.monotonic() + 20.0
+    end_s = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end_s
         background.poll()
@@ -112,7 +115,8 @@ def test_the_choice_decides_what_is_asked_for(
     [
         ("THIS", "tcp://x:1", 1, ("", 2)),  # the default, which says nothing then
         ("THIS", "tcp://x:1", 3, ("local", 3)),
-        ("DASK", " tcp://computer:8786 ", 3, ("tcp://computer:8786", 2)),
+        ("DASK", " tls://computer:8786 ", 3, ("tls://computer:8786", 2)),
+        ("DASK", "tcp://localhost:8786", 3, ("tcp://localhost:8786", 2)),
         ("DASK", "tls://[::1]:8786", 1, ("tls://[::1]:8786", 2)),
         ("FLAMENCO", "tcp://x:1", 3, ("", 2)),
     ],
@@ -133,6 +137,23 @@ def test_a_bad_address_of_a_scheduler_is_refused(address: str) -> None:
     choices.kind, choices.dask_address = "DASK", address
     with pytest.raises(RuntimeError, match="no address of a Dask scheduler"):
         bpy.ops.gwrap.test_computers()
+
+
+def test_what_others_can_read_is_refused_by_test_and_job_alike() -> None:
+    choices = bpy.context.scene.gwrap.computers
+    choices.kind, choices.dask_address = "DASK", "tcp://10.0.0.7:8786"
+    with pytest.raises(RuntimeError, match="is not encrypted"):
+        bpy.ops.gwrap.test_computers()
+    with pytest.raises(UsageError, match="is not encrypted"):
+        job_settings(bpy.context.scene, threads=0)
+
+
+def test_certificates_of_a_server_are_not_looked_for() -> None:
+    choices = bpy.context.scene.gwrap.computers
+    choices.kind, choices.dask_address = "DASK", "tls://localhost:8786"
+    choices.certificates = r"\\server\share"
+    with pytest.raises(UsageError, match="is on another computer"):
+        job_settings(bpy.context.scene, threads=0)
 
 
 def test_a_good_manager(stub: StubManager, url: str, tmp_path: Path) -> None:
@@ -177,16 +198,111 @@ def test_nobody_answers() -> None:
     assert "Nothing answers at http://127.0.0.1:9." in words(answered())
 
 
-def test_a_dask_scheduler_is_connected_to() -> None:
+GOOD_WORKER = {
+    "name": "blade (10.0.0.7:1)", "good": True, "problems": [], "cores": 16, "memory_gib": 63.9,
+    "gpu": "",
+}  # fmt: skip
+BAD_WORKER = {
+    "name": "tower (10.0.0.8:1)", "good": False, "cores": 0, "memory_gib": 0.0, "gpu": "",
+    "problems": ["tower does not see /mnt/farm. Mount the shared folder there."],
+}  # fmt: skip
+
+
+def play_doctor(monkeypatch: pytest.MonkeyPatch, code: str) -> list[dict[str, object]]:
+    """Put a program in the place of the doctor; return what it is asked for."""
+    asked: list[dict[str, object]] = []
+
+    def command(module: str, request: str, *, python: str) -> list[str]:
+        assert module == "jobs.commands.farm.doctor"
+        asked.append(json.loads(request))
+        return [sys.executable, "-c", code]
+
+    monkeypatch.setattr(dask_test, "child_command", command)
+    return asked
+
+
+def choose_dask(address: str) -> None:
     choices = bpy.context.scene.gwrap.computers
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        port = listener.getsockname()[1]
-        choices.kind, choices.dask_address = "DASK", f"tcp://127.0.0.1:{port}"
-        bpy.ops.gwrap.test_computers()
-        said = f"Something accepts connections at tcp://127.0.0.1:{port}."
-        assert said in words(answered())
+    choices.kind, choices.dask_address = "DASK", address
+
+
+def test_each_dask_worker_has_a_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, worker: Callable[..., None]
+) -> None:
+    told = [{"line": "x", "worker": GOOD_WORKER}, {"line": "y", "worker": BAD_WORKER}]
+    said = "\n".join(map(json.dumps, [*told, {"error": "1 of 2 workers", "hint": "Mend"}]))
+    asked = play_doctor(monkeypatch, f"print({said!r}); raise SystemExit(3)")
+    choose_photos(tmp_path)
+    choose_dask("tcp://localhost:8786")
+    bpy.context.scene.gwrap.computers.certificates = str(tmp_path / "keys")
+    assert bpy.ops.gwrap.test_computers() == {"FINISHED"}
+    assert "Asking…" in draw(PANEL).texts
+    layout = answered()
+    assert words(layout).endswith(
+        "1 of 2 workers can be used. tower (10.0.0.8:1): tower does not see /mnt/farm. Mount the "
+        "shared folder there. blade (10.0.0.7:1): 16 cores, 63.9 GiB, no GPU"
+    )
+    assert asked == [
+        {"address": "tcp://localhost:8786", "certificates": str(tmp_path / "keys"),
+         "folder": str(tmp_path), "limit_s": 120.0}
+    ]  # fmt: skip
+    choose_dask("tcp://localhost:8787")
+    assert "workers can be used" not in words(draw(PANEL)), "it was about another address"
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ('print(\'{"error": "No scheduler.", "hint": "Start one."}\')', "No scheduler. Start one."),
+        ("raise SystemExit('odd')", "The test ended without a result: odd. See Check Worker."),
+        ("pass", "The test ended without a result: no output."),
+    ],
+)
+def test_a_doctor_that_finds_no_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, said: str,
+    worker: Callable[..., None],
+) -> None:  # fmt: skip
+    play_doctor(monkeypatch, code)
+    monkeypatch.setenv(SHARED_VARIABLE, str(tmp_path))
+    choose_dask("tcp://localhost:8786")
     bpy.ops.gwrap.test_computers()
-    assert f"Nothing accepts connections at tcp://127.0.0.1:{port}" in words(answered())
+    assert said in words(answered())
+
+
+def test_the_process_of_a_test_ends_with_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, worker: Callable[..., None]
+) -> None:
+    pid = tmp_path / "pid"
+    nap = f"import os,time; open({str(pid)!r}, 'w').write(str(os.getpid())); time.sleep(300)"
+    play_doctor(monkeypatch, nap)
+    monkeypatch.setenv(SHARED_VARIABLE, str(tmp_path))
+    choose_dask("tcp://localhost:8786")
+    bpy.ops.gwrap.test_computers()
+    wait_for(lambda: pid.exists() and bool(pid.read_text()))
+    background.before_load()
+    wait_for(lambda: not process_alive(int(pid.read_text()), 0))
+    assert not farm_calls.is_busy()
+
+
+def test_a_real_doctor_where_nothing_listens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed", reason="Dask is not installed")
+    monkeypatch.setenv(PYTHON_VARIABLE, sys.executable)
+    monkeypatch.setenv(SHARED_VARIABLE, str(tmp_path))
+    choose_dask("tcp://127.0.0.1:9")
+    bpy.ops.gwrap.test_computers()
+    wait_for(lambda: not farm_calls.is_busy(), 120.0)
+    assert "Nothing accepts connections at tcp://127.0.0.1:9" in words(draw(PANEL))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_folder_nothing_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = play_doctor(monkeypatch, "pass")
+    choose_dask("tcp://localhost:8786")
+    with pytest.raises(RuntimeError, match="No folder is known that all computers share"):
+        bpy.ops.gwrap.test_computers()
+    assert asked == []
 
 
 @pytest.mark.parametrize("kind", ["DASK", "FLAMENCO"])
@@ -194,7 +310,7 @@ def test_other_computers_need_online_access(kind: str) -> None:
     assert not bpy.app.online_access, "the bpy module is offline"
     choices = bpy.context.scene.gwrap.computers
     choices.kind = kind
-    choices.dask_address, choices.flamenco_address = "tcp://10.0.0.1:1", "http://10.0.0.1:1"
+    choices.dask_address, choices.flamenco_address = "tls://10.0.0.1:1", "http://10.0.0.1:1"
     with pytest.raises(RuntimeError, match=r"may not go online\. Turn on Allow Online Access"):
         bpy.ops.gwrap.test_computers()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import sys
 import time
 from dataclasses import replace
@@ -387,3 +388,18 @@ def test_stopping_forgets_the_question(worker: Path, monkeypatch: pytest.MonkeyP
     time.sleep(0.1)
     background.poll()
     assert "4 to 6 min" not in draw(TRAIN).texts
+
+
+def test_pictures_of_blocks_are_shown_but_their_points_are_only_a_part(tmp_path: Path) -> None:
+    whole = live_preview.WHOLE_TRAININGS
+    for number, name in enumerate(("blocks-ab/coarse-all", "blocks-ab/block-0001")):
+        path = tmp_path / "stages" / name / live_preview.PICTURE
+        path.parent.mkdir(parents=True)
+        path.write_bytes(b"picture")
+        os.utime(path, ns=(number, 10**9 + number))
+    newest = live_preview.newest_picture(tmp_path)
+    assert newest is not None
+    assert "block-0001" in newest[0]
+    points = live_preview.newest_picture(tmp_path, live_preview.PICTURE, whole)
+    assert points is not None
+    assert "coarse-all" in points[0]

@@ -155,3 +155,8 @@ def test_a_link_is_no_file_of_a_stage(file: Path, tmp_path: Path) -> None:
     link.symlink_to(file)
     with pytest.raises(ParseError, match="is a link"):
         read_arrays(link, ("a",))
+
+
+def test_the_limit_counts_what_is_read(file: Path) -> None:
+    compress(file)
+    assert list(read_arrays(file, ("b",), most_bytes=1000)) == ["b"]

@@ -1,51 +1,94 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Addresses of Dask schedulers: which are allowed, standard library only."""
+"""Addresses of Dask schedulers: how they are written, and which are allowed."""
 
 from __future__ import annotations
 
 import ipaddress
 import re
 import socket
-from urllib.parse import SplitResult, urlsplit
+from dataclasses import dataclass, replace
+from urllib.parse import urlsplit
 
-from ..errors import UsageError
+from ..errors import FarmError, UsageError
 from ..settings.choices import COMPUTERS
-from ..settings.farm import LOCAL
+
+CONNECT_S = 5.0
+_EXAMPLE = "Give one such as tls://computer:8786."
+_SHOWN_CHARACTERS = 100
 
 
-def checked_address(text: str) -> str:
-    """Return an address that may be used.
+@dataclass(frozen=True)
+class Address:
+    """Scheme, host and port."""
+
+    scheme: str
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.scheme}://{host}:{self.port}"
+
+    @property
+    def is_this_computer(self) -> bool:
+        """Whether requests do not leave this computer; no name is looked up."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+    def listening(self) -> Address:
+        """Return where a server listens that others reach at this address: at all networks."""
+        if self.is_this_computer:
+            return self
+        return replace(self, host="::" if ":" in self.host else "0.0.0.0")  # noqa: S104 - TLS only
+
+
+def scheduler_address(text: str) -> Address:
+    """Return an address of a Dask scheduler that may be used.
 
     Raises
     ------
     UsageError
-        It is none, or would send names and commands over a network that others can read.
+        It is none, or would send names and commands over a network that others can read: all but
+        the addresses of this computer must be ``tls://``.
     """
-    if text == LOCAL:
-        return text
-    found = urlsplit(text) if re.fullmatch(COMPUTERS, text) else None
-    if found is None or not found.hostname or not _port_of(found):
+    given = text.strip()
+    address = _parsed(given) if "://" in given and re.fullmatch(COMPUTERS, given) else None
+    if address is None:
+        shown = given[:_SHOWN_CHARACTERS]
+        raise UsageError(f"{shown!r} is no address of a Dask scheduler.", _EXAMPLE)
+    if address.scheme != "tls" and not address.is_this_computer:
         raise UsageError(
-            f"{text!r} is no address of a Dask scheduler.", "Give local, or tls://HOST:PORT."
-        )
-    if found.scheme == "tcp" and not _is_loopback(found.hostname):
-        raise UsageError(
-            f"{text} is not encrypted: whoever reaches that port runs programs there.",
+            f"{address} is not encrypted: whoever reaches that port runs programs there.",
             "Make certificates (batch.py farm make-certificates DIR) and give tls://HOST:PORT.",
         )
-    return text
+    return address
 
 
-def _port_of(parts: SplitResult) -> int:
+def _parsed(text: str) -> Address | None:
     try:
-        return parts.port or 0
-    except ValueError:
-        return 0
+        parts = urlsplit(text)
+        if parts.hostname and parts.port:
+            return Address(parts.scheme, parts.hostname, parts.port)
+    except ValueError:  # a port beyond 65535, brackets without an address
+        pass
+    return None
 
 
-def _is_loopback(host: str) -> bool:
+def check_reachable(address: Address) -> None:
+    """Connect to an address and hang up; nothing is sent.
+
+    Raises
+    ------
+    FarmError
+        Nothing accepts connections there.
+    """
     try:
-        found = {str(entry[4][0]) for entry in socket.getaddrinfo(host, None)}
-    except OSError:
-        return False
-    return bool(found) and all(ipaddress.ip_address(f.split("%")[0]).is_loopback for f in found)
+        socket.create_connection((address.host, address.port), CONNECT_S).close()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", "") or str(error)
+        raise FarmError(
+            f"Nothing accepts connections at {address}: {reason}.",
+            "Check the address, and that a scheduler runs there: batch.py farm scheduler.",
+        ) from None

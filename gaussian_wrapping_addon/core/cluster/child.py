@@ -7,12 +7,14 @@ library only, nothing imported from the package.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,8 @@ ENTRY_VARIABLE = "GW_ENTRY"
 """Names ``worker_main.py`` of the add-on on this computer."""
 PACKAGES_VARIABLE = "GW_PACKAGES"
 """Names the folder of the worker's packages, where they are not those of the interpreter."""
+OTHER_CODE = 3
+"""Exit code: this computer has another version of the program than the one that planned."""
 LAST_LINES = 20
 LAST_BYTES = 4000
 
@@ -33,6 +37,24 @@ def sendable() -> Callable[[dict[str, Any]], dict[str, Any]]:
         return run_child(request)
 
     return run
+
+
+def sendable_beside() -> Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]:
+    """Return the same for a Dask worker whose slots may be taken, to be run outside of them."""
+
+    async def run_beside(request: dict[str, Any]) -> dict[str, Any]:
+        return await asyncio.to_thread(run_child, request)
+
+    return run_beside
+
+
+def sendable_clock() -> Callable[[], float]:
+    """Return a function, to be sent whole, that returns the seconds since the epoch there."""
+
+    def clock() -> float:
+        return time.time()
+
+    return clock
 
 
 def run_child(request: dict[str, Any]) -> dict[str, Any]:
@@ -48,15 +70,21 @@ def run_child(request: dict[str, Any]) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``code``, ``error``, ``hint``, ``host`` and the last ``lines`` of its output.
+        ``code``, ``error``, ``hint``, ``host``, the last ``lines`` of its output, the ``answer``
+        that it gave (``None`` for none), and whether it is ``refused``: whatever this computer is
+        asked, it cannot do.
     """
     host = os.uname().nodename if hasattr(os, "uname") else os.environ.get("COMPUTERNAME", "")
     try:
-        command = _command(request)
+        command = _command(request, host)
     except OSError as error:
-        return {"code": 2, "error": str(error), "hint": "", "host": host, "lines": []}
+        return {
+            "code": 2, "error": str(error), "hint": "", "host": host, "lines": [], "answer": None,
+            "refused": True,
+        }  # fmt: skip
     lines: list[str] = []
     told: dict[str, Any] = {}
+    answer = None
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors,
@@ -69,6 +97,7 @@ def run_child(request: dict[str, Any]) -> dict[str, Any]:
                 lines = [*lines, line][-LAST_LINES:]
                 values = _values(line)
                 told = values if "error" in values else told
+                answer = values.get("answer", answer)
             code = process.wait()
         finally:
             if process.poll() is None:
@@ -82,11 +111,11 @@ def run_child(request: dict[str, Any]) -> dict[str, Any]:
     hint = str(told.get("hint", ""))
     return {
         "code": code, "error": problem, "hint": hint, "host": host,
-        "lines": [*lines, *said][-LAST_LINES:],
+        "lines": [*lines, *said][-LAST_LINES:], "answer": answer, "refused": code == OTHER_CODE,
     }  # fmt: skip
 
 
-def _command(request: dict[str, Any]) -> list[str]:
+def _command(request: dict[str, Any], host: str) -> list[str]:
     """Return the command line of the child.
 
     Raises
@@ -99,19 +128,19 @@ def _command(request: dict[str, Any]) -> list[str]:
         shared = os.environ.get(SHARED_VARIABLE, "")
         if not shared:
             raise OSError(
-                f"{SHARED_VARIABLE} is not set on this computer: it names the shared folder."
+                f"{SHARED_VARIABLE} is not set on {host}: it names the shared folder there."
             )
         folder = Path(shared) / folder
     if not folder.is_dir():
-        raise OSError(f"This computer does not see {folder}.")
+        raise OSError(f"{host} does not see {folder}.")
     arguments = json.dumps({**request["arguments"], "out": str(folder)})
-    return [*(request["command"] or _own_command()), request["module"], arguments]
+    return [*(request["command"] or _own_command(host)), request["module"], arguments]
 
 
-def _own_command() -> list[str]:
+def _own_command(host: str) -> list[str]:
     entry = os.environ.get(ENTRY_VARIABLE, "")
     if not Path(entry).is_file():
-        raise OSError(f"{ENTRY_VARIABLE} is not set on this computer: it names the add-on's entry.")
+        raise OSError(f"{ENTRY_VARIABLE} is not set on {host}: it names the add-on's entry there.")
     packages = os.environ.get(PACKAGES_VARIABLE, "")
     options = ["-X", f"gwrap_caller={os.getpid()}:{_start_ticks()}"]
     options += ["-X", f"gwrap_packages={packages}"] if packages else []

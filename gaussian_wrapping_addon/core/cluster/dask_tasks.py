@@ -6,6 +6,8 @@ Names and results travel over the network, data over the folder that all compute
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import logging
 import os
 import time
@@ -17,7 +19,7 @@ from ..errors import WorkerError
 from ..processes.worker_extras import load_extra
 from ..settings.farm import LOCAL
 from . import child
-from .addresses import checked_address
+from .addresses import scheduler_address
 from .certificates import CA_NAME, CERTIFICATE_NAME, KEY_NAME, checked_folder
 
 if TYPE_CHECKING:
@@ -32,8 +34,13 @@ CONNECT_S = 15.0
 KILLED_WORKERS = 2
 """Dask gives a task up that has taken more workers than this with it."""
 _POLL_S = 0.05
+_LOOK_S = 5.0
+"""How often it is looked whether workers are still there."""
+_NONE_S = 60.0
+"""Without any worker of this computer for so long, none will come: starting one takes seconds."""
 _CLOSE_S = 5.0
 _LOST = ("cancelled", "lost")
+_CONNECTED = ("running", "connecting", "newly-created")
 
 
 class FarmLostError(WorkerError):
@@ -51,6 +58,15 @@ class Ended:
     error: str = ""
     hint: str = ""
     host: str = ""
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """A child that some workers are asked for only, as others have refused."""
+
+    key: str
+    request: dict[str, Any]
+    workers: frozenset[str]
 
 
 class DaskTasks:
@@ -76,7 +92,7 @@ class DaskTasks:
     """
 
     def __init__(self, address: str, processes: int, certificates: str = "") -> None:
-        self._address = checked_address(address)
+        self._address = address if address == LOCAL else str(scheduler_address(address))
         load_extra("farm", "Several processes or computers")
         import cloudpickle
         import dask
@@ -85,6 +101,9 @@ class DaskTasks:
         cloudpickle.register_pickle_by_value(child)
         self._run = child.sendable()
         self._futures: dict[str, Future] = {}
+        self._refusing: set[str] = set()
+        self._bound: dict[str, _Bound] = {}
+        self._looked_s = self._seen_s = time.monotonic()
         self._cluster: LocalCluster | None = None
         self._processes = processes
         dask.config.set(
@@ -102,27 +121,28 @@ class DaskTasks:
                 host="127.0.0.1", dashboard_address=HTTP, scheduler_kwargs={"dashboard": False},
                 worker_dashboard_address=HTTP,
             )  # fmt: skip
+        security = security_of(self._address, certificates)
+        if self._cluster is None:
+            asyncio.run(check_scheduler(self._address, security))
         try:
             self._client: Client = Client(
-                target, timeout=CONNECT_S, set_as_default=False,
-                security=security_of(self._address, certificates),
-            )  # fmt: skip
+                target, timeout=CONNECT_S, set_as_default=False, security=security
+            )
         except (OSError, TimeoutError) as error:
-            raise WorkerError(
-                f"No Dask scheduler answers at {self._address} ({error or 'no answer'}).",
-                "Start one there: batch.py farm scheduler. Both sides need the same certificates.",
-            ) from None
+            raise no_scheduler(self._address, error) from None
 
     @property
     def slots(self) -> int:
-        """How many children may run at a time; at least one, as workers may still come."""
+        """How many children may run at a time; at least one, as workers may still come.
+
+        Workers that refuse do not count, while there are others.
+        """
         if self._cluster is not None:
             return self._processes
-        workers = self._client.scheduler_info(n_workers=-1).get("workers", {})
-        return max(1, sum(int(worker["nthreads"]) for worker in workers.values()))
+        return max(1, sum(int(worker["nthreads"]) for worker in self._fit().values()))
 
     def submit(self, name: str, key: str, request: dict[str, Any]) -> None:
-        """Have a child run somewhere (see :func:`.child.run_child`).
+        """Have a child run somewhere (see :func:`.child.run_child`), not where one was refused.
 
         Parameters
         ----------
@@ -130,8 +150,36 @@ class DaskTasks:
             By which it is found again.
         key : str
             Unique: by it the scheduler knows the task.
+
+        Raises
+        ------
+        FarmLostError
+            The scheduler is gone.
         """
-        self._futures[name] = self._client.submit(self._run, request, key=key, pure=False)
+        if self._client.status not in _CONNECTED:
+            raise self._lost()
+        fit = self._fit().keys() if self._refusing else set[str]()
+        if fit and fit.isdisjoint(self._refusing):
+            self._bound[name] = _Bound(key, request, frozenset(fit))
+        self._send(name, key, request)
+
+    def _send(self, name: str, key: str, request: dict[str, Any]) -> None:
+        bound = self._bound.get(name)
+        self._futures[name] = self._client.submit(
+            self._run, request, key=key, pure=False,
+            workers=None if bound is None else sorted(bound.workers),
+        )  # fmt: skip
+
+    def _workers(self) -> dict[str, Any]:
+        """Return what the scheduler knows of its workers, by address."""
+        with contextlib.suppress(OSError):  # no connection now: :meth:`ended` tells if it is lost
+            return dict(self._client.scheduler_info(n_workers=-1).get("workers", {}))
+        return {}
+
+    def _fit(self) -> dict[str, Any]:
+        """Return the workers that have not refused; all, if all have."""
+        found = self._workers()
+        return {k: v for k, v in found.items() if k not in self._refusing} or found
 
     def ended(self, seconds: float) -> list[Ended]:
         """Return which children have ended; wait at most so long for the first.
@@ -146,16 +194,46 @@ class DaskTasks:
             found = [name for name, future in self._futures.items() if future.done()]
             if found:
                 return [self._take(name) for name in found]
-            if self._client.status not in ("running", "connecting", "newly-created"):
+            if self._client.status not in _CONNECTED:
                 raise self._lost()
+            self._look_after_workers()
             if time.monotonic() >= until_s:
                 return []
             time.sleep(_POLL_S)
+
+    def _look_after_workers(self) -> None:
+        """Submit for any worker what waits for some that are gone: Dask would wait for ever.
+
+        Raises
+        ------
+        FarmLostError
+            A cluster of this computer has no workers any more: Dask starts one again that dies at
+            work, and gives up one that dies while it starts.
+        """
+        now_s = time.monotonic()
+        watched = self._bound or self._cluster is not None
+        if not self._futures or not watched or now_s - self._looked_s < _LOOK_S:
+            return
+        self._looked_s = now_s
+        alive = self._workers()
+        if alive:
+            self._seen_s = now_s
+        elif self._cluster is not None and now_s - self._seen_s > _NONE_S:
+            raise FarmLostError(
+                "All processes that run parts on this computer have ended.",
+                "Resume: parts that are done stay. If it happens again, use fewer processes.",
+            )
+        lonely = [name for name, bound in self._bound.items() if bound.workers.isdisjoint(alive)]
+        for name in lonely if alive else ():
+            bound = self._bound.pop(name)
+            self._client.cancel([self._futures.pop(name)])
+            self._send(name, f"{bound.key}-anywhere", bound.request)
 
     def _take(self, name: str) -> Ended:
         from distributed.scheduler import KilledWorker
 
         future = self._futures.pop(name)
+        self._bound.pop(name, None)
         if future.status in _LOST:
             raise self._lost()
         try:
@@ -168,6 +246,10 @@ class DaskTasks:
             )  # fmt: skip
         except Exception as error:  # whatever a worker raises arrives here
             return Ended(name, 2, f"{type(error).__name__}: {error}")
+        if result.get("refused"):
+            with contextlib.suppress(OSError):  # the scheduler is gone: said elsewhere
+                for workers in self._client.who_has([future]).values():
+                    self._refusing.update(workers)
         texts = [str(result.get(key, "")) for key in ("error", "hint", "host")]
         return Ended(name, int(result.get("code", 2)), *texts)
 
@@ -191,6 +273,37 @@ class DaskTasks:
                 self._cluster.close(timeout=_CLOSE_S)
         except Exception as error:  # a cluster that is gone already
             _logger.warning("the Dask cluster did not close: %s", error)
+
+
+async def check_scheduler(address: str, security: Any) -> None:
+    """Ask a scheduler for its name: a client would wait for ever for one that accepts and hangs.
+
+    Parameters
+    ----------
+    security : distributed.Security or None
+        See :func:`security_of`.
+
+    Raises
+    ------
+    WorkerError
+        It does not answer.
+    """
+    from distributed.core import rpc
+
+    arguments = {} if security is None else security.get_connection_args("client")
+    try:
+        async with asyncio.timeout(CONNECT_S), rpc(address, connection_args=arguments) as scheduler:
+            await scheduler.identity(n_workers=0)
+    except (OSError, TimeoutError) as error:
+        raise no_scheduler(address, error) from None
+
+
+def no_scheduler(address: str, error: Exception) -> WorkerError:
+    """Return the error where no Dask scheduler answers at an address."""
+    return WorkerError(
+        f"No Dask scheduler answers at {address} ({str(error) or 'no answer'}).",
+        "Start one there: batch.py farm scheduler. Both sides need the same certificates.",
+    )
 
 
 def request_of(

@@ -1,40 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Addresses of a farm's manager: scheme, host and port."""
+"""Addresses of a Flamenco Manager."""
 
 from __future__ import annotations
 
-import ipaddress
 import re
-from dataclasses import dataclass
 from urllib.parse import urlsplit
 
+from ..cluster.addresses import Address
 from ..errors import UsageError
 
 _HOST = re.compile(r"[A-Za-z0-9._:%-]{1,253}")
 _PORTS = {"http": 80, "https": 443}
 _EXAMPLE = "Give scheme, computer and port, such as http://flamenco.local:8080."
 _SHOWN_CHARACTERS = 100
-
-
-@dataclass(frozen=True)
-class Address:
-    """Scheme, host and port."""
-
-    scheme: str
-    host: str
-    port: int
-
-    def __str__(self) -> str:
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{self.scheme}://{host}:{self.port}"
-
-    @property
-    def is_this_computer(self) -> bool:
-        """Whether requests do not leave this computer."""
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"
 
 
 def parse_address(text: str) -> Address:

@@ -12,13 +12,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from .. import limits
-from ..errors import ParseError, WrapError
-from ..files import read_json
+from ..errors import WrapError
 from ..jobs.parts.graph import PARTS_NAME, PartsGraph, read_parts
-from ..jobs.parts.part_state import STATES_FOLDER
+from ..jobs.parts.part_state import STATES_FOLDER, PartState, read_state
 from ..regular_files import is_real_folder
 
 SILENT_S = 180.0
@@ -30,21 +27,6 @@ DONE, RUNNING, FAILED, LEFT = "done", "running", "failed", "left"
 COLUMNS = (DONE, RUNNING, FAILED, LEFT)
 
 _COLUMN = {"DONE": DONE, "RUNNING": RUNNING, "FAILED": FAILED}
-
-
-@dataclass(frozen=True)
-class PartState:
-    """What ``parts/NAME.json`` says."""
-
-    column: str
-    """One of :data:`COLUMNS`, but for silent parts."""
-    place: str = ""
-    """Name of the computer."""
-    heartbeat_s: float = 0.0
-    """Unix time of the last sign of life, by that computer's clock."""
-    message: str = ""
-    error: str = ""
-    hint: str = ""
 
 
 @dataclass(frozen=True)
@@ -112,7 +94,7 @@ class PartReader:
             row[COLUMNS.index(column)] += 1
             if state is not None and column == FAILED:
                 words = f"{state.error} {state.hint}".strip() or state.message
-                failed.append(FailedPart(part.name, state.place, words))
+                failed.append(FailedPart(part.name, state.host, words[:MAX_TEXT_CHARACTERS]))
         rows = tuple((kind, (row[0], row[1], row[2], row[3])) for kind, row in counts.items())
         return PartBoard(rows, tuple(failed))
 
@@ -146,7 +128,7 @@ class PartReader:
                 if before is not None and before[0] == stamp:
                     known[name] = before
                     continue
-                state = _read_state(Path(entry.path))
+                state = read_state(self.root, name)
                 if state is not None:
                     known[name] = (stamp, state)
                 elif before is not None:
@@ -158,41 +140,7 @@ class PartReader:
 def _column_now(state: PartState | None, now_s: float) -> str:
     if state is None:
         return LEFT
-    if state.column == RUNNING and now_s - state.heartbeat_s > SILENT_S:
+    column = _COLUMN[state.state]
+    if column == RUNNING and now_s - state.heartbeat_s > SILENT_S:
         return LEFT  # another computer will run it
-    return state.column
-
-
-def _read_state(path: Path) -> PartState | None:
-    """Return a part's state; None where the file is damaged or not to be read now."""
-    try:
-        values = read_json(path, most_bytes=limits.MAX_PART_STATE_BYTES)
-    except (OSError, ParseError):
-        return None
-    if not isinstance(values, dict):
-        return None
-    column = _COLUMN.get(_text(values, "state"))
-    if column is None:
-        return None
-    return PartState(
-        column,
-        _text(values, "place").split(" ")[0],
-        _number(values, "heartbeat_s"),
-        _text(values, "message"),
-        _text(values, "error"),
-        _text(values, "hint"),
-    )
-
-
-def _text(values: dict[str, Any], key: str) -> str:
-    found = values.get(key)
-    return found[:MAX_TEXT_CHARACTERS] if isinstance(found, str) else ""
-
-
-def _number(values: dict[str, Any], key: str) -> float:
-    found = values.get(key)
-    number = isinstance(found, int | float) and not isinstance(found, bool)
-    try:
-        return float(found) if number else 0.0  # type: ignore[arg-type]
-    except OverflowError:
-        return 0.0
+    return column

@@ -192,17 +192,21 @@ def _points_along_rays(
     random: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``wanted`` additional points with colours in [0, 1], from pixels of the photos."""
-    views = [load_photo(i) for i in view_indices]
-    views = [view for view in views if view[2] is None or view[2].any()]
+    views, cameras = [], []
+    for index in view_indices:  # twice, as hundreds of photos do not fit into memory
+        camera, _, mask = load_photo(index)
+        if mask is None or mask.any():
+            views.append(index)
+            cameras.append(camera)
     if not views:
         raise DatasetError("The masks exclude all pixels of all photos.", "Check the masks.")
-    cameras = [camera for camera, _, _ in views]
     share = np.full(len(views), wanted // len(views))
     share[: wanted - int(share.sum())] += 1
     found_points, found_colors = [], []
-    for (camera, photo, mask), count in zip(views, share.tolist(), strict=True):
+    for index, count in zip(views, share.tolist(), strict=True):
         if count == 0:
             continue
+        camera, photo, mask = load_photo(index)
         allowed = np.arange(photo.shape[0] * photo.shape[1])
         if mask is not None:
             allowed = np.nonzero(mask.reshape(-1))[0]

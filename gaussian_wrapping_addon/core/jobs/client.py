@@ -32,10 +32,10 @@ from ..processes.spawn import kill_group, spawn
 from ..processes.worker_environment import ready_worker
 from ..processes.worker_requirements import not_started
 from ..regular_files import open_regular, touch_regular
-from .stages.oom_retry import killed_hint, killed_mesh_hint
 from .store.job_file import JobFile, read_job, reject_region_conflicts, write_job
 from .store.job_folder import FOREIGN_LOCK_HINT, JobFolder, JobStatus
 from .store.rollback import save_rollback
+from .training.oom_retry import killed_hint, killed_mesh_hint
 
 WORKER_MODULE = "jobs.worker"
 PYTHON_VARIABLE = "GAUSSIAN_WRAPPING_PYTHON"

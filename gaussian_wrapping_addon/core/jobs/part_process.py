@@ -20,9 +20,10 @@ from types import FrameType
 
 from .. import limits
 from ..devices import choose_device
-from ..errors import Cancelled, UsageError, WorkerError, WrapError
+from ..errors import EXIT_RESOURCES, Cancelled, UsageError, WorkerError, WrapError
 from ..files import seconds_since_written
 from ..kernels.parallel import default_threads
+from ..meshing.tiles.kinds import TILE_KINDS
 from ..processes.helper_process import emit, kill_helpers
 from ..processes.parent_death import end_with_parent
 from ..processes.process_identity import Caller
@@ -40,9 +41,10 @@ from .parts.exit_codes import (
 from .parts.graph import Part, PartsGraph, read_parts
 from .parts.lease import PartLease
 from .parts.part_runner import PartResult, PartRunner
-from .parts.part_state import PartState, read_state, states_folder
+from .parts.part_state import STATES_FOLDER, read_state, states_folder
 from .parts.planning import plan_hash
 from .parts.walk import HERE
+from .stages.region_meshing import TILES_FOLDER
 from .store.job_file import JobFile, read_job
 from .store.job_folder import JobFolder, JobStatus
 from .store.rollback import discard_rollback
@@ -52,6 +54,9 @@ _logger = logging.getLogger(__name__)
 TELL_EVERY_S = 30.0
 """Farms take a task that says nothing for minutes for dead."""
 POLL_S = 1.0
+MANY = frozenset((STATES_FOLDER, TILES_FOLDER))
+"""Folders with files of every tile. A part of one tile does not look for links among them all:
+whatever opens one of their files refuses links, and what replaces one replaces the link."""
 
 
 def main(arguments: list[str]) -> int:
@@ -73,7 +78,7 @@ def main(arguments: list[str]) -> int:
 def _run(folder: JobFolder, request: dict[str, object]) -> int:
     if not folder.is_job():
         raise UsageError(f"{folder.root} is not a job folder.", "Give the --out of a job.")
-    folder.check_entries()
+    folder.check_entries(but=MANY)
     graph = read_parts(folder.root)
     if graph.code != code_version():
         emit(
@@ -86,6 +91,8 @@ def _run(folder: JobFolder, request: dict[str, object]) -> int:
     if plan_hash(job) != graph.plan:
         raise UsageError(f"{folder.root} was planned for another job.", "Plan it again: parts DIR.")
     part = graph.part(str(request["part"]))
+    if part.kind not in TILE_KINDS:
+        folder.check_entries()
     driven = bool(request["driven"])
     if _was_done(folder, graph, part):
         return DONE
@@ -201,6 +208,7 @@ def _hold(
             emit(line=f"part {part.name} was done by another process")
             return DONE
         result = _work(folder, job, graph, part, request, lease, watch)
+        state = lease.finish("DONE", fraction=1.0, exit_code=DONE, outputs=result.outputs)
     except Cancelled as cancelled:
         reason = watch.reason()
         code = MAY_WORK_ELSEWHERE if reason else CANCELLED
@@ -218,13 +226,12 @@ def _hold(
         return code
     finally:
         ended.set()
-    state = lease.finish("DONE", fraction=1.0, exit_code=DONE, outputs=result.outputs)
     emit(line=f"part {part.name} is done, {state.seconds:.0f} s")
     return DONE
 
 
 def _code_of(job_code: int) -> int:
-    return MAY_WORK_ELSEWHERE if job_code == 4 else NEVER
+    return MAY_WORK_ELSEWHERE if job_code == EXIT_RESOURCES else NEVER
 
 
 def _work(
@@ -240,10 +247,11 @@ def _work(
     wanted = str(request["device"] or job.settings.device)
     device = choose_device("cpu" if job.command == "bake" else wanted)
     _logger.info("part %s, device: %s", part.name, device.sentence())
+    # Only the last part tells how long the job took, and reads the states of all for it.
+    begun = begun_s(folder, graph) if part.kind in HERE else time.time()
     runner = PartRunner(
-        folder, job, lambda: graph, threads=threads, device=device,
-        begun_s=begun_s(folder, graph), is_alone=False,
-    )  # fmt: skip
+        folder, job, lambda: graph, threads=threads, device=device, begun_s=begun, is_alone=False
+    )
     return runner.run(part, Progress(part.kind, lease.event, watch.cancelled))
 
 
@@ -251,7 +259,7 @@ def begun_s(folder: JobFolder, graph: PartsGraph) -> float:
     """Return when the first part of a plan was begun; now, if none was."""
     begun = [time.time()]
     for path in states_folder(folder.root).glob("*.json"):
-        state: PartState | None = read_state(folder.root, path.stem)
+        state = read_state(folder.root, path.stem)
         if state is not None and state.plan == graph.plan:
             begun.append(state.begun_s)
     return min(begun)

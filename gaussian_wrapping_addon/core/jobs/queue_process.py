@@ -11,63 +11,139 @@ from __future__ import annotations
 import json
 import signal
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from .. import limits
-from ..cluster.dask_tasks import DaskTasks, request_of
-from ..errors import EXIT_CANCELLED, EXIT_DONE, EXIT_RESOURCES, Cancelled, ParseError, WrapError
+from ..cluster.dask_tasks import DaskTasks, Ended, request_of
+from ..errors import (
+    EXIT_CANCELLED,
+    EXIT_DONE,
+    EXIT_OTHER,
+    EXIT_RESOURCES,
+    Cancelled,
+    ParseError,
+    WrapError,
+)
 from ..evaluation.report.text import measured, part
 from ..files import read_json, write_json
 from ..processes.helper_process import child_command, emit
+from ..processes.parent_death import end_with_parent
 from ..processes.process_identity import Caller
 from ..regular_files import touch_regular
 from ..settings.farm import LOCAL
 from . import worker
 from .client import JobClient
+from .failure import failure_of
+from .parts.code_version import code_version
+from .parts.exit_codes import CANCELLED, DONE, MAY_WORK_ELSEWHERE, NEVER, OTHER_CODE
+from .parts.graph import read_parts
+from .parts.planning import plan_hash
+from .store.job_file import read_job
 from .store.job_folder import JobFolder
 
 MODULE = "jobs.queue_process"
 TABLE_NAME = "queue.json"
 MOST_ATTEMPTS = 3
 POLL_S = 0.5
+SHOW_LIFE_S = 5.0
+HELD_S = limits.SILENT_S + 30.0
+"""How long a job that another process holds is waited for: one that a killed queue has left ends
+within seconds here, and on another computer counts as ended after :data:`limits.SILENT_S`."""
+_CODES = {EXIT_DONE: DONE, EXIT_RESOURCES: MAY_WORK_ELSEWHERE, EXIT_CANCELLED: CANCELLED}
+"""What the exit codes of a job mean to who may begin it again; others: never."""
 
 
 def main(arguments: list[str]) -> int:
     """Run the queue of ``arguments = [{"out", "jobs", "computers", ...} as JSON]``.
 
-    With ``{"out", "job"}``, what a Dask worker calls, run that one job.
+    With ``{"out", "job", "code"}``, what a Dask worker calls, run that one job; the exit code is
+    then one of :mod:`.parts.exit_codes`.
     """
     request = json.loads(arguments[0])
-    if "job" in request:
-        return worker.main([str(Path(request["out"]) / request["job"]), "1"])
+    folder = JobFolder(Path(request["out"]))
     try:
-        return _Queue(Path(request["out"]), [str(name) for name in request["jobs"]], request).run()
-    except WrapError as error:
-        emit(error=error.message, hint=error.hint)
-        return error.exit_code
+        if "job" in request:
+            end_with_parent()
+            return _run_job(JobFolder(folder.root / request["job"]), str(request["code"]))
+        folder.lock()
+        try:
+            return _Queue(folder, [str(name) for name in request["jobs"]], request).run()
+        finally:
+            folder.unlock()
+    except (WrapError, OSError) as error:  # such as a disk without room for the table
+        failure = failure_of(error, folder.root)
+        if not failure.is_known:
+            raise
+        emit(error=failure.error, hint=failure.hint)
+        return _CODES.get(failure.code, NEVER) if "job" in request else failure.code
+
+
+def _run_job(folder: JobFolder, code: str) -> int:
+    if code != code_version():
+        emit(
+            error=f"This computer has version {code_version()} of the program, the queue {code}.",
+            hint="Install the same version on all computers.",
+        )
+        return OTHER_CODE
+    caller = Caller()
+    if not _is_free(folder, lambda: caller.ended() or folder.cancel_path.exists()):
+        emit(
+            error=f"Another process is working in {folder.root}.",
+            hint="Wait for it, or cancel it; then give the same command again.",
+        )
+        return MAY_WORK_ELSEWHERE
+    if _is_done(folder):  # by a worker whose computer was lost before it could say so
+        return DONE
+    ended = _CODES.get(worker.main([str(folder.root), "1"]), NEVER)
+    status = folder.read_status()
+    if ended != DONE and status.error:
+        emit(error=status.error, hint=status.hint)
+    return ended
+
+
+def _is_free(folder: JobFolder, is_stopped: Callable[[], bool]) -> bool:
+    """Wait, not for ever, until nobody holds a job; return whether that is so."""
+    until_s = time.monotonic() + HELD_S
+    while folder.locked():
+        if is_stopped() or time.monotonic() > until_s:
+            return False
+        time.sleep(POLL_S)
+    return True
+
+
+def _is_done(folder: JobFolder) -> bool:
+    """Return whether the job that stands in a folder, not an earlier one, is done."""
+    if folder.read_status().state != "DONE" or not folder.result.is_dir():
+        return False
+    try:
+        return read_parts(folder.root).plan == plan_hash(read_job(folder.job_path))
+    except WrapError:
+        return False
 
 
 @dataclass
 class _Queue:
-    """The jobs of a folder."""
+    """The jobs of a folder, which this process holds."""
 
-    root: Path
+    home: JobFolder
     names: list[str]
     request: dict[str, Any]
     stopped: bool = False
     codes: dict[str, int] = field(default_factory=dict)
     errors: dict[str, str] = field(default_factory=dict)
+    _shown_s: float = field(default_factory=time.monotonic)
 
     def run(self) -> int:
         """Run all jobs; return the exit code of the first that failed, 0 if none."""
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._stop)
         self._caller = Caller()
-        left = [name for name in self.names if not self._is_done(name)]
+        left = [name for name in self.names if not _is_done(self._folder(name))]
         for name in self.names:
             if name not in left:
                 self.codes[name] = EXIT_DONE
@@ -88,19 +164,26 @@ class _Queue:
         self.stopped = True
 
     def _is_stopped(self) -> bool:
+        """Return whether to stop; called all the time, it shows that the queue lives."""
+        if time.monotonic() - self._shown_s > SHOW_LIFE_S:
+            self._shown_s = time.monotonic()
+            self.home.show_life()
         self.stopped = self.stopped or self._caller.ended()
         return self.stopped
 
     def _folder(self, name: str) -> JobFolder:
-        return JobFolder(self.root / name)
-
-    def _is_done(self, name: str) -> bool:
-        folder = self._folder(name)
-        return folder.read_status().state == "DONE" and folder.result.is_dir()
+        return JobFolder(self.home.root / name)
 
     def _in_turn(self, names: list[str]) -> Iterator[tuple[str, int, str]]:
         for name in names:
-            client = JobClient.resume(self.root / name)
+            _is_free(self._folder(name), self._is_stopped)
+            if self.stopped:
+                return
+            try:
+                client = JobClient.resume(self._folder(name).root)
+            except WrapError as error:
+                yield name, error.exit_code, str(error)
+                continue
             while (status := client.poll()).active:
                 if self._is_stopped():
                     client.cancel()
@@ -117,40 +200,50 @@ class _Queue:
         )
         command = child_command(MODULE)[:-1] if computers == LOCAL else None
         attempts = dict.fromkeys(names, 0)
+        waiting, running = deque(names), set[str]()
         begun = f"{time.time_ns():x}"
 
         def submit(name: str) -> None:
             attempts[name] += 1
+            running.add(name)
             self._folder(name).cancel_path.unlink(missing_ok=True)
-            request = request_of(self.root, MODULE, {"job": name}, command)
+            arguments = {"job": name, "code": code_version()}
+            request = request_of(self.home.root, MODULE, arguments, command)
             tasks.submit(name, f"job-{name}-{begun}-{attempts[name]}", request)
 
         try:
-            for name in names:
-                submit(name)
-            while attempts:
+            while waiting or running:
                 if self._is_stopped():
-                    for name in attempts:
+                    for name in running:
                         touch_regular(self._folder(name).cancel_path)
                     return
+                while waiting and len(running) < tasks.slots:
+                    submit(waiting.popleft())
                 for end in tasks.ended(POLL_S):
-                    again = end.code < 0 or end.code in (EXIT_RESOURCES, EXIT_CANCELLED)
-                    if again and attempts[end.name] < MOST_ATTEMPTS:
-                        submit(end.name)
+                    running.discard(end.name)
+                    if _may_work(end) and attempts[end.name] < MOST_ATTEMPTS:
+                        waiting.append(end.name)
                         continue
-                    del attempts[end.name]
-                    status = self._folder(end.name).read_status()
-                    failed = status.error or end.error
-                    yield end.name, end.code, f"{failed} {status.hint}".strip()
+                    code = self._exit_code(end)
+                    yield end.name, code, f"{end.error} {end.hint}".strip()
         except Cancelled:
             self.stopped = True
         finally:
             tasks.close(limits.CANCEL_ALONE_S if self.stopped else 0.0)
 
+    def _exit_code(self, end: Ended) -> int:
+        """Return the exit code of a job for people, from how its process ended."""
+        if end.code == DONE:
+            return EXIT_DONE
+        status = self._folder(end.name).read_status()
+        if status.state == "FAILED" and status.exit_code and end.code != OTHER_CODE:
+            return status.exit_code
+        return EXIT_RESOURCES if _may_work(end) else EXIT_OTHER
+
     def _tell(self) -> None:
         """Write the table of results, and say it."""
         rows = [self._row(name) for name in self.names]
-        write_json(self.root / TABLE_NAME, {"version": 1, "jobs": rows})
+        write_json(self.home.root / TABLE_NAME, {"version": 1, "jobs": rows})
         emit(line=f"{'job':24} {'state':8} {'s':>7} {'held out dB':>11} {'faces':>9}")
         for row in rows:
             held_out = "" if row["psnr"] is None else f"{row['psnr']:.2f}"
@@ -179,3 +272,8 @@ class _Queue:
             "faces": int(sum(count or 0 for count in faces)) if faces else None,
             "error": self.errors.get(name, "") if status.state != "DONE" else "",
         }
+
+
+def _may_work(end: Ended) -> bool:
+    """Return whether a job that did not end well may work elsewhere, or if begun again."""
+    return end.code < 0 or end.code in (MAY_WORK_ELSEWHERE, OTHER_CODE, CANCELLED)

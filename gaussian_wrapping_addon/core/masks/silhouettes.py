@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -34,12 +34,11 @@ def silhouettes(
     inside: np.ndarray,
     cameras: Sequence[Camera],
     renderer: Renderer,
-    step: Callable[[int], None],
     *,
     bounds: np.ndarray | None = None,
     threads: int,
-) -> list[np.ndarray]:
-    """Return how much of each pixel shows what is inside, (h, w) float32 in [0, 1] a camera.
+) -> Iterator[np.ndarray]:
+    """Yield how much of each pixel shows what is inside, (h, w) float32 in [0, 1] a camera.
 
     The share is the sum of the blending weights of the Gaussians inside: what stands in front of
     them takes its part of the light, and so does what they let through.
@@ -52,22 +51,17 @@ def silhouettes(
         Gaussians that belong to the object.
     cameras : sequence of Camera
         Scene frame; silhouettes have their size.
-    step : callable
-        Told the number of cameras done; may raise to cancel.
     bounds : (n, 3), optional
         Corners of the regions, scene frame. What is nearer to a camera than half of the way to
         them hides nothing: a short training leaves fog right before single cameras.
     """
     arrays = marked(gaussians, inside)
-    shares = []
-    for index, camera in enumerate(cameras):
-        step(index)
+    for camera in cameras:
         options = RenderOptions(
             depth=False, sh_degree=0, threads=threads, near_z=_near_z(camera, bounds)
         )
         color = renderer.render(arrays, camera, options).color
-        shares.append(np.clip(color[..., 0], 0.0, 1.0))
-    return shares
+        yield np.clip(color[..., 0], 0.0, 1.0)
 
 
 def _near_z(camera: Camera, bounds: np.ndarray | None) -> float:

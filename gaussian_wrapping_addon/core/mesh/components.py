@@ -79,7 +79,11 @@ def extents(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: in
 
 
 def without_floaters(
-    vertices: np.ndarray, faces: np.ndarray, min_share: float, most: int = 0
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    min_share: float,
+    most: int = 0,
+    stand_for: np.ndarray | None = None,
 ) -> FloaterRemoval:
     """Remove components that are small both in area and in length.
 
@@ -89,13 +93,14 @@ def without_floaters(
     removed solid is always small.
 
     Of what is left the ``most`` solids of the largest area stay, with their cavities; 0 for all.
+    ``stand_for`` (f,) is how many faces of a dense mesh each one counts as, 1 without it.
     """
     count, part = face_components(len(vertices), faces)
     volume, area = volumes_and_areas(vertices, faces, part, count)
     length = extents(vertices, faces, part, count)
     keep = area >= min_share * area.max(initial=0.0)
     long = length >= LONG_FACTOR * min_share * length.max(initial=0.0)
-    keep |= long & (np.bincount(part, minlength=count) >= LONG_FACES)
+    keep |= long & (np.bincount(part, stand_for, minlength=count) >= LONG_FACES)
     if most:
         keep &= _largest(vertices, faces, part, np.where(keep, volume, np.nan), area, most)
     removed = float(area[~keep].sum() / max(area.sum(), 1e-300))

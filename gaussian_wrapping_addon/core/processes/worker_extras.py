@@ -68,7 +68,8 @@ EXTRAS = (
         (
             Requirement("cffi", "==2.1.1"), Requirement("click", "==8.5.1"),
             Requirement("cloudpickle", "==3.1.3"), Requirement("cryptography", "==50.0.2"),
-            Requirement("dask", "==2026.8.0"), Requirement("distributed", "==2026.8.0"),
+            Requirement("dask", "==2026.8.0"), Requirement("dask-jobqueue", "==0.9.0"),
+            Requirement("distributed", "==2026.8.0"),
             Requirement("importlib-metadata", "==8.9.0"), Requirement("locket", "==1.0.0"),
             Requirement("msgpack", "==1.2.4"), Requirement("packaging", "==26.4"),
             Requirement("partd", "==1.4.2"), Requirement("psutil", "==7.2.2"),

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,14 +92,16 @@ def save_priors(folder: Path, priors: Mapping[int, DepthPrior], key: str) -> Non
 
 
 def load_priors(
-    folder: Path, cameras: Mapping[int, Camera], key: str
+    folder: Path, cameras: Mapping[int, Camera], key: str, views: Collection[int] | None = None
 ) -> dict[int, DepthPrior] | None:
     """Read what :func:`save_priors` wrote for the same key.
 
     Parameters
     ----------
     cameras : mapping of int to Camera
-        Of the views that priors are wanted for, at the size they were matched at.
+        Of all views that were matched, at the size they were matched at.
+    views : collection of int, optional
+        Those that priors are wanted for; by default all.
 
     Returns
     -------
@@ -107,16 +109,18 @@ def load_priors(
         ``None`` where the file is missing, damaged or of another key: the priors follow from the
         photos and can be made again.
     """
-    names = ["key", *(f"{layer}.{view}" for view in cameras for layer in _LAYERS)]
+    wanted = cameras.keys() if views is None else views
+    names = ["key", *(f"{layer}.{view}" for view in wanted for layer in _LAYERS)]
     pixels = sum(camera.width * camera.height for camera in cameras.values())
-    most_bytes = 4 * len(_LAYERS) * pixels + _MOST_HEADER_BYTES * len(names)
+    entries = 1 + len(_LAYERS) * len(cameras)
+    most_bytes = 4 * len(_LAYERS) * pixels + _MOST_HEADER_BYTES * entries
     try:
         arrays = read_arrays(folder / FILE_NAME, names, most_bytes=most_bytes)
         if str(arrays["key"]) != key:
             return None
         return {
-            view: _prior(camera, [arrays[f"{layer}.{view}"] for layer in _LAYERS])
-            for view, camera in cameras.items()
+            view: _prior(cameras[view], [arrays[f"{layer}.{view}"] for layer in _LAYERS])
+            for view in wanted
         }
     except (ParseError, ValueError):
         return None

@@ -13,18 +13,16 @@ import numpy as np
 import torch
 
 from ..dataset.photo_source import PhotoSource
+from ..dataset.photos.photo_store import decoded_in
 from ..dataset.scene import Scene
 from ..dataset.view_split import FEW_PHOTOS, evenly_spaced, held_out_views, training_views
 from ..errors import Cancelled, DatasetError, WrapError
-from ..gaussians.initialisation import initial_gaussians
 from ..gaussians.model import OrientedGaussians
 from ..kernels.parallel import default_threads
 from ..progress import Progress
 from ..report_warning import ReportWarning
 from ..settings import TrainingSettings
-from ..stereo.depth_maps import matching_divisor
-from ..stereo.depth_priors import DepthPrior, load_priors, priors_of, save_priors
-from .appearance.background import inside_masks
+from ..stereo.depth_priors import DepthPrior
 from .appearance.photo_exposure import Exposure, corrected_for_measuring
 from .backdrop import with_backdrop
 from .cancellation import CancellablePhotos
@@ -32,8 +30,8 @@ from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from .device_recovery import DeviceRecovery
 from .devices.backend import Backend
 from .devices.cpu_backend import CpuBackend
-from .initialisation.dense_start import dense_start, matched_photos, on_planes
 from .initialisation.handover import Handover
+from .initialisation.point_start import PointStart
 from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import Correction, LiveView, held_out_metrics, measure_held_out
@@ -42,9 +40,9 @@ from .poses.posed_photos import PosedPhotos
 from .result import TrainingResult
 from .rounds import Inside, Rounds
 from .schedule import SMALLEST_SIDE_PX, Schedule
-from .selection.exposure_selection import select_exposure
+from .selection.first_decisions import first_decisions
 from .selection.image_size_selection import photo_detail, select_image_size
-from .selection.model_selection import Decision, ModelSelection, decide, select_multi_view
+from .selection.model_selection import Decision
 from .selection.pose_selection import start_poses
 from .state import Snapshot, TrainingState
 
@@ -130,11 +128,12 @@ def train(
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        run = _Trainer(
-            scene, photos, settings, folder, seed, threads, start_splat, inside, progress, backend,
-            handover,
-        )  # fmt: skip
-        return run.run(progress)
+        with decoded_in(photos, folder):
+            run = _Trainer(
+                scene, photos, settings, folder, seed, threads, start_splat, inside, progress,
+                backend, handover,
+            )  # fmt: skip
+            return run.run(progress)
     finally:
         torch.set_num_threads(before)
 
@@ -324,7 +323,7 @@ class _Trainer:
             warnings.append(ReportWarning("few-photos", text, "Take more photos, from all around."))
         decision = None
         if self.start_splat is None:
-            gaussians, decision = self._initial(key, progress)
+            gaussians, decision, self.stepper.priors = self._point_start().gaussians(key, progress)
         else:
             start = start_from_splat(
                 self.start_splat, self.scene, self.photos, self.views, self.settings, progress,
@@ -336,7 +335,10 @@ class _Trainer:
         state.warnings = warnings
         if self.start_splat is not None:
             state.degree = self.settings.sh_degree if self.settings.harmonics != "off" else 0
-        self._select_model(state)
+        state.model_selection, state.exposure = first_decisions(
+            self.scene, self.photos, self.views, self.neighbours, self.settings,
+            self.image_decision, from_splat=self.start_splat is not None,
+        )  # fmt: skip
         if decision is not None:
             state.model_selection = state.model_selection.with_decision(decision)
         state.poses, state.model_selection = start_poses(
@@ -357,36 +359,6 @@ class _Trainer:
         rounds.filter(state)
         return state
 
-    def _initial(self, key: str, progress: Progress) -> tuple[OrientedGaussians, Decision]:
-        """Return the Gaussians at dense or sparse points, and why."""
-        small, scene = self.schedule.divisor(0), self._start_scene()
-        decision = Decision.by_settings("dense_start", "off")
-        if self.settings.dense_start != "off":
-            start = dense_start(
-                scene, self.photos, self.views, self.settings.dense_start, progress.span(0.0, 0.0),
-                side_px=self.settings.match_px, max_gaussians=self.schedule.growth_limit(),
-                sh_degree=self.settings.sh_degree, seed=self.seed, threads=self.threads,
-            )  # fmt: skip
-            if start.gaussians is not None:
-                if self._uses_priors():
-                    self.stepper.priors = start.priors
-                    save_priors(self.folder, start.priors, key)
-                return start.gaussians, start.decision
-            decision = start.decision
-        gaussians = initial_gaussians(
-            scene,
-            self.views,
-            lambda i: (
-                self.photos.camera(i, small),
-                self.photos.photo(i, small),
-                self.photos.mask(i, small),
-            ),
-            max_gaussians=self.schedule.growth_limit(),
-            sh_degree=self.settings.sh_degree,
-            seed=self.seed,
-        )
-        return gaussians, decision
-
     def _finished(
         self, rounds: Rounds, state: TrainingState, progress: Progress
     ) -> OrientedGaussians:
@@ -403,80 +375,22 @@ class _Trainer:
             threads=self.threads, check=progress.check,
         )  # fmt: skip
 
-    def _start_scene(self) -> Scene:
-        """Return the scene with the sparse points that masks do not show to be background."""
-        scene, small = self.scene, self.schedule.divisor(0)
-        if self.settings.mask_mode != "background" or not len(scene.points):
-            return scene
-        kept = inside_masks(
-            scene.points,
-            [self.photos.camera(i, small) for i in self.views],
-            [self.photos.mask(i, small) for i in self.views],
-        )
-        return dataclasses.replace(
-            scene, points=scene.points[kept], point_colors=scene.point_colors[kept]
-        )
-
-    def _uses_priors(self) -> bool:
-        return self.settings.lambda_depth_prior > 0.0 or self.settings.free_views > 0
+    def _point_start(self) -> PointStart:
+        return PointStart(
+            self.scene, self.photos, self.views, self.settings, self.folder,
+            self.schedule.divisor(0), self.schedule.growth_limit(), self.seed, self.threads,
+        )  # fmt: skip
 
     def _saved_priors(
         self, state: TrainingState, key: str, progress: Progress
     ) -> dict[int, DepthPrior]:
-        """Return the confirmed depths of a resumed training; lost ones are made again."""
+        """Return the confirmed depths of a resumed training."""
         if self.handover is not None:
             return dict(self.handover.priors)
-        if not (state.model_selection.chose("dense_start") and self._uses_priors()):
+        start = self._point_start()
+        if not (state.model_selection.chose("dense_start") and start.uses_priors):
             return {}
-        full = [self.photos.camera(view, 1) for view in self.views]
-        divisor = matching_divisor(full, self.settings.match_px)
-        cameras = {view: self.photos.camera(view, divisor) for view in self.views}
-        priors = load_priors(self.folder, cameras, key)
-        if priors is None:
-            _logger.info("the confirmed depths are not there: matching the photos again")
-            scene, quiet = self._start_scene(), progress.span(0.0, 0.0)
-            maps = matched_photos(
-                scene, self.photos, self.views, quiet, side_px=self.settings.match_px,
-                seed=self.seed, threads=self.threads,
-            )  # fmt: skip
-            priors = priors_of(self.views, on_planes(scene, maps, quiet, seed=self.seed))
-            save_priors(self.folder, priors, key)
-        return priors
-
-    def _select_model(self, state: TrainingState) -> None:
-        """Take the decisions that need no training; record those made by settings."""
-        settings = self.settings
-        model_selection = ModelSelection((self.image_decision,))
-        exposure = select_exposure(self.scene, self.photos, self.views)
-        model_selection = model_selection.with_decision(
-            decide("exposure", settings.exposure, exposure.needed, exposure.evidence)
-        )
-        if model_selection.chose("exposure"):
-            count = len(self.scene.views)
-            state.exposure = Exposure(count, self.views, exposure.log_gains)
-        pairs = [self.neighbours[view] for view in self.views]
-        model_selection = model_selection.with_decision(
-            select_multi_view(pairs, settings.multi_view)
-        )
-        if settings.harmonics != "auto" or settings.sh_degree == 0 or self.start_splat:
-            degree = settings.sh_degree if settings.harmonics != "off" else 0
-            evidence = "Not tried: " + (
-                "the splat has harmonics of its own."
-                if self.start_splat
-                else "decided by the settings."
-            )
-            model_selection = model_selection.with_decision(
-                Decision(
-                    "harmonics", settings.harmonics, f"degree {degree}", evidence, measured=False
-                )
-            )
-        if settings.wrapping != "auto":
-            model_selection = model_selection.with_decision(
-                Decision.by_settings("wrapping", settings.wrapping)
-            )
-        if settings.growth == "off":
-            model_selection = model_selection.with_decision(Decision.by_settings("growth", "off"))
-        state.model_selection = model_selection
+        return start.saved_priors(key, progress)
 
     def _restart(self, state: TrainingState, snapshot: Snapshot) -> TrainingState:
         """Restore the last snapshot with lower rates and another view order, at most once."""

@@ -18,7 +18,10 @@ _endings = Lane()
 
 
 def run_child(
-    command: list[str], on_start: Callable[[subprocess.Popen[bytes]], bool], deadline_s: float
+    command: list[str],
+    on_start: Callable[[subprocess.Popen[bytes]], bool],
+    deadline_s: float,
+    late: WorkerError | None = None,
 ) -> tuple[list[dict[str, Any]], str]:
     """Run a child to its end; touches nothing of Blender.
 
@@ -26,6 +29,8 @@ def run_child(
     ----------
     on_start : callable
         Receives the process; returns false if the estimate is no longer wanted, which ends it.
+    late : WorkerError, optional
+        Raised where it takes too long, in place of the error of an estimate.
 
     Returns
     -------
@@ -49,7 +54,8 @@ def run_child(
         output, words = process.communicate(timeout=deadline_s)
     except subprocess.TimeoutExpired:
         kill_group(process)
-        raise WorkerError("The estimate took too long.", "Start the job without it.") from None
+        too_long = WorkerError("The estimate took too long.", "Start the job without it.")
+        raise late or too_long from None
     found = []
     for line in output.decode(errors="replace").splitlines():
         try:
@@ -75,9 +81,11 @@ class Child:
         self._guard = threading.Lock()
         self._wanted = True
 
-    def run(self, command: list[str], deadline_s: float) -> tuple[list[dict[str, Any]], str]:
+    def run(
+        self, command: list[str], deadline_s: float, late: WorkerError | None = None
+    ) -> tuple[list[dict[str, Any]], str]:
         """Run a child to its end, in a thread; see :func:`run_child`."""
-        return run_child(command, self._on_start, deadline_s)
+        return run_child(command, self._on_start, deadline_s, late)
 
     def _on_start(self, process: subprocess.Popen[bytes]) -> bool:
         with self._guard:

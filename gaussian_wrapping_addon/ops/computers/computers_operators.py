@@ -13,6 +13,7 @@ from ..common.addon import properties_of
 from ..common.error_reporting import OperatorResult, ReportsErrors
 from ..jobs import panel_state
 from ..jobs.job_guards import no_job_runs
+from ..worker.preferred_worker import worker_choice
 from . import farm_actions, farm_calls, part_watch
 
 
@@ -34,7 +35,7 @@ def _is_submitted(cls: type[bpy.types.Operator], context: bpy.types.Context) -> 
 class GWRAP_OT_test_computers(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.test_computers"
     bl_label = "Test"
-    bl_description = "Ask in the background whether something answers at this address"
+    bl_description = "Ask in the background whether these computers can run jobs"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -44,7 +45,7 @@ class GWRAP_OT_test_computers(ReportsErrors, bpy.types.Operator):
         return _no_request_runs(cls)
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        farm_actions.test_computers(context.scene)
+        farm_actions.test_computers(context.scene, worker_choice(context))
         return {"FINISHED"}
 
 

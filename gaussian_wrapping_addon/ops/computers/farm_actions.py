@@ -8,14 +8,14 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
+from ...core.cluster.addresses import Address, scheduler_address
 from ...core.errors import UsageError
-from ...core.farm.address import Address, parse_address
+from ...core.farm.address import parse_address
 from ...core.farm.flamenco import job_state
 from ...core.farm.flamenco.job_record import read_record, submitted
 from ...core.farm.flamenco.job_state import FarmState
 from ...core.farm.flamenco.manager import Manager
 from ...core.farm.flamenco.submission import Choices, Farm, Submission, ask_farm, submit
-from ...core.farm.reachable import check_reachable, scheduler_address
 from ...core.files import real_path
 from ...core.jobs.client import prepare_job
 from ...core.jobs.parts.planning import plan_if_missing
@@ -28,7 +28,8 @@ from ..jobs.job_actions import refuse_running
 from ..jobs.panel_settings import job_settings
 from ..jobs.scene_folders import output_of, source_of
 from ..jobs.watched_jobs import key_of
-from . import farm_calls, part_watch
+from ..worker.preferred_worker import WorkerChoice
+from . import dask_test, farm_calls, part_watch
 
 _folders: dict[int, str] = {}
 """Job folders submitted in this session, by the session uid of their scene: undo keeps these."""
@@ -70,17 +71,19 @@ def manager_of(scene: bpy.types.Scene) -> Manager:
     return Manager(address)
 
 
-def test_computers(scene: bpy.types.Scene) -> None:
-    """Ask in the background whether the chosen computers can be used."""
+def test_computers(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
+    """Ask in the background whether the chosen computers can be used.
+
+    Raises
+    ------
+    WrapError
+        The address or a folder cannot be used, or no worker is set up on this computer.
+    """
     choices = properties_of(scene).computers
     if choices.kind == "DASK":
         address = scheduler_address(choices.dask_address)
         _require_access(address)
-        farm_calls.call(
-            choices.dask_address,
-            lambda: check_reachable(address),
-            lambda _: (tr("Something accepts connections at {address}.", address=address),),
-        )
+        dask_test.start(scene, address, choice)
         return
     manager, chosen = manager_of(scene), farm_choices(scene)
     farm_calls.call(choices.flamenco_address, lambda: ask_farm(manager, chosen), _found)

@@ -25,6 +25,8 @@ class Outcome:
     good: bool
     lines: tuple[str, ...]
     """Sentences: what was found, or what was wrong and the next step."""
+    rows: tuple[tuple[bool, str], ...] = ()
+    """Of each computer: whether it can be used, and a sentence."""
 
 
 @dataclass
@@ -69,7 +71,10 @@ def keep_state(folder: str, state: FarmState | None) -> None:
 
 
 def call(
-    about: str, request: Callable[[], Result], then: Callable[[Result], tuple[str, ...]]
+    about: str,
+    request: Callable[[], Result],
+    then: Callable[[Result], tuple[str, ...] | Outcome],
+    end: Callable[[], None] | None = None,
 ) -> None:
     """Run a request in the thread.
 
@@ -80,13 +85,16 @@ def call(
     request : callable
         Runs in the thread; touches nothing of Blender.
     then : callable
-        Receives the result on the main thread; returns sentences on it.
+        Receives the result on the main thread; returns sentences on it, or an outcome.
+    end : callable, optional
+        Ends what the request waits for, where nobody waits for it any more.
     """
     _lane.cancel()
     _memory.outcome, _memory.about = None, about
 
     def keep(result: Result) -> None:
-        _end(Outcome(True, then(result)))
+        found = then(result)
+        _end(found if isinstance(found, Outcome) else Outcome(True, found))
 
     def keep_failure(error: Exception) -> None:
         if not isinstance(error, WrapError | OSError):
@@ -94,7 +102,7 @@ def call(
         lines = (error.message, error.hint) if isinstance(error, WrapError) else (str(error),)
         _end(Outcome(False, tuple(filter(None, lines))))
 
-    _lane.submit(request, keep, failed=keep_failure)
+    _lane.submit(request, keep, failed=keep_failure, end=end)
 
 
 def stop() -> None:

@@ -21,7 +21,7 @@ from ..common import tags
 from ..common.addon import properties_of
 from ..common.background import Lane, Task
 from . import watched_jobs
-from .live_preview import EVERY_S, Stamp, newest_picture
+from .live_preview import EVERY_S, WHOLE_TRAININGS, Stamp, newest_picture
 
 _logger = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ def stop() -> None:
 
 def _read(folder: Path, known: Stamp | None) -> LivePoints | None:
     """Return the newest points, None if there are no new ones; runs in a thread."""
-    stamp = newest_picture(folder, POINTS_FILE)
+    stamp = newest_picture(folder, POINTS_FILE, WHOLE_TRAININGS)
     if stamp is None or stamp == known or stamp[2] > MAX_BYTES:
         return None
     positions, colors = parse_points(read_bounded(Path(stamp[0]), MAX_BYTES))

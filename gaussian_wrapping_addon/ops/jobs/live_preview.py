@@ -24,6 +24,9 @@ from ..common.background import Lane, Task
 _logger = logging.getLogger(__name__)
 
 PICTURE = "preview-training.npy"
+WHOLE_TRAININGS = ("train-*", "blocks-*/coarse-*")
+"""Folders of trainings of the whole scene, in that of the stages."""
+ALL_TRAININGS = (*WHOLE_TRAININGS, "blocks-*/block-*")
 EVERY_S = 3.0
 """Interval between two searches of the folder."""
 MAX_BYTES = 8 * 2**20
@@ -66,10 +69,12 @@ def icons_of(folder: str) -> tuple[int, ...]:
     return shown.icons if shown else ()
 
 
-def newest_picture(folder: Path, name: str = PICTURE) -> Stamp | None:
+def newest_picture(
+    folder: Path, name: str = PICTURE, places: tuple[str, ...] = ALL_TRAININGS
+) -> Stamp | None:
     """Return the image of the running training, or another of its files, or None."""
     found = []
-    for path in (folder / "stages").glob(f"train-*/{name}"):
+    for path in (p for place in places for p in (folder / "stages").glob(f"{place}/{name}")):
         try:
             state = path.stat()
             if path.is_symlink() or (path.parent / "done.json").exists():

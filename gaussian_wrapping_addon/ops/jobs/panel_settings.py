@@ -9,8 +9,8 @@ from typing import Any
 
 import bpy
 
+from ...core.cluster.addresses import scheduler_address
 from ...core.errors import UsageError
-from ...core.farm.reachable import scheduler_address
 from ...core.files import real_path
 from ...core.settings import Declaration, JobSettings, declarations, preset, with_values
 from ...core.settings.farm import LOCAL
@@ -103,7 +103,8 @@ def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
     Raises
     ------
     UsageError
-        The address of the Dask scheduler is none.
+        The address of the Dask scheduler is none, or not encrypted; the folder of the certificates
+        is on another computer.
     """
     properties = properties_of(scene)
     choices, processes = properties.computers, properties.processes
@@ -112,10 +113,22 @@ def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
         where = str(scheduler_address(choices.dask_address))
     elif choices.kind == "THIS" and processes > 1:
         where = LOCAL
-    certificates = bpy.path.abspath(choices.certificates) if choices.certificates else ""
+    certificates = certificates_of(scene)
     if where != LOCAL:
         processes = JobSettings().processes
     return {"computers": where, "processes": processes, "certificates": certificates}
+
+
+def certificates_of(scene: bpy.types.Scene) -> str:
+    """Return the folder of the farm's certificates; ``""`` leaves it to the environment.
+
+    Raises
+    ------
+    UsageError
+        It is on another computer.
+    """
+    stored = properties_of(scene).computers.certificates
+    return str(_local(stored, "folder of certificates")) if stored else ""
 
 
 def meshing_choices(scene: bpy.types.Scene, world_per_blender: float) -> dict[str, Any]:

@@ -21,12 +21,13 @@ from ..common.text import characters_of, wrapped_label
 
 _KINDS: Final = {"THIS": "Local", "DASK": "Dask", "FLAMENCO": "Flamenco"}
 _PARTS: Final = {
-    "frames": "Frames", "cameras": "Cameras", "masks": "Masks", "train": "Train", "plan": "Plan",
-    "points": "Points", "gather": "Gather", "faces": "Faces", "mesh": "Mesh",
-    "texture": "Texture", "export": "Export", "bake": "Bake",
+    "frames": "Frames", "cameras": "Cameras", "masks": "Masks", "coarse": "Coarse Training",
+    "block": "Blocks", "train": "Train", "plan": "Plan", "points": "Points", "gather": "Gather",
+    "faces": "Faces", "mesh": "Mesh", "texture": "Texture", "export": "Export", "bake": "Bake",
 }  # fmt: skip
 """Names of the kinds of parts."""
 _NOW: Final = ("{count} running", "{count} failed")
+_ICONS: Final = {True: "CHECKMARK", False: "ERROR"}
 _MAX_FAILED: Final = 4
 """Failed parts that are drawn; the others are counted above."""
 _MAX_LINES: Final = 3
@@ -124,10 +125,12 @@ def _draw_outcome(layout: Any, context: bpy.types.Context, about: str) -> None:
     outcome = farm_calls.outcome(about)
     if outcome is None:
         return
-    icon = "CHECKMARK" if outcome.good else "ERROR"
+    icon = _ICONS[outcome.good]
     for line in outcome.lines:
         wrapped_label(layout, line, characters, icon=icon)
         icon = "BLANK1"
+    for is_good, line in outcome.rows:
+        wrapped_label(layout, line, characters, icon=_ICONS[is_good])
 
 
 def _draw_failed(layout: Any, context: bpy.types.Context, look: Look, folder: str) -> None:

@@ -14,7 +14,7 @@ from gaussian_wrapping_addon.core.settings import JobSettings, with_values
 
 PART = {
     "outputs": [], "share": 0.01, "region": "", "tile": -1, "memory_bytes": 1_500_000_000,
-    "seconds": 60.0,
+    "seconds": 60.0, "block": -1,
 }  # fmt: skip
 
 
@@ -42,9 +42,15 @@ def region_parts(region: str, tiles: int) -> list[dict[str, Any]]:
     ]
 
 
-def graph(regions: dict[str, int]) -> dict[str, Any]:
-    """Return ``parts.json`` of a whole job: tiles of each region, 0 for one piece."""
-    parts = [part("cameras", "cameras"), part("train", "train", ["cameras"])]
+def graph(regions: dict[str, int], blocks: int = 0) -> dict[str, Any]:
+    """Return ``parts.json`` of a whole job: tiles of each region, 0 for one piece; so of blocks."""
+    parts, before = [part("cameras", "cameras")], ["cameras"]
+    if blocks:
+        parts.append(part("coarse", "coarse", before))
+        trained = [part(f"block-{k:04d}", "block", ["coarse"]) for k in range(blocks)]
+        parts += trained
+        before = [one["name"] for one in trained]
+    parts.append(part("train", "train", before))
     for region, tiles in regions.items():
         parts += region_parts(region, tiles)
     parts.append(part("export", "export", [f"texture-{region}" for region in regions]))
@@ -60,6 +66,7 @@ def graph(regions: dict[str, int]) -> dict[str, Any]:
 GRAPHS = {
     "one piece": graph({"auto": 0}),
     "tiles": graph({"engine": 8}),
+    "blocks": graph({"auto": 2}, 3),
     "several regions": graph({"engine": 3, "Wheel_2": 0, "door": 2}),
     "a bake": {
         **graph({}),
@@ -85,8 +92,9 @@ def write_state(root: Path, name: str, state: str, **more: Any) -> None:
     """Write the state of a part, as the process that runs it does."""
     (root / "parts").mkdir(exist_ok=True)
     values = {
-        "state": state, "place": "host", "pid": 1, "begun_s": 1.0, "heartbeat_s": 1000.0,
-        "fraction": 0.5, "message": "", "attempts": 1, "error": "", "hint": "", "exit_code": None,
-        "seconds": 1.0,
+        "state": state, "plan": "ba9876543210", "place": "host boot", "pid": 1, "pid_started": 1,
+        "token": "1", "begun_s": 1.0, "heartbeat_s": 1000.0, "fraction": 0.5, "message": "",
+        "attempts": 1, "error": "", "hint": "", "exit_code": None, "seconds": 1.0,
+        "peak_memory_bytes": 1, "figures": {}, "outputs": [],
     }  # fmt: skip
     (root / "parts" / f"{name}.json").write_text(json.dumps(values | more | {"state": state}))

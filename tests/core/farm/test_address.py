@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import pytest
 
+from gaussian_wrapping_addon.core.cluster.addresses import Address
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.farm.address import Address, parse_address
+from gaussian_wrapping_addon.core.farm.address import parse_address
 
 GOOD = {
     "http://farm.local:8080": Address("http", "farm.local", 8080),

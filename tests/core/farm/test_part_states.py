@@ -85,13 +85,14 @@ def test_damaged_states_count_as_left(root: Path, data: bytes) -> None:
 
 def test_odd_entries_do_no_harm(root: Path) -> None:
     (root / "parts").mkdir()
-    values = {"state": "FAILED", "place": 3, "error": "x" * 5000, "heartbeat_s": 10**400}
-    (root / "parts" / "train.json").write_text(json.dumps(values))
+    write_state(root, "train", "FAILED", error="x" * 5000)
+    write_state(root, "plan-a", "RUNNING", heartbeat_s=10**400)
+    write_state(root, "mesh-a", "FAILED", place=3)
     (root / "parts" / "foreign.json").write_text(json.dumps({"state": "FAILED"}))
     (root / "parts" / "cameras.json").symlink_to(root / "parts.json")
     os.mkfifo(root / "parts" / "export.json")
     board = reader_of(root).read()
-    assert board.failed == (FailedPart("train", "", "x" * part_states.MAX_TEXT_CHARACTERS),)
+    assert board.failed == (FailedPart("train", "host", "x" * part_states.MAX_TEXT_CHARACTERS),)
     assert board.totals == (0, 0, 1, 13)
 
 
@@ -105,8 +106,8 @@ def test_a_linked_folder_of_states_is_not_read(root: Path, tmp_path: Path) -> No
 
 def test_only_changed_files_are_read_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read = []
-    inner = part_states._read_state
-    monkeypatch.setattr(part_states, "_read_state", lambda p: read.append(p.stem) or inner(p))
+    inner = part_states.read_state
+    monkeypatch.setattr(part_states, "read_state", lambda r, n: read.append(n) or inner(r, n))
     reader = reader_of(root)
     write_state(root, "cameras", "DONE")
     write_state(root, "train", "RUNNING")

@@ -11,7 +11,6 @@ from PIL import Image
 from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import save_gaussians
-from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
@@ -19,6 +18,7 @@ from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
     source_fingerprint,
     stage_key,
 )
+from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 from gaussian_wrapping_addon.core.regions.region import write_region
 from gaussian_wrapping_addon.core.settings import JobSettings, TextureSettings

@@ -18,7 +18,6 @@ from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
-from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
@@ -27,6 +26,7 @@ from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
     source_fingerprint,
     stage_key,
 )
+from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings
 

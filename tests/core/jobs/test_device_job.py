@@ -31,9 +31,9 @@ from gaussian_wrapping_addon.core.settings import (
     TextureSettings,
     TrainingSettings,
 )
-from gaussian_wrapping_addon.core.training import trainer
 from gaussian_wrapping_addon.core.training.cost import machine_speed
 from gaussian_wrapping_addon.core.training.devices import chosen
+from gaussian_wrapping_addon.core.training.initialisation import point_start
 from gaussian_wrapping_addon.core.training.initialisation.splat_transform import (
     transform_gaussians,
 )
@@ -102,7 +102,7 @@ def start_near(monkeypatch: pytest.MonkeyPatch) -> None:
         moved = transform_gaussians(near, scene.world_from_scene.inverse())
         return OrientedGaussians(**{name: t.float() for name, t in moved.tensors()})
 
-    monkeypatch.setattr(trainer, "initial_gaussians", start)
+    monkeypatch.setattr(point_start, "initial_gaussians", start)
 
 
 def write_photos(folder: Path) -> Path:

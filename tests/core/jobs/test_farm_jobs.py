@@ -27,7 +27,7 @@ from tests.core.jobs.farm_jobs import (
 pytest.importorskip("distributed", reason="Dask is not installed: set-up-worker --add farm")
 pytestmark = [
     pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="processes are killed by a signal"),
-    pytest.mark.timeout(900),
+    pytest.mark.timeout(1800),
 ]
 
 

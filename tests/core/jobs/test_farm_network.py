@@ -19,8 +19,10 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core.cluster.certificates import FOLDER_VARIABLE, make_certificates
-from gaussian_wrapping_addon.core.jobs.client import JobClient
+from gaussian_wrapping_addon.core.errors import EXIT_USAGE, UsageError
+from gaussian_wrapping_addon.core.jobs.client import JobClient, prepare_job
 from gaussian_wrapping_addon.core.jobs.store.job_file import write_job
+from gaussian_wrapping_addon.core.limits import SILENT_S
 from gaussian_wrapping_addon.core.names import SHARED_VARIABLE
 from tests.core.jobs import farm_jobs
 from tests.core.jobs.farm_jobs import (
@@ -36,7 +38,7 @@ from tests.core.jobs.farm_jobs import (
 pytest.importorskip("distributed", reason="Dask is not installed: set-up-worker --add farm")
 pytestmark = [
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs signals and namespaces"),
-    pytest.mark.timeout(900),
+    pytest.mark.timeout(1800),
 ]
 PACKAGE = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon"
 
@@ -150,6 +152,97 @@ def test_a_worker_of_another_version_is_told(farm: Farm, tmp_path: Path) -> None
     assert "version" in status.error
     assert "Install the same version" in status.hint
     assert [state.state for state in states(folder).values()] == []
+
+
+def test_a_worker_of_another_version_beside_a_right_one_is_asked_once(
+    farm: Farm, alone: farm_jobs.JobFolder, tmp_path: Path
+) -> None:
+    other = tmp_path / "older" / PACKAGE.name
+    shutil.copytree(PACKAGE, other, ignore=shutil.ignore_patterns("__pycache__"))
+    (other / "core" / "limits.py").open("a").write("\n# older\n")
+    address = f"tcp://127.0.0.1:{free_port()}"
+    farm.start("scheduler", address, says="listens at")
+    farm.start("worker", address, says="works for", package=other)
+    farm.start("worker", address, says="works for")
+    folder, job = tiled_sphere(tmp_path / "job", 2, computers=address)
+    status = farm_jobs.run(folder, job)
+    assert status.state == "DONE", status
+    assert same_mesh(folder, alone)
+    # Parts of two tiles went to both at once, if not the first part did; then it is known.
+    assert folder.log_path.read_text().count("ended with code 3 (attempt 1)") == 1
+    assert "(attempt 2)" not in folder.log_path.read_text()
+
+
+@pytest.fixture(scope="module")
+def attic() -> list[str]:
+    """Return what to put before a command that runs as on another computer, with its own name."""
+    words = ["unshare", "--uts", "--pid", "--fork", "--kill-child", "--mount-proc"]
+    words += ["sh", "-c", 'hostname attic && exec "$@"', "sh"]
+    try:
+        tried = subprocess.run([*words, "true"], capture_output=True, text=True, check=False)
+    except OSError as error:
+        pytest.skip(f"unshare is missing: {error}")
+    if tried.returncode:
+        pytest.skip(f"no namespace can be made: {tried.stderr.strip()}")
+    return words
+
+
+def resume_words(folder: farm_jobs.JobFolder) -> list[str]:
+    return [sys.executable, str(PACKAGE / "batch.py"), "resume", str(folder.root), "--no-blend"]
+
+
+def test_of_two_clients_on_two_computers_one_is_told_and_one_ends_the_job(
+    attic: list[str], alone: farm_jobs.JobFolder, tmp_path: Path
+) -> None:
+    folder, job = tiled_sphere(tmp_path, 2, computers="local", processes=2)
+    said: list[subprocess.CompletedProcess[str]] = []
+
+    def look() -> None:
+        if not said and any(name.startswith("points") for name, _ in running(folder)):
+            words = [*attic, *resume_words(folder)]
+            said.append(subprocess.run(words, capture_output=True, text=True, check=False))
+
+    status = farm_jobs.run(folder, job, look)
+    assert status.state == "DONE", status
+    (second,) = said
+    assert second.returncode == EXIT_USAGE, second
+    assert f"A job is running in {folder.root}." in second.stdout + second.stderr
+    assert "Traceback" not in second.stdout + second.stderr
+    assert same_mesh(folder, alone)
+
+
+def test_a_silent_computer_s_job_is_taken_over_by_another(
+    attic: list[str], alone: farm_jobs.JobFolder, tmp_path: Path
+) -> None:
+    folder, job = tiled_sphere(tmp_path, 2, computers="local", processes=2)
+    prepare_job(folder.root, job)
+    first = subprocess.Popen(
+        [*attic, *resume_words(folder)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )  # fmt: skip
+
+    def begun() -> bool:
+        there = [name for name, state in states(folder).items() if state.host == "attic"]
+        return any(name.startswith("points") for name in there)
+
+    try:
+        wait_until(begun, farm_jobs.DEADLINE_S)
+    finally:
+        kill(first.pid)  # its namespace goes with it
+        first.wait()
+    with pytest.raises(UsageError, match="A job is running in"):
+        JobClient.resume(folder.root, python=sys.executable)
+    done = {name: state.token for name, state in states(folder).items() if state.state == "DONE"}
+    assert "plan-ball" in done
+    silent_s = time.time() - SILENT_S - 20.0
+    for path in (folder.lock_path, folder.status_path, *(folder.root / "parts").iterdir()):
+        os.utime(path, (silent_s, silent_s))
+    assert folder.read_status().state == "LOST"
+    status = wait(JobClient.resume(folder.root, python=sys.executable))
+    assert status.state == "DONE", status
+    assert same_mesh(folder, alone)
+    kept = set(done) - {"cameras"}
+    assert {name: states(folder)[name].token for name in kept} == {n: done[n] for n in kept}
 
 
 def _namespaces() -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from gaussian_wrapping_addon.core.jobs import part_process
 from gaussian_wrapping_addon.core.jobs.client import prepare_job
 from gaussian_wrapping_addon.core.jobs.parts.graph import PARTS_NAME, read_parts, write_parts
 from gaussian_wrapping_addon.core.jobs.parts.part_state import new_state, read_state, write_state
@@ -22,6 +23,7 @@ from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.processes.helper_process import child_command
 from tests.core.jobs import farm_jobs
 from tests.core.jobs.farm_jobs import mesh_in, same_mesh, states, tiled_sphere
+from tests.core.jobs.small_disk import fill, mounted_disk
 
 
 def start(folder: JobFolder, part: str, **changes: object) -> subprocess.Popen[str]:
@@ -118,15 +120,100 @@ def test_a_part_that_is_told_to_end_says_that_it_may_work_elsewhere(planned: Job
         assert run(planned, name)[0] == 0
     process = start(planned, "plan-ball")
     end_s = time.monotonic() + 60.0
-    while (state := read_state(planned.root, "plan-ball")) is None or state.fraction == 0.0:
-        if process.poll() is not None:
-            pytest.skip("it was faster")
+    while read_state(planned.root, "plan-ball") is None:  # written as soon as it can be told
         assert time.monotonic() < end_s
-        time.sleep(0.02)
+        time.sleep(0.01)
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=60)
     state = read_state(planned.root, "plan-ball")
     assert state is not None
-    assert (process.returncode, state.state) in ((2, "FAILED"), (0, "DONE"))
-    if process.returncode:
-        assert "its process was ended" in out
+    assert (process.returncode, state.state) == (2, "FAILED")
+    assert "its process was ended" in out
+    assert run(planned, "plan-ball")[0] == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no small disk is mounted there")
+def test_a_part_on_a_full_disk_says_so_and_that_it_may_work_later(tmp_path: Path) -> None:
+    with mounted_disk(tmp_path / "disk") as disk:
+        folder, job = tiled_sphere(disk, 2)
+        prepare_job(folder.root, job)
+        plan_if_missing(folder)
+        assert run(folder, "cameras")[0] == 0
+        fill(disk / "filler")
+        code, said = run(folder, "train")  # not even its state can be written
+        assert (code, "No room" in said, "Make room" in said) == (2, True, True)
+        assert read_state(folder.root, "train") is None
+        (disk / "filler").unlink()
+        assert run(folder, "train")[0] == 0
+        process = start(folder, "plan-ball")
+        end_s = time.monotonic() + 60.0
+        while read_state(folder.root, "plan-ball") is None:
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+        while process.poll() is None:
+            fill(disk / "filler")
+        said, errors = process.communicate()
+        assert "Traceback" not in errors, errors
+        assert (process.returncode, "No room" in said) == (2, True)
+        state = read_state(folder.root, "plan-ball")
+        assert state is not None
+        assert (state.state, state.exit_code) == ("FAILED", 2)
+        assert "No room" in state.error
+        assert not list(disk.rglob("*.writing.*"))
+        (disk / "filler").unlink()
+        assert run(folder, "plan-ball")[0] == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights on Windows")
+def test_links_are_refused_wherever_a_part_looks(planned: JobFolder, tmp_path: Path) -> None:
+    for name in ("cameras", "train", "plan-ball"):
+        assert run(planned, name)[0] == 0
+    tiles = next(planned.stages.glob("mesh-ball-*")) / "tiles"
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "kept").write_text("kept")
+
+    def refused(path: Path, target: Path, part: str) -> None:
+        earlier = path.with_name("earlier")
+        if path.exists():
+            path.rename(earlier)
+        path.symlink_to(target)
+        code, said = run(planned, part)
+        assert (code, "is a link" in said or "it is a link" in said) == (1, True), said
+        path.unlink()
+        if earlier.exists():
+            earlier.rename(path)
+
+    tile = "points-ball-0000"
+    refused(planned.root / "parts", outside, tile)
+    refused(tiles, outside, tile)
+    refused(tiles.parent, outside, tile)
+    refused(planned.stages / "train-more", outside, tile)
+    refused(planned.root / "log.txt", outside / "kept", tile)
+    refused(tiles / "plan.npz", outside / "kept", tile)
+    refused(tiles / "anything.npz", outside / "kept", "mesh-ball")
+    refused(tiles / "points-0000.npz", outside / "kept", tile)
+    # What a part replaces is the link, not what it leads to.
+    state = planned.root / "parts" / f"{tile}.json"
+    state.unlink()
+    state.symlink_to(outside / "kept")
+    code, said = run(planned, tile)
+    assert code == 0, said
+    assert not state.is_symlink()
+    assert [path.name for path in outside.iterdir()] == ["kept"]
+    assert (outside / "kept").read_text() == "kept"
+
+
+def test_a_part_of_a_tile_looks_at_no_other_tile(
+    planned: JobFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[str] = []
+    scandir = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda path: looked.append(Path(path).name) or scandir(path))
+    (planned.stages / "mesh-ball-0" / "tiles").mkdir(parents=True)
+    (planned.root / "parts").mkdir(exist_ok=True)
+    planned.check_entries(but=part_process.MANY)
+    assert {"parts", "tiles"}.isdisjoint(looked)
+    assert "mesh-ball-0" in looked
+    planned.check_entries()
+    assert {"parts", "tiles"} <= set(looked)

@@ -136,7 +136,7 @@ def test_imports_are_followed_however_they_are_written() -> None:
     assert (
         core / "render" / "simd" / "raster_math.py" in found
     )  # names in brackets, over many lines
-    found = kernel_cache._imported(core / "jobs" / "stages" / "training_stage.py")
+    found = kernel_cache._imported(core / "jobs" / "training" / "training_stage.py")
     assert core / "training" / "trainer.py" in found  # within a function
     assert all(path.is_file() for path in found)
 

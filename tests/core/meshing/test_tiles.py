@@ -17,14 +17,13 @@ from gaussian_wrapping_addon.core.meshing.points.region_caps import no_caps
 from gaussian_wrapping_addon.core.meshing.points.spacing import Spacing
 from gaussian_wrapping_addon.core.meshing.points.surface_points import SurfacePoints
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
+from gaussian_wrapping_addon.core.meshing.tiles.border_faces import BorderFaces
 from gaussian_wrapping_addon.core.meshing.tiles.plan import Field, TilePlan
 from gaussian_wrapping_addon.core.meshing.tiles.steiner_points import (
     CLEARANCE_RADII,
     steiner_lattice,
 )
 from gaussian_wrapping_addon.core.meshing.tiles.tile_faces import (
-    TileFaces,
-    joined_faces,
     local_tetrahedra,
     tile_faces,
 )
@@ -49,7 +48,7 @@ from .meshing_scenes import (
     sphere,
     torus,
 )
-from .tiled_meshing import mesh_in_tiles
+from .tiled_meshing import LabelledTiles, mesh_in_tiles
 
 SIGMA = 0.02
 PLATE = rounded_box((1.0, 0.9, 0.02), 0.02)
@@ -124,13 +123,13 @@ def plan_around(region: Region, tiling: Tiling, radius: float, side: float) -> T
 
 
 @cache
-def points_on_sheet() -> tuple[Region, Tiling, GatheredPoints, TilePlan]:
+def points_on_sheet(count: int = 8000) -> tuple[Region, Tiling, GatheredPoints, TilePlan]:
     """Points on a wavy sheet and a sphere, some exactly on borders of tiles, with their fillers."""
     rng = np.random.default_rng(1)
     radius = 0.004
-    ground = rng.uniform(-1, 1, (8000, 3))
+    ground = rng.uniform(-1, 1, (count, 3))
     ground[:, 2] = 0.1 * np.sin(4 * ground[:, 0]) - 0.4
-    ball_radius = rng.normal(size=(3000, 3))
+    ball_radius = rng.normal(size=(3 * count // 8, 3))
     ball_radius *= 0.4 / np.linalg.norm(ball_radius, axis=1)[:, None]
     ball_radius[:, 2] += 0.3
     points = np.concatenate([ground, ball_radius])
@@ -205,7 +204,7 @@ def test_faces_are_closed_whatever_the_labels() -> None:
         tile_faces(Field(Noise(tile), None, 1), plan, gathered, tile, Progress())
         for tile in range(len(tiling))
     ]
-    faces = joined_faces(parts)
+    faces = LabelledTiles(Field(None, None, 1), plan, gathered, parts).dense_faces()
     assert len(faces) > 10_000
     assert len(np.unique(np.sort(faces, 1), axis=0)) == len(faces)
     begin, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
@@ -215,17 +214,20 @@ def test_faces_are_closed_whatever_the_labels() -> None:
 
 
 def test_tiles_that_do_not_fit_are_told() -> None:
-    none = np.zeros((0, 3), np.int64)
-    a = TileFaces(none, np.array([[0, 1, 2]]), np.array([True]), {})
-    b = TileFaces(none, np.array([[1, 2, 0]]), np.array([False]), {})
+    yes, no = np.array([True]), np.array([False])
     with pytest.raises(MeshingError, match="agree"):
-        joined_faces([a, b])
-    flipped = TileFaces(none, np.array([[0, 2, 1]]), np.array([False]), {})
-    assert len(joined_faces([a, flipped])) == 1
-    solid = TileFaces(none, np.array([[0, 2, 1]]), np.array([True]), {})
-    assert len(joined_faces([a, solid])) == 0
+        settled([[0, 1, 2]], yes, [[1, 2, 0]], no)
+    assert len(settled([[0, 1, 2]], yes, [[0, 2, 1]], no)) == 1
+    assert len(settled([[0, 1, 2]], yes, [[0, 2, 1]], yes)) == 0
     with pytest.raises(MeshingError, match="agree"):
-        joined_faces([a, flipped, solid])
+        settled([[0, 1, 2]], yes, [[0, 2, 1]], no, [[0, 2, 1]], yes)
+
+
+def settled(*parts: list[list[int]] | np.ndarray) -> np.ndarray:
+    """Join border faces; pairs of the faces of a tile and which of them are solid."""
+    border = BorderFaces()
+    pairs = zip(parts[::2], parts[1::2], strict=True)
+    return np.concatenate([border.add(np.array(faces), np.array(solid)) for faces, solid in pairs])
 
 
 @cache

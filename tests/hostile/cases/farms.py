@@ -37,7 +37,7 @@ def _listed(*parts: Any) -> dict[str, Any]:
 def _part(name: Any, *needs: Any) -> dict[str, Any]:
     return {
         "name": name, "kind": "points", "needs": list(needs), "outputs": [], "share": 0.1,
-        "region": "", "tile": -1, "memory_bytes": None, "seconds": None,
+        "region": "", "tile": -1, "memory_bytes": None, "seconds": None, "block": -1,
     }  # fmt: skip
 
 
@@ -103,6 +103,14 @@ def _record(name: str, text: str) -> Variant:
     return Variant(name, build, 3, says, ("farm", "status", "out"))
 
 
+_HERE = "tcp://127.0.0.1:9"
+_SIZE = ("--workers", "1", "--cores", "1", "--memory", "1GB", "--time", "1")
+
+
+def _hosts(name: str, build: Build, says: str) -> Variant:
+    return Variant(name, build, 3, f"hosts, {says}", ("farm", "ssh", _HERE, "--hosts", "hosts"))
+
+
 _MANAGERS = Case(
     74,
     "Addresses and records of farms",
@@ -125,6 +133,27 @@ _MANAGERS = Case(
         _record("a record of a file", '{"version": 1, "address": "file:///x", "job": "1"}'),
         _record("a record with a path", '{"version": 1, "address": "http://x", "job": "../x"}'),
         _record("a record that is cut", '{"version"'),
+        Variant(
+            "a scheduler that others can read", nothing, 2, "is not encrypted.*make-certificates",
+            ("farm", "doctor", "tcp://10.0.0.7:8786", "--shared", "."),
+        ),
+        Variant(
+            "a scheduler with a path", nothing, 2, "is no address of a Dask scheduler",
+            ("farm", "doctor", "tls://farm:8786/../x", "--shared", "."),
+        ),
+        _hosts("an option as a computer", file("hosts", "-oProxyCommand=touch$IFS\n"), "line 1:"),
+        _hosts("a command as a computer", file("hosts", "\na;touch x\n"), "line 2:"),
+        _hosts("a vast list of computers", file("hosts", b"#" * (1 << 20) + b"#"), "whole file:"),
+        _hosts("computers in bytes", file("hosts", b"\xff\xfe"), "whole file: it is not text"),
+        Variant(
+            "a pipe as a list of computers", pipe("hosts"), 3,
+            "hosts, whole file: it is a named pipe",
+            ("farm", "ssh", _HERE, "--hosts", "hosts"), needs=Needs.POSIX,
+        ),
+        Variant(
+            "a directive of two lines", nothing, 2, "A directive has a line break",
+            ("farm", "slurm", _HERE, *_SIZE, "--directive=-x\nrm -r x"),
+        ),
     ),
     (
         f"{_FLAMENCO}/test_exchange.py::*",

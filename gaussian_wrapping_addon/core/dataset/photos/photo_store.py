@@ -4,45 +4,48 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
-from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 
 from ...errors import DatasetError
+from ...machine import available_memory_bytes
 from ..camera import Camera
+from ..photo_source import PhotoSource
 from ..scene import Scene
+from .decoded_file import DecodedFile
+from .kept_photos import KeptPhotos, Key
+from .photo_budget import photo_budget_bytes
 from .photo_file import MASK_THRESHOLD, photo_header, read_mask, read_photo
-
-DEFAULT_MEMORY_BYTES = 1 << 30
 
 
 class PhotoStore:
-    """Photos, masks and matching cameras of a scene's views, read on demand and cached.
+    """Photos, masks and matching cameras of a scene's views, read on demand within a budget.
 
     The base level (divisor 1) is the photo with its long side limited to ``max_image_px``;
     divisor d averages d x d base pixels and crops incomplete blocks at the right and lower border,
     so that the camera of a level is exactly the base camera with intrinsics divided by d.
-    Thread-safe.
+    What comes out does not depend on the budget. Thread-safe.
 
     Parameters
     ----------
     scene : Scene
     max_image_px : int
         Long side of the base level, pixels.
-    memory_bytes : int
-        Limit of the cache; one photo is kept even if it alone is larger.
+    memory_bytes : int, optional
+        Limit of the arrays kept (:class:`~.kept_photos.KeptPhotos`); by default a share of the
+        memory that is free now (:func:`~.photo_budget.photo_budget_bytes`). The photo and the mask
+        used last are kept beyond it.
     """
 
-    def __init__(
-        self, scene: Scene, max_image_px: int, *, memory_bytes: int = DEFAULT_MEMORY_BYTES
-    ) -> None:
+    def __init__(self, scene: Scene, max_image_px: int, *, memory_bytes: int | None = None) -> None:
+        if memory_bytes is None:
+            memory_bytes = photo_budget_bytes(available_memory_bytes())
         self._views = scene.views
-        self._memory_bytes = memory_bytes
-        self._lock = threading.Lock()
-        self._cache: OrderedDict[tuple[str, int, int], np.ndarray] = OrderedDict()
-        self._cached_bytes = 0
+        self._kept = KeptPhotos(memory_bytes)
+        self._decoded: DecodedFile | None = None
         self._base = [_base_camera(view.camera, max_image_px) for view in scene.views]
 
     def __len__(self) -> int:
@@ -77,17 +80,17 @@ class PhotoStore:
         DatasetError
             The file was changed or removed after the scene was made.
         """
-        return self._cached(("photo", index, divisor), lambda: self._make_photo(index, divisor))
+        return self._array(("photo", index, divisor), lambda: self._make_photo(index, divisor))
 
     def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
         """Return the mask at a level, (h, w) bool, true where the photo counts; or ``None``."""
         if self._views[index].mask_path is None:
             return None
-        return self._cached(("mask", index, divisor), lambda: self._make_mask(index, divisor))
+        return self._array(("mask", index, divisor), lambda: self._make_mask(index, divisor))
 
     def _make_photo(self, index: int, divisor: int) -> np.ndarray:
         if divisor > 1:
-            return _average(self.photo(index), divisor)
+            return _average(self._base_array("photo", index, self._make_photo), divisor)
         view, base = self._views[index], self._base[index]
         self._check_size(view.photo_path, view.camera)
         # Photos of a scene are stored upright: none relies on an EXIF rotation.
@@ -104,8 +107,7 @@ class PhotoStore:
         view, base = self._views[index], self._base[index]
         assert view.mask_path is not None
         if divisor > 1:
-            full = self.mask(index)
-            assert full is not None
+            full = self._base_array("mask", index, self._make_mask)
             grey = np.where(full, 255, 0).astype(np.uint8)[..., None]
             return _average(grey, divisor)[..., 0] >= MASK_THRESHOLD
         self._check_size(view.mask_path, view.camera)
@@ -118,32 +120,75 @@ class PhotoStore:
         return grey >= MASK_THRESHOLD
 
     @staticmethod
-    def _check_size(path: object, camera: Camera) -> None:
-        from pathlib import Path
-
-        header = photo_header(Path(str(path)))
+    def _check_size(path: Path, camera: Camera) -> None:
+        header = photo_header(path)
         if (header.width, header.height) != (camera.width, camera.height):
             raise DatasetError(
-                f"{Path(str(path)).name} is now {header.width} x {header.height} pixels, it was "
+                f"{path.name} is now {header.width} x {header.height} pixels, it was "
                 f"{camera.width} x {camera.height}.",
                 "Put the photo back, or start the job anew.",
             )
 
-    def _cached(self, key: tuple[str, int, int], make: Callable[[], np.ndarray]) -> np.ndarray:
-        with self._lock:
-            if key in self._cache:
-                self._cache.move_to_end(key)
-                return self._cache[key]
-        made = make()  # outside the lock: decoding is slow, and levels call for the base
-        made.setflags(write=False)
-        with self._lock:
-            if key not in self._cache:
-                self._cache[key] = made
-                self._cached_bytes += made.nbytes
-                while self._cached_bytes > self._memory_bytes and len(self._cache) > 1:
-                    _, dropped = self._cache.popitem(last=False)
-                    self._cached_bytes -= dropped.nbytes
-            return self._cache[key]
+    @contextmanager
+    def decoded_in(self, folder: Path) -> Iterator[None]:
+        """Keep decoded on disk, in this context, what does not fit into memory.
+
+        Parameters
+        ----------
+        folder : Path
+            As for :class:`~.decoded_file.DecodedFile`.
+        """
+        before, self._decoded = self._decoded, DecodedFile(folder)
+        try:
+            yield
+        finally:
+            self._decoded.close()
+            self._decoded = before
+
+    def _array(self, key: Key, make: Callable[[], np.ndarray]) -> np.ndarray:
+        found = self._kept.get(key)
+        if found is not None:
+            return found
+        array = self._made(key, make)  # without a lock: decoding is slow
+        array, left_out = self._kept.put(key, array)
+        if self._decoded is not None:
+            for other, dropped in left_out:
+                if other == key or other[2] == 1:  # other levels are made of that of divisor 1
+                    self._decoded.add(other, dropped)
+        return array
+
+    def _base_array(
+        self, kind: str, index: int, make: Callable[[int, int], np.ndarray]
+    ) -> np.ndarray:
+        """Return a photo or mask of divisor 1 that a level is made of; others are likely to come.
+
+        It is kept where that costs no other array its place.
+        """
+        key = (kind, index, 1)
+        found = self._kept.peek(key)
+        if found is not None:
+            return found
+        array = self._made(key, lambda: make(index, 1))
+        if not self._kept.put_aside(key, array) and self._decoded is not None:
+            self._decoded.add(key, array)
+        return array
+
+    def _made(self, key: Key, make: Callable[[], np.ndarray]) -> np.ndarray:
+        array = None if self._decoded is None else self._decoded.get(key)
+        if array is None:
+            array = make()
+        array.setflags(write=False)
+        return array
+
+
+@contextmanager
+def decoded_in(photos: PhotoSource, folder: Path) -> Iterator[None]:
+    """Keep photos decoded in a folder, in this context, where they are read from files at all."""
+    if isinstance(photos, PhotoStore):
+        with photos.decoded_in(folder):
+            yield
+    else:
+        yield
 
 
 def _base_camera(camera: Camera, max_image_px: int) -> Camera:

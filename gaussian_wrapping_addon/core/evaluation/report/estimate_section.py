@@ -21,6 +21,19 @@ def estimate_lines(training: dict[str, Any]) -> list[str]:
         (
             f"Estimated before the start: {duration(low)} to {duration(high)}, "
             f"{bytes_text(expected.get('memory_bytes'))} of memory. It took {duration(took)}, "
-            f"{where}."
+            f"{where}.{_photos(part(expected, 'photos'))}"
         ),
     ]
+
+
+def _photos(photos: dict[str, Any]) -> str:
+    """Return where the photos were, as a sentence; nothing if the report is older."""
+    whole, budget = measured(photos.get("all_bytes")), measured(photos.get("budget_bytes"))
+    if whole is None or budget is None:
+        return ""
+    if whole <= budget:
+        return f" All photos fitted into memory ({bytes_text(whole)})."
+    return (
+        f" Photos were read on demand: {bytes_text(whole)} decoded, {bytes_text(budget)} of memory "
+        "for them."
+    )

@@ -10,7 +10,16 @@ from ...settings import TrainingSettings, declarations
 from .text import escaped, measured, number
 
 # Lists of records that have tables or pictures of their own.
-_SHOWN_ELSEWHERE = {"decisions", "history", "pictures", "warnings", "packages", "stages", "notes"}
+_SHOWN_ELSEWHERE = {
+    "decisions",
+    "history",
+    "pictures",
+    "warnings",
+    "packages",
+    "stages",
+    "notes",
+    "blocks",
+}
 
 _UNITS = {
     "psnr": "dB",

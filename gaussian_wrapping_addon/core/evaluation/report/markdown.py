@@ -11,6 +11,7 @@ from typing import Any
 
 from ...files import resolve_inside
 from ...names import REPORT_FOLDER
+from .blocks_section import blocks_lines
 from .estimate_section import estimate_lines
 from .figures import figure_rows
 from .region_section import Picture, note_lines, region_lines, region_summary
@@ -38,6 +39,8 @@ _STAGES = {
     "cameras": "photos and cameras",
     "masks": "making masks",
     "masked": "photos with these masks",
+    "coarse": "coarse training",
+    "block": "training one block",
     "train": "training the Gaussians",
     "mesh": "mesh of region",
     "texture": "texture of region",
@@ -348,6 +351,7 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
     iterations = number(training.get("iterations"), "iterations")
     lines = [
         f"{number(training.get('gaussians'), 'Gaussians')} after {iterations}.",
+        *blocks_lines(training),
         *estimate_lines(training),
         "",
         *picture(f"{REPORT_FOLDER}/{CURVE}", "PSNR and number of Gaussians during training."),

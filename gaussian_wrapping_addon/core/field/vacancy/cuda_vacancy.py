@@ -234,11 +234,14 @@ class CudaVacancyField(VacancyField):
         mask = self._masks[index]
         if mask is None:
             return torch.empty(0, dtype=torch.uint8, device=self._torch_device), 0, 0, 0
-        if index not in self._device_masks:
-            tensor = torch.tensor(mask.view(np.uint8), device=self._torch_device)
-            self._device_masks[index] = tensor
+        sent = self._device_masks.get(index)
+        if sent is None:
+            sent = torch.tensor(mask.unpacked().view(np.uint8), device=self._torch_device)
+            if sent.numel() <= self._device_cache_left:
+                self._device_masks[index] = sent
+                self._device_cache_left -= sent.numel()
         height, width = mask.shape
-        return self._device_masks[index], _MASK_MODES[self._mask_mode], width, height
+        return sent, _MASK_MODES[self._mask_mode], width, height
 
     def _device_bins(self, index: int) -> _DeviceBins | None:
         if index in self._device_cache:

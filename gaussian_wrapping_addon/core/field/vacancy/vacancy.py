@@ -23,7 +23,7 @@ from ...kernels.parallel import (
 from ...machine import total_memory_bytes
 from ...progress import Progress
 from .camera_bins import TILE_PX, CameraBins, VirtualScreen, bin_camera
-from .photo_masks import MaskMode, checked_masks, masked_points
+from .photo_masks import MaskMode, PackedMask, checked_masks, masked_points
 from .vacancy_kernels import project_points, sort_by_cell, transmittance_of_cells
 
 SETTLED = 1.0 - 1e-3
@@ -87,7 +87,7 @@ class VacancyField:
     unseen : {"empty", "occupied", "invalid"}
         Vacancy 1, 0 or NaN of points that no camera sees (docs/method.md, section 5.3). Invalid
         points count as empty in :meth:`is_empty`, and ``unseen_evaluations`` counts them.
-    masks : sequence of (h, w) bool or None, optional
+    masks : sequence of (h, w) bool, PackedMask or None, optional
         One per camera, true where its photo counts, of any resolution.
     mask_mode : {"ignore", "background"}
         Points in masked pixels are unseen by the camera; or known to be empty, whatever other
@@ -118,7 +118,7 @@ class VacancyField:
         region_bounds: np.ndarray | None = None,
         near_z: float = tolerances.NEAR_Z,
         cache_bytes: int | None = None,
-        masks: Sequence[np.ndarray | None] | None = None,
+        masks: Sequence[np.ndarray | PackedMask | None] | None = None,
         mask_mode: MaskMode = "ignore",
     ) -> None:
         if len(cameras) == 0:
@@ -285,7 +285,7 @@ class VacancyField:
         scale_x, scale_y = mask.shape[1] / virtual.width, mask.shape[0] / virtual.height
         run_chunks(
             lambda begin, end: masked_points(
-                begin, end, screen, cells, mask, scale_x, scale_y, masked
+                begin, end, screen, cells, mask.bits, mask.width, scale_x, scale_y, masked
             ),
             even_bounds(len(cells), self.threads),
             self.threads,

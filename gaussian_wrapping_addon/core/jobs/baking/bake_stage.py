@@ -14,13 +14,13 @@ from ...errors import UsageError
 from ...files import write_json
 from ...progress import Progress
 from ...settings import key_values
-from ..stages.training_stage import training_keys
 from ..store.bake_request import BakeRequest
 from ..store.continue_training import no_finished_training
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
 from ..store.result_swap import new_result
 from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done, run_stage, stage_key
+from ..store.training_keys import training_keys
 
 if TYPE_CHECKING:
     from ...dataset.similarity import Similarity

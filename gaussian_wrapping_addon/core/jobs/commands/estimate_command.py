@@ -29,11 +29,10 @@ def main(arguments: list[str]) -> int:
 
 def _estimate(job: JobFile) -> list[str | ReportWarning]:
     from ...kernels.parallel import default_threads
+    from ...training.cost.blocks_estimate import block_estimates, estimate_training, memory_warnings
     from ...training.cost.machine_speed import renderer_is_compiled, speeds
     from ...training.cost.training_estimate import (
         MESH_AND_TEXTURE_SHARE,
-        check_resources,
-        estimate,
         this_machine,
     )
     from ...training.initialisation.splat_start import wrapping_settings
@@ -47,7 +46,7 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
     threads = job.settings.threads or default_threads()
     timed = device.is_cuda or renderer_is_compiled()
     machine = this_machine(Path.cwd(), threads, *speeds(threads, device.device))
-    expected = estimate(facts, training, machine)
+    expected = estimate_training(facts, training, machine)
     low, high = MESH_AND_TEXTURE_SHARE
     points = f"{facts.points} sparse points" if facts.points else "camera poses still to be solved"
     where = device.card if device.is_cuda else f"{threads} threads"
@@ -56,14 +55,23 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
         f"training ({job.settings.preset}, {where}): {expected.span()}",
         f"memory: {expected.memory_bytes / 2**30:.1f} GB",
         f"disk: {expected.disk_bytes / 2**30:.2f} GB",
+        f"photos: {expected.photos.sentence()}",
         f"Gaussians: up to {expected.gaussians:,}",
         f"mesh and texture: {100 * low:.0f} to {100 * high:.0f} % more",
     ]
+    if training.blocks > 1:
+        names = ("coarse training", "one block", "joining")
+        parts = block_estimates(facts, training, machine)
+        told = [
+            f"{name} {part.span()}, {part.memory_bytes / 2**30:.1f} GB"
+            for name, part in zip(names, parts, strict=True)
+        ]
+        lines.append(f"{training.blocks} blocks: {'; '.join(told)}")
     if not facts.points:
         lines.append("solving the cameras: minutes before")
     if not timed:
         lines.append("not timed here: the first job compiles the renderer, about a minute, once")
-    return [*lines, *check_resources(expected, machine)]
+    return [*lines, *memory_warnings(facts, training, machine, expected)]
 
 
 def input_facts(source: Path, settings: JobSettings | None = None) -> SceneFacts:

@@ -29,6 +29,7 @@ def run_in_worker(
     python: str,
     module: str,
     what: str,
+    grace_s: float = 2.0,
 ) -> int:
     """Run a command in the worker's Python, log its output, and return its exit code.
 
@@ -40,6 +41,8 @@ def run_in_worker(
         The worker's interpreter.
     module, what : str
         The child's module, and its name in errors; all commands use the protocol above.
+    grace_s : float
+        Time in which it may end by itself when this is interrupted.
 
     Raises
     ------
@@ -65,7 +68,7 @@ def run_in_worker(
             _logger.info("cancelled")
             return EXIT_CANCELLED
         finally:
-            kill_group(process)
+            kill_group(process, grace_s)
         if code not in (EXIT_DONE, *range(EXIT_OTHER, EXIT_CANCELLED + 1)) or (
             not error_shown if code else not understood
         ):

@@ -29,13 +29,21 @@ PARENT_POLL_S = 1.0
 
 
 def run_command(
-    work: Callable[[], Iterable[str | ReportWarning]], memory_hint: str = "Close other programs."
-) -> int:
+    work: Callable[[], Iterable[str | ReportWarning]], memory_hint: str = "Close other programs.",
+    leave: Callable[[], object] | None = None,
+) -> int:  # fmt: skip
     """Emit the lines and warnings of ``work`` as they come, or its error; return the exit code.
 
     The process ends when its caller does.
+
+    Parameters
+    ----------
+    leave : callable, optional
+        Called in another thread before the process ends with its caller: takes away what ``work``
+        has left elsewhere.
     """
-    threading.Thread(target=exit_with_caller, args=(Caller(),), daemon=True).start()
+    watched = (Caller(),) if leave is None else (Caller(), leave)
+    threading.Thread(target=exit_with_caller, args=watched, daemon=True).start()
     try:
         for line in work():
             if isinstance(line, ReportWarning):
@@ -67,8 +75,10 @@ def run_command(
     return EXIT_DONE
 
 
-def exit_with_caller(caller: Caller) -> None:
+def exit_with_caller(caller: Caller, leave: Callable[[], object] | None = None) -> None:
     """End this process when its caller has ended: nothing reads the output any more."""
     while not caller.ended():
         time.sleep(PARENT_POLL_S)
+    if leave is not None:
+        leave()
     os._exit(EXIT_CANCELLED)

@@ -30,10 +30,10 @@ from ...progress import Progress
 from ...regular_files import read_bounded
 from ...report_warning import ReportWarning
 from ..stages.cameras_stage import MASKED, scene_of_finished_training
-from ..stages.training_stage import training_keys
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done, run_stage, stage_key
+from ..store.training_keys import training_keys
 from .region_masks import COARSE, make_region_masks
 
 if TYPE_CHECKING:

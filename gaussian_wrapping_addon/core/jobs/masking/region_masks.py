@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ...dataset.camera import Camera
     from ...dataset.scene import Scene
     from ...gaussians.model import OrientedGaussians
+    from ...render.types.renderer import Renderer
 
 _logger = logging.getLogger(__name__)
 
@@ -86,19 +87,15 @@ def make_region_masks(
     bounds = np.concatenate([region.vertices for region in regions])
     rendering = progress.span(_TRAINED, 1.0)
 
-    def step(index: int) -> None:
-        rendering.update(index / len(cameras), f"masking photo {index + 1} of {len(cameras)}")
+    def write(renderer: Renderer) -> None:
+        shares = silhouettes(gaussians, inside, cameras, renderer, bounds=bounds, threads=threads)
+        for index, view in enumerate(scene.views):
+            rendering.update(index / len(cameras), f"masking photo {index + 1} of {len(cameras)}")
+            size = (view.camera.width, view.camera.height)
+            mask = cleaned(next(shares), size, GROWN_SHARE)
+            write_bytes(folder / f"{index:06d}.png", encoded(mask))
 
-    shares = with_renderer(
-        device.device,
-        "Silhouettes",
-        lambda renderer: silhouettes(
-            gaussians, inside, cameras, renderer, step, bounds=bounds, threads=threads
-        ),
-    )
-    for index, (share, view) in enumerate(zip(shares, scene.views, strict=True)):
-        mask = cleaned(share, (view.camera.width, view.camera.height), GROWN_SHARE)
-        write_bytes(folder / f"{index:06d}.png", encoded(mask))
+    with_renderer(device.device, "Silhouettes", write)
 
 
 def _limited(camera: Camera) -> Camera:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -78,10 +77,7 @@ class InProcess:
         self._queue.append((part, plan, attempt))
 
     def wait(self, seconds: float) -> list[Outcome]:
-        """Run the next part, however long it takes."""
-        if not self._queue:
-            time.sleep(seconds)
-            return []
+        """Run the next part, however long it takes; there must be one."""
         part, plan, attempt = self._queue.pop(0)
         lease = PartLease(self.root, part.name, plan, attempt)
         lease.take()

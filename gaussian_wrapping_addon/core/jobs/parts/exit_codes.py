@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from ...cluster import child
 from ...errors import EXIT_CANCELLED, EXIT_DONE, EXIT_RESOURCES, DeviceError, WorkerError, WrapError
 
 DONE = EXIT_DONE
@@ -10,7 +11,7 @@ NEVER = 1
 """Bad data: it fails wherever it is run."""
 MAY_WORK_ELSEWHERE = 2
 """Memory, disk, a device, a killed helper: elsewhere or later it may work."""
-OTHER_CODE = 3
+OTHER_CODE = child.OTHER_CODE
 """This computer has another version of the program than the one that planned."""
 CANCELLED = EXIT_CANCELLED
 

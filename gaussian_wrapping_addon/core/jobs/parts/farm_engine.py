@@ -66,7 +66,7 @@ class FarmEngine:
 
     def _threads(self, part: Part) -> int:
         """Return the threads of a part: all there are, or a share where others run beside it."""
-        if self._settings.threads or not self._is_local or part.tile < 0:
+        if self._settings.threads or not self._is_local or not part.is_one_of_many:
             return self._settings.threads
         return max(1, default_threads() // self._settings.processes)
 

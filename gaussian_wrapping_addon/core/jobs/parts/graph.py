@@ -17,8 +17,8 @@ from ...files import read_json, write_json
 VERSION = 1
 PARTS_NAME = "parts.json"
 KINDS = (
-    "cameras", "masks", "train", "plan", "points", "gather", "faces", "mesh", "texture", "bake",
-    "export",
+    "cameras", "masks", "coarse", "block", "train", "plan", "points", "gather", "faces", "mesh",
+    "texture", "bake", "export",
 )  # fmt: skip
 """In the order of a job."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,79}")
@@ -46,6 +46,13 @@ class Part:
     memory_bytes: int | None = None
     seconds: float | None = None
     """Estimated; ``None`` where nothing is known yet."""
+    block: int = -1
+    """Number of its block, if it trains one."""
+
+    @property
+    def is_one_of_many(self) -> bool:
+        """Whether parts of its kind can run side by side with it."""
+        return self.tile >= 0 or self.block >= 0
 
 
 @dataclass(frozen=True)
@@ -171,6 +178,7 @@ def _part_of(entry: Any) -> Part:
         entry["name"], entry["kind"], needs, outputs, _number(entry, "share", 0.0, 1.0),
         entry["region"], int(_number(entry, "tile", -1.0, limits.MAX_TILES)),
         _optional(entry, "memory_bytes", int), _optional(entry, "seconds", float),
+        int(_number(entry, "block", -1.0, limits.MAX_BLOCKS)),
     )  # fmt: skip
 
 

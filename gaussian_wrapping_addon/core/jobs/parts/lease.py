@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -24,7 +25,14 @@ from ...processes.helper_process import emit
 from ...processes.peak_memory import own_peak_bytes
 from ...processes.process_identity import is_here, owner_alive
 from ...progress import ProgressEvent
-from .part_state import PartState, new_state, read_state, state_path, write_state
+from .part_state import (
+    PartState,
+    new_state,
+    overwrite_state,
+    read_state,
+    state_path,
+    write_state,
+)
 
 _logger = logging.getLogger(__name__)
 
@@ -86,8 +94,8 @@ class PartLease:
         state = read_state(self._root, self._name)
         if state is not None and state.done_in(self._root, self._state.plan):
             return False
-        self._is_held = True
         self._write()
+        self._is_held = True
         self._thread.start()
         return True
 
@@ -99,9 +107,11 @@ class PartLease:
     def event(self, event: ProgressEvent) -> None:
         """Take the progress of the part; written with the next beat."""
         with self._guard:
+            finite = {name: x for name, x in event.figures.items() if math.isfinite(x)}
             self._state = replace(
-                self._state, fraction=event.fraction, message=event.message or self._state.message
-            )
+                self._state, fraction=event.fraction, message=event.message or self._state.message,
+                figures={**self._state.figures, **finite},
+            )  # fmt: skip
 
     def tell(self) -> None:
         """Write a line about the progress, if anybody reads the output."""
@@ -110,7 +120,13 @@ class PartLease:
             emit(message=message, fraction=round(self._state.fraction, 4))
 
     def finish(self, state: str, **changes: object) -> PartState:
-        """Write how the part has ended, unless another process holds it."""
+        """Write how the part has ended, unless another process holds it.
+
+        Raises
+        ------
+        OSError
+            It cannot be written that the part is done; that it is not need not be known.
+        """
         if not self._is_held:
             return self._state
         self._ended.set()
@@ -118,7 +134,13 @@ class PartLease:
         with self._guard:
             self._state = replace(self._state, state=state, **changes)  # type: ignore[arg-type]
         if not self._is_taken():
-            self._write()
+            try:
+                self._write()
+            except OSError:
+                if state == "DONE":
+                    raise
+                with contextlib.suppress(OSError):  # a full disk has the room of the earlier state
+                    overwrite_state(self._root, self._name, self._state)
         return self._state
 
     def _beat(self) -> None:

@@ -26,10 +26,10 @@ from ..stages.region_field import load_region, reject_short_edges
 from ..stages.region_meshing import TILES_FOLDER, TilesPlanned, remove_tiles
 from ..stages.texture_stage import run_texture
 from ..stages.tile_tasks import TileMaker, tile_file
-from ..stages.training_stage import run_training
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done
+from ..training.training_stage import run_block, run_coarse, run_training
 from .graph import Part, PartsGraph
 from .part_state import PartState, read_state
 from .planning import PlannedTiles
@@ -110,7 +110,8 @@ class PartRunner:
         if part.kind in TILE_KINDS:
             return self._run_tile(part, progress)
         work: dict[str, Callable[[Part, Progress], PartResult]] = {
-            "cameras": self._run_cameras, "masks": self._run_masks, "train": self._run_training,
+            "cameras": self._run_cameras, "masks": self._run_masks, "coarse": self._run_coarse,
+            "block": self._run_block, "train": self._run_training,
             "plan": self._run_plan, "mesh": self._run_mesh, "texture": self._run_texture,
             "bake": self._run_bake, "export": self._run_export,
         }  # fmt: skip
@@ -124,6 +125,22 @@ class PartRunner:
         stage = run_masks(
             self._folder, self._job, self._stage("cameras"), progress, threads=self._threads,
             device=self._device,
+        )  # fmt: skip
+        return self._finished(part, stage)
+
+    def _run_coarse(self, part: Part, progress: Progress) -> PartResult:
+        cameras = self._cameras()
+        reject_short_edges(self._job, cameras.folder)
+        stage = run_coarse(
+            self._folder, self._job, cameras, progress, version=STAGE_VERSIONS["train"],
+            threads=self._threads, device=self._device,
+        )  # fmt: skip
+        return self._finished(part, stage)
+
+    def _run_block(self, part: Part, progress: Progress) -> PartResult:
+        stage = run_block(
+            self._folder, self._job, self._cameras(), part.block, progress,
+            version=STAGE_VERSIONS["train"], threads=self._threads, device=self._device,
         )  # fmt: skip
         return self._finished(part, stage)
 

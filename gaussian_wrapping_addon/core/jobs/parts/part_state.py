@@ -7,13 +7,13 @@ import os
 import time
 import uuid
 from collections.abc import Collection
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from ... import limits
 from ...errors import ParseError
-from ...files import read_json, resolve_inside, write_json
+from ...files import overwrite_json, read_json, resolve_inside, write_json
 from ...processes.process_identity import host_and_pid_namespace, process_start_ticks
 
 STATES_FOLDER = "parts"
@@ -46,6 +46,8 @@ class PartState:
     seconds: float = 0.0
     """How long it took, in this attempt."""
     peak_memory_bytes: int = 0
+    figures: dict[str, float] = field(default_factory=dict)
+    """Live figures, such as ``iteration`` and ``psnr`` of a training."""
     outputs: tuple[str, ...] = ()
     """Files and folders, relative to the job folder; of a stage first its own folder."""
 
@@ -79,15 +81,24 @@ def state_path(root: Path, name: str) -> Path:
 def write_state(root: Path, name: str, state: PartState) -> None:
     """Write the state of a part, atomically."""
     states_folder(root).mkdir(exist_ok=True)
-    write_json(state_path(root, name), {**asdict(state), "outputs": list(state.outputs)})
+    write_json(state_path(root, name), _values_of(state))
+
+
+def overwrite_state(root: Path, name: str, state: PartState) -> None:
+    """Write the state of a part over the earlier one, where there is no room for another file."""
+    overwrite_json(state_path(root, name), _values_of(state))
+
+
+def _values_of(state: PartState) -> dict[str, Any]:
+    return {**asdict(state), "outputs": list(state.outputs)}
 
 
 def read_state(root: Path, name: str) -> PartState | None:
     """Return the state of a part; ``None`` where there is none, or it is damaged."""
     try:
-        values = read_json(state_path(root, name), most_bytes=limits.MAX_STATUS_BYTES)
+        values = read_json(state_path(root, name), most_bytes=limits.MAX_PART_STATE_BYTES)
         return _state_of(values)
-    except (OSError, ParseError, TypeError, ValueError, KeyError):
+    except (OSError, ParseError, TypeError, ValueError, KeyError, OverflowError):
         return None
 
 
@@ -107,10 +118,13 @@ def _state_of(values: Any) -> PartState:
         and isinstance(outputs, list)
         and all(isinstance(output, str) for output in outputs)
         and known["state"] in STATES
+        and isinstance(known["figures"], dict)
+        and all(_is_number(figure, int | float) for figure in known["figures"].values())
     )
     if not good:
         raise TypeError("a value has the wrong type")
-    return PartState(**{**known, "outputs": tuple(outputs)})
+    numbers = {name: float(known[name]) for name in _NUMBERS}
+    return PartState(**{**known, **numbers, "outputs": tuple(outputs)})
 
 
 def _is_number(value: Any, kinds: Any) -> bool:

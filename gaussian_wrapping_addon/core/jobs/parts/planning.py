@@ -23,6 +23,8 @@ MASKS_SHARE = 0.1
 """Of the time of a training that masks are made for."""
 BAKE_BEGINS = 0.02
 """Share of a bake's time before the bake itself."""
+_IN_BLOCKS = {"coarse": 0.12, "block": 0.68, "train": 0.2}
+"""Shares of a training in blocks: the coarse one, all blocks, joining."""
 _TILED = {"plan": 0.2, POINTS: 0.3, GATHER: 0.03, FACES: 0.37, "mesh": 0.1}
 """Shares of the mesh stage of a region in tiles."""
 
@@ -117,7 +119,21 @@ def _begin(job: JobFile) -> list[Part]:
         made = train * MASKS_SHARE
         train -= made
         parts.append(Part("masks", "masks", ("cameras",), ("stages/masked-*/scene.json",), made))
-    needs = (parts[-1].name,)
+    needs: tuple[str, ...] = (parts[-1].name,)
+    blocks = job.settings.training.blocks
+    if blocks > 1 and job.command != "bake":
+        of = {kind: train * share for kind, share in _IN_BLOCKS.items()}
+        stage = "stages/blocks-*"
+        parts.append(Part("coarse", "coarse", needs, (f"{stage}/blocks.json",), of["coarse"]))
+        trained = [
+            Part(
+                f"block-{number:04d}", "block", ("coarse",),
+                (f"{stage}/block-{number:04d}/gaussians.npz",), of["block"] / blocks, block=number,
+            )
+            for number in range(blocks)
+        ]  # fmt: skip
+        parts += trained
+        needs, train = tuple(part.name for part in trained), of["train"]
     return [*parts, Part("train", "train", needs, ("stages/train-*/gaussians.npz",), train)]
 
 

@@ -23,8 +23,8 @@ from ..store.stage_folder import (
     source_fingerprint,
     stage_key,
 )
+from ..store.training_keys import training_keys
 from ..video.frames_stage import frames_request, run_frames, with_frame_facts
-from .training_stage import training_keys
 
 if TYPE_CHECKING:
     from ...dataset.loading.real_world import UnitsRequest

@@ -105,7 +105,8 @@ def _figures_in(result: Path) -> dict[str, dict[str, Any]]:
 def _job_report(
     cameras: Stage, trained: Stage, regions: list[tuple[str, Stage, Stage]]
 ) -> dict[str, Any]:
-    stages = [*cameras.before, cameras, trained, *(s for _, m, t in regions for s in (m, t))]
+    training = [*trained.before, trained]
+    stages = [*cameras.before, cameras, *training, *(s for _, m, t in regions for s in (m, t))]
     return {
         "stages": [
             {

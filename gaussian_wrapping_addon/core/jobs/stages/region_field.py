@@ -215,6 +215,7 @@ def region_field(
         A mask does not fit its photo, or masks cover every photo that was trained on.
     """
     from ...dataset.photos.photo_store import PhotoStore
+    from ...field.vacancy.photo_masks import PackedMask
     from ...field.vacancy.vacancy import VacancyField
     from ...meshing.points.candidate_surface import halo_bounds
 
@@ -225,7 +226,7 @@ def region_field(
         "threads": threads,
         "unseen": meshing.unseen,
         "region_bounds": halo_bounds(region),
-        "masks": [photos.mask(index) for index in views],
+        "masks": [PackedMask.of(photos.mask(index)) for index in views],
         "mask_mode": scene.mask_mode(training.mask_mode),
     }
     if device.startswith("cuda"):

@@ -139,9 +139,9 @@ def _joined(
     from ...meshing.tiles.store import (
         faces_path,
         gathered_path,
-        load_faces,
-        load_gathered,
         load_plan,
+        load_point_figures,
+        load_surface,
     )
     from ...meshing.tiles.tiled_mesh import join_tiles
 
@@ -150,8 +150,10 @@ def _joined(
     paths = [faces_path(folder, tile) for tile in range(len(plan.tiling))]
     if not all(path.is_file() for path in [gathered_path(folder), *paths]):
         raise TilesPlanned(stage_folder)
-    parts = [load_faces(path) for path in paths]
-    mesh = join_tiles(field, plan, load_gathered(gathered_path(folder)), parts, meshing, progress)
+    mesh = join_tiles(
+        field, plan, load_point_figures(gathered_path(folder)),
+        lambda tile: load_surface(paths[tile]), meshing, progress,
+    )  # fmt: skip
     if noted.get("warnings"):
         mesh.provenance["warnings"] = list(noted["warnings"])
     return mesh, dict(noted.get("estimate", {}))

@@ -15,12 +15,13 @@ from ...meshing.tiles.store import (
     load_plan,
     load_points,
     points_path,
-    save_faces,
     save_gathered,
     save_points,
+    save_surface,
 )
 from ...meshing.tiles.tile_faces import tile_faces
 from ...meshing.tiles.tile_points import GatheredPoints, gather, tile_points
+from ...meshing.tiles.tile_surface import tile_surface
 from ...progress import Progress
 
 
@@ -73,5 +74,6 @@ class TileMaker:
             parts = [load_points(points_path(self._folder, number)) for number in range(count)]
             save_gathered(path, gather(self.plan, parts))
         else:
-            save_faces(path, tile_faces(field, self.plan, self._all_points, tile, progress))
+            faces = tile_faces(field, self.plan, self._all_points, tile, progress.span(0.0, 0.9))
+            save_surface(path, tile_surface(self.plan, self._all_points, faces))
         return path

@@ -145,6 +145,12 @@ def make_job(
             "and georeference on replace by metres.",
             "Leave one of them out; a result can be scaled by a measured length.",
         )
+    from_splat = bool(start) or source.suffix.lower() == ".ply"
+    if command == "wrap" and settings.training.blocks > 1 and from_splat:
+        raise UsageError(
+            "A training that starts from a splat cannot be divided into blocks.",
+            "Leave out --blocks.",
+        )
     control = settings.control_points
     # A finished training is meshed without it.
     if command == "wrap" and control and not Path(control).is_file():

@@ -186,19 +186,24 @@ class JobFolder:
             raise known_error(error, self.root) or unwritable_error(self.root, error) from None
         self.check_entries()
 
-    def check_entries(self) -> None:
+    def check_entries(self, *, but: frozenset[str] = frozenset()) -> None:
         """Raise unless everything in the folder is a regular file or a folder, at any depth.
 
         Before any command reads or writes more than the status: the folder may come from elsewhere,
         and a link in it would lead writes and deletions out of it. The folder itself may be reached
         through links.
 
+        Parameters
+        ----------
+        but : frozenset of str
+            Names of folders that are not looked into; they must be folders all the same.
+
         Raises
         ------
         DatasetError
             Names the entry.
         """
-        reject_foreign_entries(self.root)
+        reject_foreign_entries(self.root, but=but)
 
     def is_job(self) -> bool:
         """Whether a job was started here."""

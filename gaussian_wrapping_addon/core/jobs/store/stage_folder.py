@@ -29,7 +29,7 @@ _logger = logging.getLogger(__name__)
 # whatever the number of their cameras; with another number of their own they cannot: a training
 # that comes out better now keeps its number.
 STAGE_VERSIONS = {
-    "frames": 1, "cameras": 3, "masks": 1, "masked": 1, "train": 6, "mesh": 11, "texture": 13,
+    "frames": 1, "cameras": 3, "masks": 1, "masked": 1, "train": 6, "mesh": 12, "texture": 13,
     "bake": 3,
 }  # fmt: skip
 
@@ -54,7 +54,8 @@ class Stage:
     """Content of ``done.json``: the stage's measurements."""
     reused: bool
     before: tuple[Stage, ...] = ()
-    """Stages that it takes the place of, for the report: cameras and masks of a masked scene."""
+    """Stages that it was made of, for the report: of a masked scene its cameras and masks, of a
+    training in blocks each of them."""
 
 
 def stage_key(*parts: Any) -> str:

@@ -30,6 +30,7 @@ def flip_edges(
     dense_vertices: np.ndarray,
     dense_faces: np.ndarray,
     longest: float,
+    movable: np.ndarray | None = None,
 ) -> np.ndarray:
     """Flip edges while that brings the faces closer to a dense mesh of the same surface.
 
@@ -48,6 +49,8 @@ def flip_edges(
         Oriented alike.
     longest : float
         Greatest length of a new edge.
+    movable : (f,) bool, optional
+        For a part of a mesh: faces that may change. All faces at their corners are given.
 
     Returns
     -------
@@ -61,7 +64,7 @@ def flip_edges(
     points = vertices - (low + high) / 2
     surface = _SurfaceHeights(points, dense_vertices - (low + high) / 2, dense_faces)
     for _ in range(PASSES):
-        chosen = _one_pass(points, faces, surface, longest)
+        chosen = _one_pass(points, faces, surface, longest, movable)
         if chosen == 0:
             break
     return faces
@@ -102,15 +105,23 @@ class _SurfaceHeights:
 
 
 def _one_pass(
-    points: np.ndarray, faces: np.ndarray, surface: _SurfaceHeights, longest: float
+    points: np.ndarray,
+    faces: np.ndarray,
+    surface: _SurfaceHeights,
+    longest: float,
+    movable: np.ndarray | None,
 ) -> int:
     """Flip the best edges, no two in the same face, in place; return their number."""
     # Half-edge 3 f + k leads from corner k of face f to the next, opposite the third.
     start, end, tip = (np.roll(faces, -k, 1).ravel() for k in range(3))
     backward = end * len(points) + start
-    order = np.argsort(start * len(points) + end)
-    twin = order[np.searchsorted((start * len(points) + end)[order], backward)]
+    forward = start * len(points) + end
+    order = np.argsort(forward)
+    twin = order[np.minimum(np.searchsorted(forward[order], backward), len(order) - 1)]
     one = np.flatnonzero(start < end)
+    if movable is not None:
+        one = one[forward[twin[one]] == backward[one]]
+        one = one[movable[one // 3] & movable[twin[one] // 3]]
     other = twin[one]
     a, b, c, d = start[one], end[one], tip[one], tip[other]
 
@@ -127,7 +138,7 @@ def _one_pass(
         allowed &= (normal * up).sum(1) > LEAST_COSINE
     allowed &= (normal_3 * normal_4).sum(1) > 0.0
     allowed &= np.linalg.norm(points[c] - points[d], axis=1) <= longest
-    edges = surface.key(a, b)
+    edges = surface.key(a, b) if movable is None else surface.key(start, end)
     allowed &= ~np.isin(surface.key(c, d), edges)
 
     rows = np.flatnonzero(allowed)

@@ -35,18 +35,26 @@ class Simplification:
         Oriented 2-manifold; modified in place.
     scale, point_weight : float
         See :func:`.quadrics.add_face_quadrics`.
+    quadrics : (v, 11) float64, optional
+        Instead of those of the faces; modified in place.
     """
 
     def __init__(
-        self, points: np.ndarray, faces: np.ndarray, scale: float, point_weight: float
+        self,
+        points: np.ndarray,
+        faces: np.ndarray,
+        scale: float,
+        point_weight: float,
+        quadrics: np.ndarray | None = None,
     ) -> None:
         count = len(points)
         head, following = np.full(count, -1, np.int64), np.full(faces.size, -1, np.int64)
         link_corners(faces, head, following)
         self.points, self._faces = np.ascontiguousarray(points), faces
         self.stamps = np.zeros(count, np.int64)
-        quadrics = np.zeros((count, COLUMNS))
-        add_face_quadrics(self.points, faces, quadrics, scale, point_weight)
+        if quadrics is None:
+            quadrics = np.zeros((count, COLUMNS))
+            add_face_quadrics(self.points, faces, quadrics, scale, point_weight)
         marks = np.zeros(count, np.int64)
         self.mesh = (self.points, faces, head, following, quadrics, self.stamps, marks)
         """The tuple that kernels take, see :mod:`.corners`."""

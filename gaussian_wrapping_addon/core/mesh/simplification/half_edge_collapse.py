@@ -40,6 +40,20 @@ class ShapeBounds(NamedTuple):
     """Least cosine between the normals of a triangle before and after."""
 
 
+class MergeLog(NamedTuple):
+    """Which vertices take part, and what has become of them."""
+
+    locked: np.ndarray
+    """(v,) bool: vertices that neither merge nor are merged into; all others have all their faces.
+    """
+    into: np.ndarray
+    """(v,) int64: the vertex that each has merged into; filled."""
+    level: np.ndarray
+    """(v,) float64: the highest cost so far when it merged; filled."""
+    highest: np.ndarray
+    """(1,) float64: the highest cost so far."""
+
+
 @part(fast=False)
 def _shapes_allow(gone, stays, mesh, bounds):
     """Return whether all faces of ``gone`` stay within the bounds when it moves to ``stays``."""
@@ -84,7 +98,7 @@ def _shapes_allow(gone, stays, mesh, bounds):
 
 
 @part(fast=False)
-def _cheapest(vertex, mesh, counts, bounds, ring):
+def _cheapest(vertex, mesh, counts, bounds, locked, ring):
     """Return the neighbour that ``vertex`` merges into at the least cost, and the cost.
 
     (-1, inf) if there is none. Ties are broken by index, so the order of faces does not matter.
@@ -92,6 +106,8 @@ def _cheapest(vertex, mesh, counts, bounds, ring):
     points, faces, head, following, quadrics = mesh[0], mesh[1], mesh[2], mesh[3], mesh[4]
     shape_weight = bounds[1]
     best, lowest = -1, np.inf
+    if locked[vertex]:
+        return best, lowest
     unlink_dead_faces(vertex, faces, head, following)
     around, mark = mark_ring(vertex, mesh, counts, ring)
     if around > MAX_RING:
@@ -101,6 +117,8 @@ def _cheapest(vertex, mesh, counts, bounds, ring):
     limit = MAX_RING - 1 if around == 3 else MAX_RING
     for i in range(around):
         stays = ring[i]
+        if locked[stays]:
+            continue
         square = 0.0
         for k in range(3):
             square += (points[vertex, k] - points[stays, k]) ** 2
@@ -124,19 +142,19 @@ def _push(vertex, price, stamp, heap, counts):
 
 
 @kernel(fast=False)
-def push_vertices(mesh, heap, counts, bounds):
+def push_vertices(mesh, heap, counts, bounds, log):
     """Push every removable vertex onto the empty heap, which must have room for all."""
     head, stamps = mesh[2], mesh[5]
     ring = np.empty(MAX_RING, np.int64)
     for vertex in range(len(head)):
         if head[vertex] >= 0:
-            best, price = _cheapest(vertex, mesh, counts, bounds, ring)
+            best, price = _cheapest(vertex, mesh, counts, bounds, log[0], ring)
             if best >= 0:
                 _push(vertex, price, stamps[vertex], heap, counts)
 
 
 @kernel(fast=False)
-def collapse_half_edges(mesh, heap, counts, bounds, target, budget):
+def collapse_half_edges(mesh, heap, counts, bounds, log, target, most, budget):
     """Merge the cheapest vertices into neighbours until ``target`` vertices are left.
 
     Parameters
@@ -145,10 +163,15 @@ def collapse_half_edges(mesh, heap, counts, bounds, target, budget):
         See :mod:`.corners`, above and :mod:`.counters`.
     bounds : tuple
         Values of :class:`ShapeBounds`.
+    log : tuple
+        Arrays of :class:`MergeLog`.
+    most : float
+        Highest cost of a merger.
     budget : int
         Greatest number of entries to pop.
     """
     stamps = mesh[5]
+    locked, into, level, highest = log
     ring, changed = np.empty(MAX_RING, np.int64), np.empty(MAX_RING + 1, np.int64)
     room = len(heap[0]) - HEAP_ROOM
     for _ in range(budget):
@@ -159,10 +182,12 @@ def collapse_half_edges(mesh, heap, counts, bounds, target, budget):
         if counts[HEAP_SIZE] > room:
             return FULL
         price, gone, stamp = heap[0][0], heap[1][0], heap[2][0]
+        if price > most:
+            return DONE
         pop_first(heap, counts)
         if stamps[gone] != stamp:
             continue
-        stays, now = _cheapest(gone, mesh, counts, bounds, ring)
+        stays, now = _cheapest(gone, mesh, counts, bounds, locked, ring)
         if stays < 0:
             continue
         if now > price:
@@ -170,12 +195,14 @@ def collapse_half_edges(mesh, heap, counts, bounds, target, budget):
             _push(gone, now, stamps[gone], heap, counts)
             continue
         merge_vertices(stays, gone, mesh, counts)
+        highest[0] = max(highest[0], price)
+        into[gone], level[gone] = stays, highest[0]
         around, _ = mark_ring(stays, mesh, counts, changed)
         changed[around] = stays
         for slot in range(around + 1):
             vertex = changed[slot]
             stamps[vertex] += 1
-            best, price = _cheapest(vertex, mesh, counts, bounds, ring)
+            best, price = _cheapest(vertex, mesh, counts, bounds, locked, ring)
             if best >= 0:
                 _push(vertex, price, stamps[vertex], heap, counts)
     return PAUSED

@@ -28,7 +28,11 @@ def narrow_faces(vertices: np.ndarray, faces: np.ndarray, height: float) -> np.n
 
 
 def remove_degenerate(
-    vertices: np.ndarray, faces: np.ndarray, height: float, region: Region | None = None
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    height: float,
+    region: Region | None = None,
+    fixed: np.ndarray | None = None,
 ) -> tuple[np.ndarray, int]:
     """Remove faces narrower than ``height``: needles by edge collapses, flat ones by edge flips.
 
@@ -43,6 +47,8 @@ def remove_degenerate(
     region : Region, optional
         Keeps caps on the region's planes: no vertex is merged into one that lies on fewer of these
         planes, and no edge of the region is flipped unless the third vertex lies on it as well.
+    fixed : (v,) bool, optional
+        For a part of a mesh: vertices that have faces elsewhere.
 
     Returns
     -------
@@ -59,6 +65,9 @@ def remove_degenerate(
         longer = 2.0 ** max(0, done - PATIENT_PASSES)
         short = height * min(SHORT_HEIGHTS * longer, MAX_SHORT_HEIGHTS)
         near, frozen = _surroundings(len(vertices), faces, narrow)
+        if fixed is not None:
+            corners = np.unique(faces[near])
+            frozen |= set(corners[fixed[corners]].tolist())
         mesh = _HalfEdgeMesh(faces[near], frozen)
         changed = False
         for face in np.searchsorted(near, narrow).tolist():

@@ -39,7 +39,9 @@ class RepairResult:
     """Edges that were split at their midpoint."""
 
 
-def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> RepairResult:
+def split_nonmanifold(
+    vertices: np.ndarray, faces: np.ndarray, fixed: np.ndarray | None = None
+) -> RepairResult:
     """Split edges with more than two faces, and vertices with more than one fan of faces.
 
     Around an edge, faces that bound the same wedge of the solid stay together. Where both copies
@@ -52,6 +54,9 @@ def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> RepairResult:
     faces : (f, 3) int
         Closed and consistently oriented: along each edge as many half-edges run one way as the
         other.
+    fixed : (v,) bool, optional
+        For a part of a closed set of faces: vertices that are not split, nor the edges between
+        them. All faces at the others are given.
 
     Raises
     ------
@@ -59,14 +64,17 @@ def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> RepairResult:
         The set of faces is not closed.
     """
     faces = np.asarray(faces, np.int64)
+    fixed = np.zeros(len(vertices), np.bool_) if fixed is None else fixed
     origin = np.arange(len(vertices))
     split_edges = 0
+    if len(faces) == 0:
+        return RepairResult(vertices[:0], faces, origin[:0], 0, 0)
     before = len(np.unique(faces))
     for _ in range(MAX_PASSES):
-        partner = _partners(vertices, faces)
-        new_faces, source = _fans(faces, partner)
-        vertices, origin = vertices[source], origin[source]
-        bad = _nonmanifold_half_edges(new_faces)
+        partner = _partners(vertices, faces, fixed)
+        new_faces, source = _fans(faces, partner, fixed)
+        vertices, origin, fixed = vertices[source], origin[source], fixed[source]
+        bad = _nonmanifold_half_edges(new_faces) & (partner >= 0)
         if not bad.any():
             break
         pairs = _independent_pairs(bad, partner)
@@ -74,6 +82,7 @@ def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> RepairResult:
         new_faces = _split_at_middles(new_faces, pairs, partner, len(vertices))
         vertices = np.concatenate([vertices, middles])
         origin = np.append(origin, np.full(len(pairs), -1))
+        fixed = np.append(fixed, np.zeros(len(pairs), np.bool_))
         split_edges += len(pairs)
         faces = new_faces
     else:
@@ -89,12 +98,18 @@ def _ends(faces: np.ndarray) -> np.ndarray:
     return half_edges(faces)[1]
 
 
-def _partners(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Pair each half-edge with the opposite one that bounds the same wedge of the solid."""
+def _partners(vertices: np.ndarray, faces: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """Pair each half-edge with the opposite one that bounds the same wedge of the solid.
+
+    -1 for half-edges between fixed vertices.
+    """
     begin, end = half_edges(faces)
     low, high = np.minimum(begin, end), np.maximum(begin, end)
     forward = begin < end
     order = np.lexsort((forward, high, low))
+    order = order[~(fixed[low] & fixed[high])[order]]
+    if len(order) == 0:
+        return np.full(faces.size, -1)
     new_edge = np.ones(len(order), np.bool_)
     new_edge[1:] = (low[order[1:]] != low[order[:-1]]) | (high[order[1:]] != high[order[:-1]])
     starts = np.append(np.flatnonzero(new_edge), len(order))
@@ -102,7 +117,7 @@ def _partners(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     forwards = np.add.reduceat(forward[order].astype(np.int64), starts[:-1])
     if (2 * forwards != sizes).any():
         raise MeshingError("The surface is not closed.", _DEFECT)
-    partner = np.empty(len(order), np.int64)
+    partner = np.full(faces.size, -1)
     plain = starts[:-1][sizes == 2]
     partner[order[plain]], partner[order[plain + 1]] = order[plain + 1], order[plain]
     for index in np.flatnonzero(sizes > 2):
@@ -148,8 +163,10 @@ def _wedges(
     return pairs
 
 
-def _fans(faces: np.ndarray, partner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split vertices so that each fan of faces has its own.
+def _fans(
+    faces: np.ndarray, partner: np.ndarray, fixed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Split vertices that are not fixed so that each fan of faces has its own.
 
     Returns
     -------
@@ -161,13 +178,20 @@ def _fans(faces: np.ndarray, partner: np.ndarray) -> tuple[np.ndarray, np.ndarra
     corners = np.arange(faces.size)
     following = next_half_edges(corners)
     # Half-edge h leads from corner h to the next; its partner runs the other way.
-    rows = np.concatenate([corners, following])
-    columns = np.concatenate([following[partner], partner])
+    paired = partner >= 0
+    rows = np.concatenate([corners[paired], following[paired]])
+    columns = np.concatenate([following[partner[paired]], partner[paired]])
+    whole = np.flatnonzero(fixed[faces.reshape(-1)])
+    if len(whole):
+        first = np.zeros(len(fixed), np.int64)
+        first[faces.reshape(-1)[whole]] = whole  # any one corner of each
+        rows = np.concatenate([rows, whole])
+        columns = np.concatenate([columns, first[faces.reshape(-1)[whole]]])
     graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(faces.size,) * 2)
     _, label = connected_components(graph, directed=False)
-    _, first = np.unique(label, return_index=True)
-    old = faces.reshape(-1)[first]
-    order = np.lexsort((first, old))
+    _, least = np.unique(label, return_index=True)
+    old = faces.reshape(-1)[least]
+    order = np.lexsort((least, old))
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
     return rank[label].reshape(-1, 3), old[order]

@@ -44,8 +44,11 @@ BOUNDARY_SAMPLES = 4096
 POINT_BYTES = 3_500
 """Peak per point of a mesh made in one piece (with adaptive spacing, of the dense mesh):
 tetrahedra, candidates, repair (145 000 points of a sphere took 3 100 each)."""
-JOINED_POINT_BYTES = 2_000
-"""The same for a tiled mesh, of which only the surface is held in one piece."""
+JOINED_VERTEX_BYTES = 1_200
+"""Peak per vertex of the simplified mesh while tiles are joined
+(benchmarks/meshing_parts/joining.py: 1 000)."""
+GATHERED_POINT_BYTES = 300
+"""Peak per dense point while the points of all tiles are thinned together (measured: 210)."""
 SURROUNDINGS = 2.0
 """Points in and around a tile, as a multiple of its own."""
 BASE_BYTES = 800 << 20
@@ -128,7 +131,9 @@ class MeshEstimate:
         room = max(memory_bytes - BASE_BYTES, 0)
         points = room / POINT_BYTES
         if tiled:
-            points = max(points, (room - _tile_bytes(TILE_POINTS)) / JOINED_POINT_BYTES)
+            share = self.points_low / max(self.dense_low, 1)
+            each = GATHERED_POINT_BYTES + share * JOINED_VERTEX_BYTES
+            points = max(points, (room - _tile_bytes(TILE_POINTS)) / each)
         hint = self._coarser(points)
         if room <= BASE_BYTES // 8:
             hint = "Close other programs"
@@ -271,7 +276,8 @@ def estimate_mesh(
     stay_low = min(stay_low, low) if adaptive else low
     stay_high = max(stay_high, share * high) if adaptive else high
     each_s = EVALUATIONS_PER_POINT * evaluation_s + POINT_S
-    tiled = BASE_BYTES + low * JOINED_POINT_BYTES + _tile_bytes(min(low, TILE_POINTS))
+    tiled = BASE_BYTES + low * GATHERED_POINT_BYTES + _tile_bytes(min(low, TILE_POINTS))
+    tiled += min(stay_low, low) * JOINED_VERTEX_BYTES
     whole_low = BASE_BYTES + low * POINT_BYTES
     return MeshEstimate(
         area,

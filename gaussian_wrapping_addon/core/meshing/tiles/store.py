@@ -23,16 +23,20 @@ from ..points.region_caps import Caps
 from ..points.spacing import Spacing
 from ..points.surface_points import SurfacePoints
 from .plan import TilePlan
-from .tile_faces import TileFaces
 from .tile_points import GatheredPoints
+from .tile_surface import TileSurface
 
 LIST_NAME = "tiles.json"
-VERSION = 2
+VERSION = 3
 _PLAN_ARRAYS = (
     "vertices", "faces", "fillers", "region", "cap_points", "cap_normals", "cap_radii",
     "cap_priority", "spacing_points", "spacing_radii",
 )  # fmt: skip
 _CLOUD_ARRAYS = ("points", "normals", "kind", "radius", "radii", "notes", "figures")
+_SURFACE_ARRAYS = (
+    "vertices", "faces", "number", "kind", "into", "level", "border", "solid", "least_height",
+    "figures",
+)  # fmt: skip
 _AGAIN = "Delete this file and resume: it is made again."
 
 
@@ -170,20 +174,28 @@ def load_gathered(path: Path) -> GatheredPoints:
     return GatheredPoints(_cloud_of(path, arrays), arrays["shifted"], arrays["inner"])
 
 
-def save_faces(path: Path, part: TileFaces) -> None:
-    """Write the faces of a tile."""
-    _save(
-        path, faces=part.faces, border=part.border, solid=part.solid,
-        figures=np.array(json.dumps(part.figures)),
-    )  # fmt: skip
-
-
-def load_faces(path: Path) -> TileFaces:
-    """Read the faces of a tile; :class:`ParseError` where the file is damaged."""
-    arrays = read_arrays(path, ("faces", "border", "solid", "figures"), hint=_AGAIN)
+def load_point_figures(path: Path) -> dict[str, Any]:
+    """Read only what was counted of the points of all tiles; :class:`ParseError` as above."""
+    arrays = read_arrays(path, ("figures",), hint=_AGAIN)
     with _damaged(path):
-        figures = json.loads(str(arrays["figures"]))
-    return TileFaces(arrays["faces"], arrays["border"], arrays["solid"], figures)
+        return dict(json.loads(str(arrays["figures"])))
+
+
+def save_surface(path: Path, surface: TileSurface) -> None:
+    """Write the surface of a tile."""
+    values = {name: getattr(surface, name) for name in _SURFACE_ARRAYS}
+    values["least_height"] = np.array(surface.least_height)
+    values["figures"] = np.array(json.dumps(surface.figures))
+    _save(path, **values)
+
+
+def load_surface(path: Path) -> TileSurface:
+    """Read the surface of a tile; :class:`ParseError` where the file is damaged."""
+    arrays: dict[str, Any] = read_arrays(path, _SURFACE_ARRAYS, hint=_AGAIN)
+    with _damaged(path):
+        arrays["least_height"] = float(arrays["least_height"])
+        arrays["figures"] = json.loads(str(arrays["figures"]))
+    return TileSurface(**arrays)
 
 
 def _of_cloud(cloud: SurfacePoints) -> dict[str, np.ndarray]:

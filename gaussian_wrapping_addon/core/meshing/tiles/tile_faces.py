@@ -9,12 +9,11 @@ labels are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ...errors import MeshingError
 from ...progress import Progress
 from ..tetrahedra.boundary_faces import OUTWARD_FACES, tetrahedron_neighbours
 from ..tetrahedra.classification import classify, on_one_sheet
@@ -31,12 +30,16 @@ class TileFaces:
     """Faces of one tile; corners are indices into the gathered points of the region."""
 
     faces: np.ndarray
-    """(f, 3) int64: between two tetrahedra of the tile, oriented outward."""
+    """(f, 3) int64, oriented outward: between two tetrahedra of the tile, or on the region's
+    boundary."""
     border: np.ndarray
     """(b, 3) int64: faces between the tile's tetrahedra and others, oriented out of the tile's."""
     solid: np.ndarray
     """(b,) bool: whether the tile's tetrahedron at that face is inside."""
     figures: dict[str, Any]
+    whole: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(p,) int64, increasing: points whose faces are all in ``faces``, since no other tile has a
+    tetrahedron there."""
 
 
 def tile_faces(
@@ -82,17 +85,26 @@ def tile_faces(
     inside = labels.inside
     known = np.where(neighbours >= 0, owned[neighbours], False)  # (m, 4)
     theirs = np.where(neighbours >= 0, inside[neighbours], False)
+    # A neighbour with a corner in the tile is the same in all tiles.
+    own = np.append(own, np.zeros(8, np.bool_))
+    beyond = np.nonzero(owned[:, None] & (neighbours >= 0) & outer[neighbours])
+    known[beyond] = own[tetrahedra[beyond[0][:, None], OUTWARD_FACES[beyond[1]]]].any(1)
+    theirs[beyond] = False
     tetrahedron, corner = np.nonzero((owned & inside)[:, None] & known & ~theirs)
     faces = numbers[tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]]
     tetrahedron, corner = np.nonzero(owned[:, None] & ~known)
     border = numbers[tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]]
+    # All tetrahedra at points of the tile are there.
+    whole = own.copy()
+    whole[tetrahedra[~owned & ~outer]] = False
     figures = {
         "tetrahedra": int(owned.sum()),
         "interior_samples": int(labels.samples[owned].sum()),
         "relabelled_tetrahedra": labels.flipped,
         "undecided_tetrahedra": labels.undecided,
     }
-    return TileFaces(faces, border, inside[tetrahedron], figures)
+    whole = numbers[whole[:-8] & gathered.inner[numbers]]
+    return TileFaces(faces, border, inside[tetrahedron], figures, whole)
 
 
 def local_tetrahedra(
@@ -119,36 +131,3 @@ def local_tetrahedra(
 def _no_faces() -> TileFaces:
     none = np.zeros((0, 3), np.int64)
     return TileFaces(none, none, np.zeros(0, np.bool_), {})
-
-
-def joined_faces(parts: list[TileFaces]) -> np.ndarray:
-    """Join the faces of all tiles, (f, 3) int64.
-
-    A border face listed by two tiles lies between their tetrahedra; one listed by a single tile
-    lies on the region's boundary.
-
-    Raises
-    ------
-    MeshingError
-        Two tiles have triangulated the points near their border differently.
-    """
-    border = np.concatenate([part.border for part in parts])
-    solid = np.concatenate([part.solid for part in parts])
-    low = np.sort(border, 1)
-    order = np.lexsort((low[:, 2], low[:, 1], low[:, 0]))
-    same = (low[order[1:]] == low[order[:-1]]).all(1)
-    first, second = order[:-1][same], order[1:][same]
-    turned = _parity(border[first]) != _parity(border[second])
-    if (same[1:] & same[:-1]).any() or not turned.all():
-        raise MeshingError(
-            "Tiles do not agree on their border.", "Use another seed or number of tiles."
-        )
-    covered = np.zeros(len(border), np.bool_)
-    covered[first], covered[second] = solid[second], solid[first]
-    return np.concatenate([*(part.faces for part in parts), border[solid & ~covered]])
-
-
-def _parity(faces: np.ndarray) -> np.ndarray:
-    """Return the parity of the permutation that sorts the corners of each face, (f,) bool."""
-    a, b, c = faces.T
-    return (a < b) ^ (b < c) ^ (c < a)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tiled meshing: plan, sample each tile, gather the points, label each tile, join the faces."""
+"""Tiled meshing: plan, sample each tile, gather the points, label each tile, join the surfaces."""
 
 from __future__ import annotations
 
@@ -10,26 +10,34 @@ from typing import Any
 import numpy as np
 
 from ...dataset.camera import Camera
+from ...errors import MeshingError
 from ...field.depth_samples import DepthSamples
 from ...gaussians.model import GaussianArrays
+from ...mesh.components import compacted, without_floaters
+from ...mesh.simplification.vertex_selection import merge_vertices
 from ...mesh.surface_mesh import SurfaceMesh
 from ...progress import Progress
 from ...regions.convex_region import Region
 from ...settings import MeshingSettings
+from ..cleanup.degenerate import remove_degenerate
 from ..points.candidate_surface import candidate_surface
 from ..points.resolution import checked_request
-from ..primal_adaptive import (
-    made_manifold,
-    residuals_on_surface,
-    simplified,
-    small_handles_closed,
-    vertex_counts,
-)
+from ..primal_adaptive import residuals_on_surface, small_handles_closed, vertex_counts
+from .growing_mesh import Joined
+from .join import LoadTile, joined, overview
 from .plan import Field, TilePlan, make_plan
-from .tile_faces import TileFaces, joined_faces
-from .tile_points import KIND_STEINER, GatheredPoints
+from .tile_flips import flip_by_tiles
+from .tile_points import KIND_STEINER
+from .tile_surface import cost_units, longest_edge
 
 _logger = logging.getLogger(__name__)
+
+MARGIN = 1.1
+"""Tiles are joined with this many times the vertices that stay, so that the last mergers choose
+among all of them."""
+
+MAX_ATTEMPTS = 3
+"""Where floaters are large or borders flat, fewer are left than wanted: tiles are joined again."""
 
 
 def plan_tiles(
@@ -76,35 +84,64 @@ def plan_tiles(
 def join_tiles(
     field: Field,
     plan: TilePlan,
-    gathered: GatheredPoints,
-    parts: list[TileFaces],
+    point_figures: dict[str, Any],
+    load: LoadTile,
     settings: MeshingSettings,
     progress: Progress,
 ) -> SurfaceMesh:
-    """Join the faces of all tiles into one closed 2-manifold and simplify it.
+    """Join the surfaces of all tiles into one closed 2-manifold, simplified.
 
-    The joined surface is held in one piece: memory is proportional to it, not to a tile, but the
-    tetrahedra, which are many times larger, never exist all at once.
+    Memory is proportional to the simplified mesh: of the dense surface there is one tile at a time,
+    and a band along the borders of those that have been joined.
 
     Parameters
     ----------
-    parts : list of TileFaces
-        In the order of the tiles.
+    point_figures : dict
+        ``figures`` of the gathered points.
+    load : callable
+        Returns the surface of a tile; called several times for each.
 
     Raises
     ------
     MeshingError
         The region holds no solid, or tiles do not agree on their border.
     """
-    faces = joined_faces(parts)
-    progress.update(0.1, f"joining {len(plan.tiling)} tiles")
-    cloud = gathered.cloud
-    vertices, faces, kind, figures = made_manifold(
-        cloud.points, faces, cloud, plan.region, settings, progress
-    )
-    figures["dense_vertices"] = len(vertices)
-    progress.update(0.95, f"simplifying {len(vertices)} vertices")
-    vertices, faces, kind = simplified(vertices, faces, kind, plan.target, plan.share, plan.region)
+    known = overview(plan, load, progress.span(0.0, 0.05))
+    # With uniform spacing all vertices stay.
+    wanted = MARGIN * max(plan.target, plan.share * known.vertices)
+    for attempt in range(MAX_ATTEMPTS):
+        level = known.level_for(wanted)
+        step = progress.span(0.05 + 0.15 * attempt, 0.2 + 0.15 * attempt)
+        mesh, between = joined(plan, load, known, level, step)
+        figures: dict[str, Any] = {
+            "split_vertices": known.figures.get("split_vertices", 0) + mesh.split_vertices,
+            "split_edges": known.figures.get("split_edges", 0) + mesh.split_edges,
+        }
+        whole = mesh.compacted()
+        del mesh
+        part, floaters = _without_floaters(plan, whole, settings)
+        del whole
+        dense = int(part.stand_for.sum(dtype=np.int64))
+        target = max(plan.target, round(plan.share * dense))
+        if level < 0.0 or len(part.vertices) >= target:
+            break
+        wanted *= MARGIN * target / len(part.vertices)
+    faces, narrow = remove_degenerate(part.vertices, part.faces, known.least_height, plan.region)
+    figures |= floaters | {"degenerate_faces_left": narrow, "dense_vertices": dense}
+    progress.update(0.5, f"simplifying {dense} vertices")
+    simplifies = dense > target
+    if simplifies:
+        faces = merge_vertices(
+            part.vertices, faces, cost_units(plan.region), target, longest_edge(plan),
+            quadrics=part.quadrics,
+        ).faces  # fmt: skip
+    vertices, faces, chosen = compacted(part.vertices, faces)
+    kind = part.kind[chosen]
+    del part
+    if simplifies:
+        faces = flip_by_tiles(
+            plan, load, known.boxes, between, vertices, faces, progress.span(0.6, 0.95)
+        )
     vertices, faces, kind, handles = small_handles_closed(vertices, faces, kind)
     figures |= handles | vertex_counts(kind)
     sums = ("tetrahedra", "interior_samples", "relabelled_tetrahedra", "undecided_tetrahedra")
@@ -120,8 +157,8 @@ def join_tiles(
         "spacing": settings.spacing,
         "notes": [note.to_json() for note in plan.notes],
         "seed": plan.seed,
-        **cloud.figures,
-        **{name: sum(part.figures.get(name, 0) for part in parts) for name in sums},
+        **point_figures,
+        **{name: known.figures.get(name, 0) for name in sums},
         **figures,
         "vertices_of_fillers": int((kind == KIND_STEINER).sum()),
         **residuals_on_surface(field.vacancy, vertices, kind),
@@ -129,3 +166,32 @@ def join_tiles(
     progress.update(1.0, f"{len(faces)} faces")
     _logger.info("Meshed region %s: %d faces", plan.region.name, len(faces))
     return SurfaceMesh(vertices, faces.astype(np.int32), None, provenance)
+
+
+def _without_floaters(
+    plan: TilePlan, whole: Joined, settings: MeshingSettings
+) -> tuple[Joined, dict[str, Any]]:
+    """Return what has been joined without floaters, and their figures."""
+    if len(whole.faces) == 0:
+        raise MeshingError(
+            f"Region {plan.region.name!r} holds no solid.",
+            "Draw the region around something that was photographed.",
+        )
+    # Closed triangle meshes have twice as many faces as vertices.
+    valence = np.bincount(whole.faces.ravel(), minlength=len(whole.vertices))
+    each = 2.0 * whole.stand_for / np.maximum(valence, 1)
+    floaters = without_floaters(
+        whole.vertices, whole.faces, settings.min_component_share, settings.most_parts,
+        each[whole.faces].sum(1),
+    )  # fmt: skip
+    figures = {
+        "components": floaters.kept,
+        "removed_solids": floaters.removed_solids,
+        "removed_cavities": floaters.removed_cavities,
+        "removed_area_share": floaters.removed_area_share,
+    }
+    vertices, faces, source = compacted(whole.vertices, floaters.faces)
+    part = Joined(
+        vertices, faces, whole.kind[source], whole.quadrics[source], whole.stand_for[source]
+    )
+    return part, figures

@@ -8,7 +8,7 @@ imitate the background, so that only transparency lowers the loss.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -92,7 +92,7 @@ def background_gradient(by_image: np.ndarray, background: np.ndarray) -> np.ndar
 def inside_masks(
     points: np.ndarray,
     cameras: Sequence[Camera],
-    masks: Sequence[np.ndarray | None],
+    masks: Iterable[np.ndarray | None],
     min_share: float = MIN_SHARE,
 ) -> np.ndarray:
     """Tell which points lie inside the masks in a sufficient share of the photos.
@@ -105,8 +105,8 @@ def inside_masks(
     points : (n, 3)
         Scene frame.
     cameras : sequence of Camera
-    masks : sequence of (h, w) bool or None
-        Of the cameras' sizes; ``None`` masks nothing.
+    masks : iterable of (h, w) bool or None
+        Of the cameras' sizes; ``None`` masks nothing. One is held at a time.
     min_share : float
         Share of the cameras with the point in their image whose masks must contain it; with 0 one
         of them suffices.
@@ -122,12 +122,12 @@ def inside_masks(
         Cameras and masks differ in number or size.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
-    if len(cameras) != len(masks):
-        raise UsageError(
-            f"There are {len(cameras)} cameras and {len(masks)} masks.", "Give one mask a camera."
-        )
     held, inside = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
-    for camera, mask in zip(cameras, masks, strict=True):
+    count = 0
+    for count, mask in enumerate(masks, start=1):
+        if count > len(cameras):
+            break
+        camera = cameras[count - 1]
         size = (camera.height, camera.width)
         if mask is not None and mask.shape != size:
             raise UsageError(
@@ -137,6 +137,8 @@ def inside_masks(
         rows, columns, _, seen = pixels_of(points, camera)
         held[seen] += 1
         inside[seen] += 1 if mask is None else mask[rows, columns]
+    if count != len(cameras):
+        raise UsageError("The numbers of cameras and masks differ.", "Give one mask a camera.")
     return (inside > 0) & (inside >= min_share * held)
 
 

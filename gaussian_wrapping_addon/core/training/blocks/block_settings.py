@@ -8,10 +8,8 @@ import math
 from dataclasses import dataclass
 
 from ...errors import UsageError
+from ...limits import MAX_BLOCKS
 from ...settings import TrainingSettings
-
-MOST_BLOCKS = 1024
-"""More cells than anybody has machines; a plan keeps a flag for each Gaussian and block."""
 
 SMALLEST_PX = 32
 """Least long side of the photos of the coarse training: that of the setting."""
@@ -30,7 +28,8 @@ class BlockSettings:
     """Share of the schedule at which blocks begin. Earlier than the coarse training has come: what
     they add takes most rounds of growth, and moves fastest, at first."""
     coarse_gaussians: float = 0.5
-    """Share of the Gaussians that the coarse training has at most."""
+    """Share of the Gaussians that the coarse training has at most; less for more blocks, so that it
+    does not need the most memory (:attr:`coarse_share`)."""
     coarse_px: float = 0.5
     """Share of the photos' long side at which it trains."""
     coverage: float = 0.95
@@ -43,10 +42,10 @@ class BlockSettings:
     """Share of the iterations that the joined Gaussians are trained together."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.blocks <= MOST_BLOCKS:
+        if not 1 <= self.blocks <= MAX_BLOCKS:
             raise UsageError(
                 f"A training cannot be divided into {self.blocks} blocks.",
-                f"Give a number from 1 to {MOST_BLOCKS}.",
+                f"Give a number from 1 to {MAX_BLOCKS}.",
             )
         bounds = {
             "margin": (0.0, 1.0), "coarse_iterations": (0.01, 1.0), "begin": (0.0, 0.9),
@@ -60,12 +59,22 @@ class BlockSettings:
                     f"{name} of a training in blocks is {value}.", f"Give {low} to {high}."
                 )
 
+    @classmethod
+    def of(cls, settings: TrainingSettings) -> BlockSettings:
+        """Return how settings of a whole training divide it."""
+        return cls(settings.blocks, polish_iterations=settings.polish)
+
+    @property
+    def coarse_share(self) -> float:
+        """Share of the Gaussians that the coarse training has at most: of two blocks, or less."""
+        return min(self.coarse_gaussians, 2.0 / self.blocks)
+
     def coarse(self, settings: TrainingSettings) -> TrainingSettings:
         """Return the settings of the coarse training that comes before the blocks."""
         return dataclasses.replace(
             settings,
             iterations=max(1, round(self.coarse_iterations * settings.iterations)),
             extra_iterations=0,
-            max_gaussians=max(1, round(self.coarse_gaussians * settings.max_gaussians)),
+            max_gaussians=max(1, round(self.coarse_share * settings.max_gaussians)),
             max_image_px=max(SMALLEST_PX, math.ceil(self.coarse_px * settings.max_image_px)),
         )

@@ -16,6 +16,7 @@ from ...dataset.scene import Scene
 from ...errors import ParseError
 from ...gaussians.model import OrientedGaussians
 from ...progress import Progress
+from ...report_warning import ReportWarning
 from ...settings import TrainingSettings
 from ...stereo.depth_maps import matching_divisor
 from ...stereo.depth_priors import FILE_NAME, DepthPrior, load_priors
@@ -40,6 +41,8 @@ class CoarseTraining:
     """(views, 3, 4) float64 refined ``cam_from_world``, or ``None`` where those given hold."""
     key: str
     """Names its inputs: the confirmed depths in its folder carry it."""
+    warnings: tuple[ReportWarning, ...] = ()
+    """Of the training; none in a plan that was read from its file."""
 
 
 def train_coarse(
@@ -81,7 +84,12 @@ def train_coarse(
         )
     own = torch.arange(len(state.adam))  # what lies behind them is the backdrop
     return CoarseTraining(
-        result.gaussians.select(own), state.model_selection, state.exposure, result.poses, key
+        result.gaussians.select(own),
+        state.model_selection,
+        state.exposure,
+        result.poses,
+        key,
+        result.warnings,
     )
 
 
@@ -120,8 +128,8 @@ def confirmed_depths(
     if not (wanted and coarse.model_selection.chose("dense_start")):
         return {}
     divisor = matching_divisor([photos.camera(view, 1) for view in all_views], settings.match_px)
-    cameras = {view: photos.camera(view, divisor) for view in views}
-    priors = load_priors(folder, cameras, coarse.key)
+    cameras = {view: photos.camera(view, divisor) for view in all_views}
+    priors = load_priors(folder, cameras, coarse.key, views)
     if priors is None:
         raise ParseError(
             folder / FILE_NAME, "whole file", "missing, damaged, or of another training.",

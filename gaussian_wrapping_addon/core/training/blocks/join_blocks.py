@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import logging
+import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -14,14 +15,20 @@ import torch
 
 from ...dataset.photo_source import PhotoSource
 from ...dataset.scene import Scene
+from ...dataset.view_split import held_out_views
 from ...errors import UsageError
 from ...gaussians.model import OrientedGaussians
+from ...kernels.parallel import default_threads
 from ...progress import Progress
 from ...render.types.renderer import Renderer
 from ...render.view_renderer import ViewRenderer
 from ...settings import TrainingSettings
 from ...stereo.depth_priors import DepthPrior
+from ..appearance.photo_exposure import corrected_for_measuring
+from ..backdrop import with_backdrop
+from ..cancellation import CancellablePhotos
 from ..devices.backend import Backend
+from ..live_view import held_out_metrics
 from ..result import TrainingResult
 from ..trainer import train
 from .block_plan import BlockPlan
@@ -89,6 +96,18 @@ def join_blocks(
         extra_iterations=round(blocks.polish_iterations * settings.iterations)
         + settings.extra_iterations,
     )
+    if not last.extra_iterations:
+        return _measured(
+            plan,
+            joined,
+            scene,
+            photos,
+            last,
+            progress.span(0.05, 1.0),
+            renderer,
+            threads,
+            "cpu" if backend is None else backend.name,
+        )
     handover = plan.handover(
         f"joined {_hash(joined)}", gaussians=joined, iteration=settings.iterations,
         rate_factor=POLISH_RATE, priors=priors or {},
@@ -96,6 +115,40 @@ def join_blocks(
     return train(
         scene, photos, last, folder, progress.span(0.05, 1.0),
         seed=seed, threads=threads, backend=backend, handover=handover,
+    )  # fmt: skip
+
+
+def _measured(
+    plan: BlockPlan,
+    joined: OrientedGaussians,
+    scene: Scene,
+    photos: PhotoSource,
+    settings: TrainingSettings,
+    progress: Progress,
+    renderer: Renderer,
+    threads: int,
+    device: str,
+) -> TrainingResult:
+    """Return joined Gaussians as the result of no iterations, without an optimizer's memory."""
+    begun_s = time.monotonic()
+    seen = CancellablePhotos(photos, progress)
+    coarse, threads = plan.coarse, threads or default_threads()
+    background = scene.mask_mode(settings.mask_mode) == "background"
+    if coarse.model_selection.chose("dense_start") and not background:
+        joined = with_backdrop(
+            joined, seen, plan.views, renderer, threads=threads, check=progress.check
+        )
+    names = {
+        view: scene.views[view].camera.name
+        for view in held_out_views(scene, settings.holdout_every)
+    }
+    held_out, lpips_note = held_out_metrics(
+        joined, seen, names, progress, threads=threads, renderer=renderer,
+        exposure_correction=None if coarse.exposure is None else corrected_for_measuring,
+    )  # fmt: skip
+    return TrainingResult(
+        joined, settings.iterations, (), tuple(held_out), time.monotonic() - begun_s, (),
+        lpips_note, coarse.model_selection, coarse.exposure is not None, device=device,
     )  # fmt: skip
 
 

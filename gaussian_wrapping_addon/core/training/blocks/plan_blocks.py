@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ...dataset.camera import Camera
 from ...dataset.photo_source import PhotoSource
 from ...dataset.scene import Scene
 from ...dataset.view_split import evenly_spaced, training_views
@@ -29,8 +30,11 @@ from .photo_choice import Visibility, chosen_photos
 _logger = logging.getLogger(__name__)
 
 OUTLIER_SHARE = 0.005
-"""Share of the weight at either end of each axis that no cell is divided by: the sky, and what
-photos see far away, is not what blocks are to be balanced by."""
+"""Share of the weight at either end of each axis that no cell is divided by."""
+
+NEAREST_SHARE, FAR_DEPTHS = 0.1, 5.0
+"""What a photo shows deeper than so many times the depth of its nearest tenth is not what blocks
+are divided by: sky fills half of a photo, and margins as wide as the sky hold the whole scene."""
 
 BALANCE_ROUNDS = 3
 """Divisions that are tried. The first one is by what photos show; where a cell then costs more than
@@ -84,17 +88,19 @@ def plan_blocks(
     if blocks.blocks > min(len(views), len(means)):
         raise _too_many(blocks.blocks, f"{len(views)} photos, {len(means)} Gaussians")
     seen = Visibility(gaussians, photos, views, renderer or ViewRenderer(), threads)
-    total = np.zeros(len(means))
-    for weights in seen.weights(progress.span(0.0, 0.2), "what photos show"):
+    total, near = np.zeros(len(means)), np.zeros(len(means))
+    shown = seen.weights(progress.span(0.0, 0.2), "what photos show")
+    for view, weights in zip(views, shown, strict=True):
         total += weights
+        near += np.where(_is_near(photos.camera(view, 1), means, weights), weights, 0.0)
     if not total.any():
         raise UsageError(
             "No photo shows any Gaussian of the coarse training.", "Check the camera poses."
         )
     cameras = [photos.camera(view, 1) for view in views]
     sizes = np.array([camera.width * camera.height for camera in cameras])
-    tiling, chosen = _balanced(means, total, sizes, blocks, seen, progress.span(0.2, 0.8))
-    low, high = _extent(means, total)
+    tiling, chosen = _balanced(means, near, sizes, blocks, seen, progress.span(0.2, 0.8))
+    low, high = _extent(means, near)
     margins = _margins(tiling, blocks.margin, low, high)
     within = [tiling.within(index, means, margins[index]) for index in range(blocks.blocks)]
     own = [np.zeros(np.count_nonzero(inside)) for inside in within]
@@ -135,17 +141,30 @@ def plan_blocks(
     )  # fmt: skip
 
 
+def _is_near(camera: Camera, means: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Tell which Gaussians a photo shows not much deeper than what is nearest, (n,) bool."""
+    shown = np.flatnonzero(weights)
+    depths = camera.to_camera(means[shown])[:, 2]
+    order = np.argsort(depths, kind="stable")
+    held = np.cumsum(weights[shown][order])
+    result = np.zeros(len(means), np.bool_)
+    if len(shown):
+        nearest = depths[order[np.searchsorted(held, NEAREST_SHARE * held[-1])]]
+        result[shown[depths <= FAR_DEPTHS * nearest]] = True
+    return result
+
+
 def _balanced(
     means: np.ndarray,
-    total: np.ndarray,
+    near: np.ndarray,
     sizes: np.ndarray,
     blocks: BlockSettings,
     seen: Visibility,
     progress: Progress,
 ) -> tuple[Tiling, np.ndarray]:
     """Return the cells, and the photos of each, (photos, cells) bool, of least largest cost."""
-    low, high = _extent(means, total)
-    costs = np.where(((means >= low) & (means <= high)).all(1), total, 0.0)
+    low, high = _extent(means, near)
+    costs = np.where(((means >= low) & (means <= high)).all(1), near, 0.0)
     best: tuple[int, Tiling, np.ndarray] | None = None
     for number in range(BALANCE_ROUNDS):
         tiling = split_evenly(means, costs, (low, high), lambda count, _: count >= blocks.blocks)
@@ -155,10 +174,7 @@ def _balanced(
         within = [tiling.within(k, means, reach) for k, reach in enumerate(margins)]
         # No product of matrices: its sums depend on the threads of the linear algebra.
         shown = np.array(
-            [
-                [weights[inside].sum() for inside in within]
-                for weights in seen.weights(part, "dividing the scene")
-            ]
+            [_sums(weights, within) for weights in seen.weights(part, "dividing the scene")]
         )
         chosen = chosen_photos(shown, blocks.coverage)
         pixels = sizes @ chosen
@@ -170,12 +186,19 @@ def _balanced(
     return best[1], best[2]
 
 
-def _extent(means: np.ndarray, total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the box that holds most of what photos show, its lowest and highest corner."""
+def _sums(weights: np.ndarray, within: Sequence[np.ndarray]) -> list[float]:
+    """Return the sum of a photo's weights in each cell; looks only at what the photo shows."""
+    rows = np.flatnonzero(weights)
+    held = weights[rows]
+    return [float(held[inside[rows]].sum()) for inside in within]
+
+
+def _extent(means: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the box that holds most of what photos show near, its lowest and highest corner."""
     corners = []
     for axis in range(3):
         order = np.argsort(means[:, axis], kind="stable")
-        share = np.cumsum(total[order]) / total.sum()
+        share = np.cumsum(near[order]) / near.sum()
         ends = np.searchsorted(share, (OUTLIER_SHARE, 1.0 - OUTLIER_SHARE))
         corners.append(means[order[np.minimum(ends, len(means) - 1)], axis])
     low, high = np.array(corners).T

@@ -14,11 +14,11 @@ from ...array_file import read_arrays
 from ...errors import ParseError, UsageError
 from ...files import read_json, write_bytes, write_json
 from ...gaussians.model import OrientedGaussians
+from ...limits import MAX_BLOCKS
 from ...regions.tiling import Tiling
 from ..appearance.photo_exposure import Exposure
 from ..selection.model_selection import ModelSelection
 from .block_plan import Block, BlockPlan
-from .block_settings import MOST_BLOCKS
 from .coarse_training import CoarseTraining
 
 PLAN_NAME = "blocks.json"
@@ -71,7 +71,7 @@ def _plan(values: dict[str, Any], path: Path) -> BlockPlan:
     tiling = Tiling.from_json(values["splits"])
     listed, views = values["blocks"], tuple(int(view) for view in values["views"])
     count = len(listed)
-    if not 1 <= count <= MOST_BLOCKS or count != len(tiling):
+    if not 1 <= count <= MAX_BLOCKS or count != len(tiling):
         raise ValueError(f"{count} blocks, {len(tiling)} cells")
     for new, (cell, axis, at) in enumerate(tiling.splits, 1):
         if not (0 <= cell < new and 0 <= axis < 3 and np.isfinite(at)):

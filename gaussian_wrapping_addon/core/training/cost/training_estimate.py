@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...dataset.photos.photo_budget import PhotoMemory, photo_memory
 from ...errors import ResourceError
 from ...gaussians.initialisation import MIN_START_POINTS
 from ...machine import available_memory_bytes
@@ -104,7 +105,6 @@ PIXEL_BYTES = 250
 RENDER_GAUSSIAN_BYTES = 600
 """Screen parameters, tile intersections and their gradients."""
 
-PHOTO_CACHE_BYTES = 1 << 30
 MEMORY_SHARE_LEFT = 0.9
 """Beyond this share of the free memory the system may swap or kill the process."""
 
@@ -159,6 +159,8 @@ class Estimate:
     disk_bytes: int
     gaussians: int
     """Largest number of Gaussians."""
+    photos: PhotoMemory
+    """Whether photos stay in memory."""
 
     def span(self) -> str:
         """Return the range of the time in suitable units."""
@@ -173,7 +175,8 @@ class Estimate:
         """Return the estimate in one line."""
         return (
             f"{self.span()}, {self.memory_bytes / 2**30:.1f} GB of memory, "
-            f"{self.disk_bytes / 2**30:.2f} GB of disk, up to {self.gaussians} Gaussians"
+            f"{self.disk_bytes / 2**30:.2f} GB of disk, up to {self.gaussians} Gaussians, "
+            f"photos {self.photos.sentence()}"
         )
 
 
@@ -330,21 +333,28 @@ def estimate(
         low_s = LOW * (_seconds(scene_facts, cheap, least, first) + matching_s) / machine.speed
         high_s = HIGH * (_seconds(scene_facts, settings, most, first) + matching_s) / machine.speed
     count = math.ceil(float(most.max()))
-    coefficients = 3 * (settings.sh_degree + 1) ** 2
-    trained = 3 + 3 + 4 + 1 + coefficients + 4  # values of a Gaussian that are trained
-    state_bytes = 4 * (3 * trained + 5)  # with both moments, filter, steps, statistics
+    value_bytes = gaussian_bytes(settings)
+    state_bytes = 3 * value_bytes + 20  # with both moments, filter, steps, statistics
     pixels = _trained_pixels(scene_facts, settings)
-    channels = 4 if scene_facts.masked else 3
-    photos_bytes = scene_facts.photos * pixels * channels * (1 + 1 / 4 + 1 / 16)
+    photos = photo_memory(
+        scene_facts.photos, pixels, masked=scene_facts.masked, free_bytes=machine.memory_bytes
+    )
     memory = (
         BASE_BYTES
-        + count * (4 * trained * GAUSSIAN_COPIES + RENDER_GAUSSIAN_BYTES)
+        + count * (value_bytes * GAUSSIAN_COPIES + RENDER_GAUSSIAN_BYTES)
         + pixels * PIXEL_BYTES
-        + min(photos_bytes, PHOTO_CACHE_BYTES)
+        + photos.used_bytes
         + matched * MATCHING_PIXEL_BYTES
     )
     disk = CHECKPOINTS * count * state_bytes + count * RESULT_BYTES_PER_GAUSSIAN
-    return Estimate(low_s, high_s, round(memory), round(disk) + OTHER_DISK_BYTES, count)
+    disk_bytes = round(disk) + OTHER_DISK_BYTES
+    return Estimate(low_s, high_s, round(memory), disk_bytes, count, photos)
+
+
+def gaussian_bytes(settings: TrainingSettings) -> int:
+    """Return the bytes of the values of a Gaussian that are trained."""
+    coefficients = 3 * (settings.sh_degree + 1) ** 2
+    return 4 * (3 + 3 + 4 + 1 + coefficients + 4)
 
 
 def gpu_bytes(facts: SceneFacts, settings: TrainingSettings, gaussians: int) -> int:

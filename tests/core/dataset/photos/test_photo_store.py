@@ -6,12 +6,14 @@ from __future__ import annotations
 import threading
 import weakref
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.dataset.photos import photo_store
 from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
 from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
@@ -91,10 +93,49 @@ def test_memory_stays_bounded_and_results_the_same(tmp_path: Path) -> None:
             given += [weakref.ref(store.photo(i)), weakref.ref(store.photo(i, divisor))]
             held = {id(photo): photo.nbytes for ref in given if (photo := ref()) is not None}
             photo = None
-            assert one_photo <= sum(held.values()) <= 2.5 * one_photo
+            # Beyond the limit the photo used last is kept.
+            assert one_photo <= sum(held.values()) <= 3.5 * one_photo
     assert store.photo(3) is store.photo(3)
     with pytest.raises(ValueError, match="read-only"):
         store.photo(0)[0, 0, 0] = 1
+
+
+def test_without_room_photos_are_decoded_once_where_they_may_stay_on_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = make_scene(tmp_path, count=6)
+    files = tmp_path / "files"
+    files.mkdir()
+    read: list[str] = []
+    for name in ("read_photo", "read_mask"):
+        whole = getattr(photo_store, name)
+
+        def counted(path: Path, whole: Any = whole, **options: Any) -> Any:
+            read.append(path.name)
+            return whole(path, **options)
+
+        monkeypatch.setattr(photo_store, name, counted)
+    wide, store = PhotoStore(scene, 80), PhotoStore(scene, 80, memory_bytes=15_000)
+    order = np.random.default_rng(0).integers(0, 6, 60).tolist()
+
+    def ask(of: PhotoStore) -> list[np.ndarray]:
+        asked = [(index, 4 if turn < 30 else 1) for turn, index in enumerate(order)]
+        return [array for key in asked for array in (of.photo(*key), of.mask(*key))]
+
+    expected = ask(wide)
+    assert len(read) == 12
+    read.clear()
+    with photo_store.decoded_in(store, files):
+        for found, true in zip(ask(store), expected, strict=True):
+            assert found.dtype == true.dtype
+            np.testing.assert_array_equal(found, true)
+            assert not found.flags.writeable
+        assert len(read) == 12
+        assert list(files.iterdir()) == []
+    read.clear()
+    for found, true in zip(ask(store), expected, strict=True):
+        np.testing.assert_array_equal(found, true)
+    assert len(read) > 30
 
 
 def test_many_threads_get_the_same_photos(tmp_path: Path) -> None:

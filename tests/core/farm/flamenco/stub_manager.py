@@ -14,7 +14,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from gaussian_wrapping_addon.core.farm.address import Address, parse_address
+from gaussian_wrapping_addon.core.cluster.addresses import Address
+from gaussian_wrapping_addon.core.farm.address import parse_address
 from gaussian_wrapping_addon.core.farm.flamenco.manager import Manager, platform
 from gaussian_wrapping_addon.core.farm.flamenco.submission import Choices, Farm
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from gaussian_wrapping_addon.core.cluster.addresses import Address
 from gaussian_wrapping_addon.core.errors import FarmError
-from gaussian_wrapping_addon.core.farm.address import Address
 from gaussian_wrapping_addon.core.farm.flamenco import exchange
 from gaussian_wrapping_addon.core.farm.flamenco.exchange import NotFoundError, ask, ask_json, shown
 from tests.core.farm.flamenco.stub_manager import StubManager, as_json, error, serving

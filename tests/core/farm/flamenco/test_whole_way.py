@@ -40,8 +40,11 @@ states.mkdir(exist_ok=True)
 for need in parts[name]["needs"]:
     assert json.loads((states / f"{need}.json").read_text())["state"] == "DONE", need
 fails = (root / "fails").exists() and (root / "fails").read_text() == name
-state = {"state": "FAILED" if fails else "DONE", "place": "blade-3", "heartbeat_s": time.time(),
-         "error": "Too little memory." if fails else ""}
+state = {"state": "FAILED" if fails else "DONE", "plan": "", "place": "blade-3", "pid": 1,
+         "pid_started": 1, "token": "", "begun_s": 1.0, "heartbeat_s": time.time(),
+         "fraction": 1.0, "message": "", "attempts": 1,
+         "error": "Too little memory." if fails else "", "hint": "", "exit_code": 2 * fails,
+         "seconds": 1.0, "peak_memory_bytes": 1, "figures": {}, "outputs": []}
 (states / f"{name}.json").write_text(json.dumps(state))
 print(f"error: {state['error']}" if fails else "done")
 sys.exit(2 if fails else 0)

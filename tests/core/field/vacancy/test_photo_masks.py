@@ -8,6 +8,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.field.vacancy.photo_masks import PackedMask
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import SETTLED, VacancyField
 from tests.core.field.field_scenes import camera_at, cameras_around, random_arrays, shell_arrays
 
@@ -64,6 +65,28 @@ def test_masked_views_equal_the_definition(mode: str, divisor: int) -> None:
     np.testing.assert_array_equal(one, each[2])
 
 
+@pytest.mark.parametrize("width", [1, 7, 8, 9, 64])
+def test_a_packed_mask_takes_a_bit_a_pixel_and_is_the_same(width: int) -> None:
+    mask = np.random.default_rng(width).random((5, width)) < 0.5
+    packed = PackedMask.of(mask)
+    assert packed is not None
+    assert packed.shape == mask.shape
+    assert packed.bits.nbytes == 5 * -(-width // 8)
+    np.testing.assert_array_equal(packed.unpacked(), mask)
+    assert PackedMask.of(None) is None
+
+
+def test_masks_may_come_packed() -> None:
+    arrays, cameras = random_arrays(300), cameras_around(5)
+    masks = random_masks(cameras, 5)
+    points = np.random.default_rng(0).normal(size=(3000, 3))
+    plain = VacancyField(arrays, cameras, masks=masks).vacancy(points)
+    packed = [PackedMask.of(mask) for mask in masks]
+    found = VacancyField(arrays, cameras, masks=packed).vacancy(points)
+    np.testing.assert_array_equal(plain.vacancy, found.vacancy)
+    np.testing.assert_array_equal(plain.camera, found.camera)
+
+
 def test_background_of_one_photo_empties_what_others_find_solid() -> None:
     arrays, cameras = shell_arrays(0.95), cameras_around(4)
     middle = np.array([[0.0, 0.0, 0.0]])
@@ -107,5 +130,7 @@ def test_bad_masks_are_named() -> None:
         VacancyField(arrays, cameras, masks=[None])
     with pytest.raises(UsageError, match="shape"):
         VacancyField(arrays, cameras, masks=[None, np.ones((3, 4, 3), bool)])
+    with pytest.raises(UsageError, match="shape"):
+        VacancyField(arrays, cameras, masks=[None, PackedMask.of(np.ones((0, 4), bool))])
     with pytest.raises(UsageError, match="mask mode"):
         VacancyField(arrays, cameras, mask_mode="white")  # type: ignore[arg-type]

@@ -51,6 +51,7 @@ def test_what_comes_after_the_training_is_said(
     lines = estimate_command._estimate(make_job("wrap", tmp_path, JobSettings()))
     (line,) = [line for line in lines if line.startswith("mesh and texture")]
     assert line == "mesh and texture: 20 to 90 % more"
+    assert "photos: in memory, 0.00 GB" in lines
 
 
 def test_an_empty_folder_is_refused(tmp_path: Path) -> None:

@@ -20,10 +20,10 @@ from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.jobs.masking import masks_stage, region_masks
 from gaussian_wrapping_addon.core.jobs.masking.masks_stage import check_mask_model, run_masks
 from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import MASKED, run_cameras
-from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage
+from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
 from gaussian_wrapping_addon.core.masks.cleaning import encoded
 from gaussian_wrapping_addon.core.masks.mask_folder import read_list, write_list
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent

@@ -73,6 +73,8 @@ def _set(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
         (_set("parts.1.share", -0.1), r"parts\[1\]"),
         (_set("parts.1.share", True), r"parts\[1\]"),
         (_set("parts.1.tile", 1e9), r"parts\[1\]"),
+        (_set("parts.1.block", 1e9), r"parts\[1\]\.block"),
+        (_set("parts.1.block", True), r"parts\[1\]\.block"),
         (_set("parts.3.region", "a/b"), r"parts\[3\]"),
         (_set("parts.3.seconds", "long"), r"parts\[3\]"),
         (lambda values: values["parts"][2].pop("share"), r"parts\[2\]"),

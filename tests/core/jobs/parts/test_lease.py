@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import subprocess
 import sys
@@ -60,12 +61,14 @@ def test_a_lease_shows_progress_and_how_the_part_ended(
     monkeypatch.setattr(lease_module, "BEAT_S", 0.05)
     lease = lease_in(tmp_path)
     assert lease.take()
-    lease.event(ProgressEvent("train", 0.5, "iteration 7"))
+    lease.event(ProgressEvent("train", 0.4, "iteration 6", {"psnr": 20.0, "iteration": 6.0}))
+    lease.event(ProgressEvent("train", 0.5, "iteration 7", {"iteration": 7.0, "loss": math.inf}))
     end_s = time.monotonic() + 5.0
     while (state := read_state(tmp_path, "train")) is None or state.fraction != 0.5:
         assert time.monotonic() < end_s
         time.sleep(0.02)
     assert (state.state, state.message, state.pid) == ("RUNNING", "iteration 7", os.getpid())
+    assert state.figures == {"psnr": 20.0, "iteration": 7.0}
     lease.finish("DONE", fraction=1.0, exit_code=0)
     state = read_state(tmp_path, "train")
     assert state is not None

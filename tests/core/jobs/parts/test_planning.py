@@ -75,6 +75,31 @@ def test_a_number_of_tiles_that_is_set_is_known_before_anything_is_run(tmp_path:
     assert fixed_tiles(job_of(tmp_path, "auto")) == fixed_tiles(job_of(tmp_path, "off")) == {}
 
 
+def test_a_training_in_blocks_is_parts_from_the_start(tmp_path: Path) -> None:
+    job = job_of(tmp_path)
+    training = dataclasses.replace(job.settings.training, blocks=3)
+    divided = dataclasses.replace(
+        job, settings=dataclasses.replace(job.settings, training=training)
+    )
+    graph = plan_parts(tmp_path / "out", divided, {})
+    check(graph)
+    blocks = ("block-0000", "block-0001", "block-0002")
+    assert [part.name for part in graph.parts][:6] == ["cameras", "coarse", *blocks, "train"]
+    assert graph.part("coarse").needs == ("cameras",)
+    assert all(graph.part(name).needs == ("coarse",) for name in blocks)
+    assert graph.part("train").needs == blocks
+    assert [graph.part(name).block for name in (*blocks, "train")] == [0, 1, 2, -1]
+    assert graph.part("block-0001").is_one_of_many
+    assert not graph.part("coarse").is_one_of_many
+    whole = plan_parts(tmp_path / "out", job, {})
+    assert graph.plan != whole.plan
+    kinds = ("coarse", "block", "train")
+    share = sum(part.share for part in graph.parts if part.kind in kinds)
+    assert share == pytest.approx(whole.part("train").share)
+    write_parts(tmp_path, graph)
+    assert read_parts(tmp_path) == graph
+
+
 def test_the_plan_depends_on_what_is_to_be_done_alone(tmp_path: Path) -> None:
     job = job_of(tmp_path)
     elsewhere = dataclasses.replace(

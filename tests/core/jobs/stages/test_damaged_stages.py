@@ -22,11 +22,9 @@ from gaussian_wrapping_addon.core.dataset.refined_scene import (
 from gaussian_wrapping_addon.core.devices import choose_device
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians, save_gaussians
-from gaussian_wrapping_addon.core.jobs.stages import training_stage
 from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
 from gaussian_wrapping_addon.core.jobs.stages.mesh_stage import DENSE_MESH, run_mesh
 from gaussian_wrapping_addon.core.jobs.stages.texture_stage import run_texture
-from gaussian_wrapping_addon.core.jobs.stages.training_stage import run_training
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
@@ -35,6 +33,8 @@ from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
     Stage,
     read_done,
 )
+from gaussian_wrapping_addon.core.jobs.training import training_stage
+from gaussian_wrapping_addon.core.jobs.training.training_stage import run_training
 from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh, save_mesh
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress

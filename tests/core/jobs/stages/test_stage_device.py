@@ -12,13 +12,11 @@ import pytest
 from gaussian_wrapping_addon.core.devices import DeviceChoice, choose_device, whole_views
 from gaussian_wrapping_addon.core.evaluation.report import pictures
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
-from gaussian_wrapping_addon.core.jobs.stages import (
-    training_stage,
-)
-from gaussian_wrapping_addon.core.jobs.stages.training_stage import GAUSSIANS_NAME, run_training
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage, read_done
+from gaussian_wrapping_addon.core.jobs.training import training_cost, training_stage
+from gaussian_wrapping_addon.core.jobs.training.training_stage import GAUSSIANS_NAME, run_training
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.training import trainer
 from gaussian_wrapping_addon.core.training.devices import chosen
@@ -68,8 +66,8 @@ def test_the_training_gets_the_device_and_notes_it(
     )
     monkeypatch.setattr(whole_views, "with_renderer", with_renderer)
     monkeypatch.setattr(pictures, "write_held_out", write_held_out)
-    monkeypatch.setattr(training_stage, "stage_device", lambda chosen, *_: chosen)
-    monkeypatch.setattr(training_stage, "_estimate", lambda *_: ({}, []))
+    monkeypatch.setattr(training_cost, "stage_device", lambda chosen, *_: chosen)
+    monkeypatch.setattr(training_stage, "estimated_cost", lambda *_: ({}, []))
     done = trained(folder, GPU)
     expected = [
         "backend of cuda:1", ("cuda:1", "Pictures of held-out photos"), "its renderer",

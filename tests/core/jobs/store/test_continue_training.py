@@ -10,7 +10,6 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.continue_training import (
     checkpoints,
     continue_training_job,
@@ -20,6 +19,7 @@ from gaussian_wrapping_addon.core.jobs.store.continue_training import (
 )
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
 from gaussian_wrapping_addon.core.settings import JobSettings, TrainingSettings
 
 

@@ -15,7 +15,6 @@ from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, DatasetError, Par
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.commands import estimate_mesh_command, worker_call
 from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import _units_key, run_cameras
-from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.job_file import (
     JobFile,
     make_job,
@@ -26,6 +25,7 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import (
 )
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import stage_key
+from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
 from gaussian_wrapping_addon.core.names import JOB_MARKER, region_name, region_names
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings, preset

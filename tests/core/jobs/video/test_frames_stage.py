@@ -23,10 +23,10 @@ from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
 from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
-from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS
+from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
 from gaussian_wrapping_addon.core.jobs.video.frames_stage import frames_request
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings

@@ -92,3 +92,25 @@ def test_what_fits_already_and_what_is_flat_stays() -> None:
     np.testing.assert_array_equal(flip_edges(corners, box, corners, box, 10.0), box)
     none = np.zeros((0, 3), np.int64)
     assert flip_edges(np.zeros((0, 3)), none, points, faces, 1.0).shape == (0, 3)
+
+
+def test_a_part_is_flipped_like_the_whole_and_nothing_else() -> None:
+    points, faces = ring(120, 60)
+    vertices, coarse, _ = compacted(points, select_vertices(points, faces, 400, 10.0))
+    everything = np.ones(len(coarse), np.bool_)
+    whole = flip_edges(vertices, coarse, points, faces, 10.0)
+    again = flip_edges(vertices, coarse, points, faces, 10.0, everything)
+    np.testing.assert_array_equal(again, whole)
+
+    movable = vertices[coarse].mean(1)[:, 0] > 0
+    at = np.zeros(len(vertices), np.bool_)
+    at[coarse[movable]] = True
+    rows = np.flatnonzero(at[coarse].any(1))
+    local_vertices, local, source = compacted(vertices, coarse[rows])
+    assert len(rows) < len(coarse)
+    part = coarse.copy()
+    part[rows] = source[flip_edges(local_vertices, local, points, faces, 10.0, movable[rows])]
+    np.testing.assert_array_equal(part[~movable], coarse[~movable])
+    assert (part != coarse).any(1).sum() > 10
+    figures = assert_closed_manifold(SurfaceMesh(vertices, part.astype(np.int32), None, {}))
+    assert (figures.vertices, figures.genus, figures.components) == (400, 1, 1)

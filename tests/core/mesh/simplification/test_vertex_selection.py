@@ -10,7 +10,13 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from gaussian_wrapping_addon.core.mesh.components import compacted
-from gaussian_wrapping_addon.core.mesh.simplification.vertex_selection import select_vertices
+from gaussian_wrapping_addon.core.mesh.simplification.vertex_selection import (
+    Units,
+    left_of,
+    merge_vertices,
+    quadrics_of,
+    select_vertices,
+)
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from tests.core.field.field_scenes import unit_sphere
 from tests.core.meshing.meshing_scenes import assert_closed_manifold, torus
@@ -104,3 +110,65 @@ def test_nothing_goes_below_a_tetrahedron_and_few_vertices_stay_as_they_are() ->
     assert assert_closed_manifold(smallest).genus == 0
     assert 4 <= len(smallest.vertices) < 40
     np.testing.assert_array_equal(select_vertices(points, faces, 3000, 1.0), faces)
+
+
+def part_of_ring() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Half of a torus, open; its vertices with other faces elsewhere, (v,) bool."""
+    points, faces = ring(60, 30)
+    half = faces[(points[faces][:, :, 0] > 0).all(1)]
+    elsewhere = np.zeros(len(points), np.bool_)
+    elsewhere[faces[(points[faces][:, :, 0] <= 0).any(1)]] = True
+    vertices, half, source = compacted(points, half)
+    return vertices, half, elsewhere[source]
+
+
+UNITS = Units(np.zeros(3), 3.0)
+
+
+def test_locked_vertices_stay_and_others_merge_only_among_themselves() -> None:
+    vertices, faces, locked = part_of_ring()
+    merged = merge_vertices(vertices, faces, UNITS, 0, 10.0, locked=locked)
+    gone = merged.into >= 0
+    assert gone.sum() > 0.5 * (~locked).sum()
+    assert not locked[gone].any()
+    assert not locked[merged.into[gone]].any()
+    np.testing.assert_array_equal(gone, np.isfinite(merged.level))
+
+    def outline(faces: np.ndarray) -> set[tuple[int, int]]:
+        edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()
+        return {(a, b) for a, b in edges} - {(b, a) for a, b in edges}
+
+    assert outline(merged.faces) == outline(faces)
+    assert len(outline(faces)) == 60
+
+
+def test_mergers_up_to_a_level_are_those_of_a_run_that_ends_there() -> None:
+    vertices, faces, locked = part_of_ring()
+    merged = merge_vertices(vertices, faces, UNITS, 0, 10.0, locked=locked)
+    levels = np.sort(merged.level[np.isfinite(merged.level)])
+    for level in levels[[0, len(levels) // 3, -1]].tolist():
+        stands = left_of(merged.into, merged.level, level)
+        replaced = stands[faces]
+        a, b, c = replaced.T
+        replaced = replaced[(a != b) & (b != c) & (c != a)]
+        short = merge_vertices(vertices, faces, UNITS, 0, 10.0, locked=locked, most=level)
+        np.testing.assert_array_equal(replaced, short.faces)
+        summed = np.zeros_like(short.quadrics)
+        np.add.at(summed, stands, quadrics_of(vertices, faces, UNITS))
+        kept = np.unique(short.faces)
+        np.testing.assert_allclose(summed[kept], short.quadrics[kept], rtol=1e-9, atol=1e-12)
+
+
+def test_given_quadrics_are_those_that_count() -> None:
+    points, faces = ball()
+    units = Units(np.zeros(3), 2.0)
+    plain = merge_vertices(points, faces, units, 500, 10.0)
+    given = quadrics_of(points, faces, units)
+    same = merge_vertices(points, faces, units, 500, 10.0, quadrics=given)
+    np.testing.assert_array_equal(same.faces, plain.faces)
+    heavy = points[:, 2] > 0
+    other = merge_vertices(
+        points, faces, units, 500, 10.0, quadrics=np.where(heavy[:, None], 100.0, 1.0) * given
+    )
+    upper = (points[np.unique(other.faces), 2] > 0).sum()
+    assert upper > 1.5 * (points[np.unique(plain.faces), 2] > 0).sum()

@@ -114,10 +114,49 @@ def test_random_labels_of_tetrahedra_become_manifold(seed: int) -> None:
     assert figures.volume == pytest.approx(exact, rel=0.1)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_parts_repaired_one_after_another_are_the_whole_repaired(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(150, 3))
+    points = np.concatenate([points, bounding_points(points, seed)])
+    tetrahedra = delaunay(points, seed=seed, progress=Progress())
+    inside = (rng.random(len(tetrahedra)) < 0.5) & (tetrahedra < 150).all(1)
+    faces = boundary_faces(tetrahedra, tetrahedron_neighbours(tetrahedra), inside)
+    whole = split_nonmanifold(points, faces)
+    # Vertices left of a plane that have no faces across it.
+    left = points[:, 0] < 0
+    across = np.zeros(len(points), np.bool_)
+    across[faces[(~left[faces]).any(1)]] = True
+    near = faces[left[faces].any(1)]
+    first = split_nonmanifold(points, near, ~left | across)
+    assert first.split_vertices > 10
+    # The same faces, then repaired everywhere, with the parts that touch parted alike.
+    far = faces[~left[faces].any(1)]
+    number = np.full(len(points), -1)
+    held = np.flatnonzero((first.origin >= 0) & (~left | across)[np.maximum(first.origin, 0)])
+    number[first.origin[held]] = held
+    missing = np.setdiff1d(far, first.origin[held])
+    number[missing] = len(first.vertices) + np.arange(len(missing))
+    vertices = np.concatenate([first.vertices, points[missing]])
+    second = split_nonmanifold(vertices, np.concatenate([first.faces, number[far]]))
+    figures = assert_closed_manifold(repaired_mesh(second))
+    expected = mesh_statistics(repaired_mesh(whole))
+    assert figures.components == expected.components
+    assert first.split_vertices + second.split_vertices == whole.split_vertices
+    assert figures.volume == pytest.approx(expected.volume, rel=0.02)
+
+
 def test_open_faces_are_refused() -> None:
     vertices, faces = cubes((0, 0, 0))
     with pytest.raises(MeshingError, match="not closed"):
         split_nonmanifold(vertices, faces[1:])
+    elsewhere = np.zeros(len(vertices), np.bool_)
+    elsewhere[faces[0]] = True
+    part = split_nonmanifold(vertices, faces[1:], elsewhere)
+    np.testing.assert_array_equal(part.faces, faces[1:])
+    elsewhere[faces[0][0]] = False
+    with pytest.raises(MeshingError, match="not closed"):
+        split_nonmanifold(vertices, faces[1:], elsewhere)
 
 
 def test_flat_face_and_needle_are_removed() -> None:

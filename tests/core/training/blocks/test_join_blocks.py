@@ -116,6 +116,10 @@ def test_joined_gaussians_are_trained_together_and_can_be_interrupted(tmp_path: 
     assert torch.equal(still.gaussians.means, before.means)
     assert not torch.equal(whole.gaussians.means, before.means)
     assert whole.held_out_psnr > still.held_out_psnr
+    # Measured without an optimizer, and so without a checkpoint.
+    assert [f.name for f in still.held_out] == [f.name for f in whole.held_out]
+    assert still.iterations == SETTINGS.iterations
+    assert not list(tmp_path.glob("checkpoint*"))
     longer = joined("parts", extra_iterations=10)
     assert longer.iterations == 100
 

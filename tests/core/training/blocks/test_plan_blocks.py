@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,6 +19,7 @@ from gaussian_wrapping_addon.core.training.blocks.block_settings import BlockSet
 from gaussian_wrapping_addon.core.training.blocks.photo_choice import chosen_photos
 from gaussian_wrapping_addon.core.training.blocks.plan_blocks import plan_blocks
 from tests.core.training.blocks.row_scene import SETTINGS, known_coarse, row_scene, two_blocks
+from tests.core.training.small_scene import sphere_gaussians
 
 
 @given(seed=st.integers(0, 10**6), cells=st.integers(1, 6), coverage=st.floats(0.5, 1.0))
@@ -81,6 +84,29 @@ def test_a_plan_is_the_same_each_time_and_on_any_number_of_threads() -> None:
         set(narrow.trained) < set(wide.trained)
         for narrow, wide in zip(again.blocks, other.blocks, strict=True)
     )
+
+
+def test_sky_around_the_scene_makes_no_margin_wider() -> None:
+    known, (scene, photos) = known_coarse(), row_scene()
+    ball = sphere_gaussians(300)
+    sky = ball.replaced(means=100.0 * ball.means, log_scales=ball.log_scales + np.log(100.0))
+    coarse = dataclasses.replace(known, gaussians=known.gaussians.joined(sky))
+    plan = plan_blocks(
+        coarse, scene, photos, SETTINGS, BlockSettings(2), Progress(), threads=1
+    )  # fmt: skip
+    without = two_blocks(2)
+    # It fills most of what the photos show.
+    renderer, options = ViewRenderer(), RenderOptions(depth=False, statistics=True)
+    raw, filled = RawArrays.from_gaussians(coarse.gaussians), np.zeros(len(coarse.gaussians))
+    for view in plan.views:
+        statistics = renderer.render(raw, photos.camera(view, 1), options).statistics
+        assert statistics is not None
+        filled += statistics.weight_sum
+    assert filled[len(known.gaussians) :].sum() > 0.3 * filled.sum()
+    np.testing.assert_allclose(plan.margins, without.margins, rtol=0.1)
+    assert {axis for _, axis, _ in plan.tiling.splits} == {0}
+    for block in plan.blocks:
+        assert len(block.views) < len(plan.views)
 
 
 def test_what_the_photos_of_a_block_hardly_show_stands_still() -> None:

@@ -135,6 +135,21 @@ def test_a_full_disk_is_refused_and_little_memory_is_told() -> None:
     assert "--max-gaussians" in warning.text
 
 
+def test_photos_take_what_is_theirs_and_the_rest_is_read_on_demand() -> None:
+    machine = Machine(2, 1.0, 4 * 2**30)
+    few = estimate(FACTS, PLAIN, machine)
+    assert few.photos.fits
+    assert few.photos.all_bytes == round(FACTS.photos * FACTS.pixels * 3 * (1 + 1 / 4 + 1 / 16))
+    assert few.sentence().endswith(f"photos {few.photos.sentence()}")
+    large = replace(PLAIN, max_image_px=4000, dense_start="off")
+    facts = SceneFacts(400, 4000 * 3000, 4000, 3000)
+    many, more = (estimate(replace(facts, photos=count), large, machine) for count in (400, 800))
+    assert not many.photos.fits
+    assert many.photos.budget_bytes == 2**30
+    assert more.photos.all_bytes == 2 * many.photos.all_bytes
+    assert more.memory_bytes == many.memory_bytes
+
+
 def test_this_machine_reads_what_is_free_also_for_folders_to_come(tmp_path: Path) -> None:
     machine = this_machine(tmp_path / "not" / "yet", 3, 1.5)
     assert (machine.threads, machine.speed) == (3, 1.5)

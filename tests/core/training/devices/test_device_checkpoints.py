@@ -16,6 +16,7 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import trainer
 from gaussian_wrapping_addon.core.training.checkpoint import load_checkpoint
+from gaussian_wrapping_addon.core.training.initialisation import point_start
 from gaussian_wrapping_addon.core.training.optimizer.device_adam import DeviceAdam
 from gaussian_wrapping_addon.core.training.state import TrainingState
 from gaussian_wrapping_addon.core.training.trainer import train
@@ -36,7 +37,9 @@ SETTINGS = TrainingSettings(
 
 @pytest.fixture(autouse=True)
 def _uneven_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trainer, "initial_gaussians", lambda *_, **__: perturbed_sphere(100, SEED))
+    monkeypatch.setattr(
+        point_start, "initial_gaussians", lambda *_, **__: perturbed_sphere(100, SEED)
+    )
 
 
 @pytest.mark.parametrize("first", ["cpu", "device"])

@@ -26,6 +26,7 @@ from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import trainer
 from gaussian_wrapping_addon.core.training.devices.cpu_backend import CpuBackend
 from gaussian_wrapping_addon.core.training.devices.device_backend import DeviceBackend
+from gaussian_wrapping_addon.core.training.initialisation import point_start
 from gaussian_wrapping_addon.core.training.optimizer.device_adam import DeviceAdam
 from gaussian_wrapping_addon.core.training.result import TrainingResult
 from gaussian_wrapping_addon.core.training.trainer import train
@@ -48,7 +49,9 @@ FULL = (torch.OutOfMemoryError("CUDA out of memory."), ResourceError("The lists 
 
 @pytest.fixture(autouse=True)
 def _uneven_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trainer, "initial_gaussians", lambda *_, **__: perturbed_sphere(80, SEED))
+    monkeypatch.setattr(
+        point_start, "initial_gaussians", lambda *_, **__: perturbed_sphere(80, SEED)
+    )
     monkeypatch.setattr(trainer, "SNAPSHOT_EVERY", SNAPSHOT)
 
 

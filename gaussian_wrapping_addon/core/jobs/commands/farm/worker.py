@@ -15,13 +15,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ....cluster import child
-from ....cluster.addresses import checked_address
+from ....cluster.addresses import scheduler_address
 from ....cluster.dask_tasks import HTTP, security_of
 from ....errors import UsageError
+from ....processes.helper_process import emit
 from ....processes.worker_environment import PACKAGES_OPTION
 from ....processes.worker_extras import load_extra
 from ..worker_call import run_command
 
+WORKS_FOR = "this computer works for"
+"""Begin of the line once the scheduler knows this worker."""
 SILENCE_S = 30.0
 """Time without a scheduler after which the worker ends."""
 _ENTRY = Path(__file__).resolve().parents[3] / "processes" / "worker_main.py"
@@ -32,7 +35,7 @@ def main(arguments: list[str]) -> int:
 
     def work() -> Iterator[str]:
         request = json.loads(arguments[0])
-        address = checked_address(str(request["address"]))
+        address = str(scheduler_address(str(request["address"])))
         shared = str(request["shared"])
         if shared and not Path(shared).is_dir():
             raise UsageError(f"{shared} is not a folder.", "Mount the shared folder, or name it.")
@@ -43,7 +46,6 @@ def main(arguments: list[str]) -> int:
         os.environ[child.PACKAGES_VARIABLE] = str(sys._xoptions.get(PACKAGES_OPTION) or "")
         if shared:
             os.environ[child.SHARED_VARIABLE] = shared
-        yield f"this computer works for {address}; end it with Ctrl-C"
         asyncio.run(_run(address, security, int(request["slots"])))
         yield "the scheduler has ended"
 
@@ -64,4 +66,5 @@ async def _run(address: str, security: object, slots: int) -> None:
             f"No scheduler answers at {address} ({error or 'no answer'}).",
             "Start it first: batch.py farm scheduler. Both need the same certificates.",
         ) from None
+    emit(line=f"{WORKS_FOR} {address}; end it with Ctrl-C")
     await nanny.finished()

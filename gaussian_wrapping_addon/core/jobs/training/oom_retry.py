@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -119,6 +120,27 @@ def train_with_oom_retry(
         write_json(folder / RETRIES_FILE, {"reasons": reasons})
         gc.collect()
         settings = reduced
+
+
+@contextlib.contextmanager
+def within_memory(what: str) -> Iterator[None]:
+    """Turn running out of memory into an error with the next step, for a part of a training.
+
+    Raises
+    ------
+    ResourceError
+        Memory did not suffice: the part may work elsewhere.
+    """
+    try:
+        yield
+    except (MemoryError, ResourceError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        raise ResourceError(
+            f"{what} ran out of memory ({_first_line(error)}).",
+            "Choose more --blocks, fewer --max-gaussians or a smaller --max-image-px; or close "
+            "other programs and resume.",
+        ) from error
 
 
 def _reason(error: BaseException, before: TrainingSettings, after: TrainingSettings) -> str:
