@@ -69,6 +69,8 @@ class Wanted:
                 raise UsageError(
                     "A directive has a line break, or is long.", "Give one option each."
                 )
+        if not self.logs.isprintable():
+            raise UsageError("The folder of --logs has a line break.", "Give another folder.")
         return self
 
 

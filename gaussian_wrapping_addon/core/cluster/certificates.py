@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime
 import os
+import ssl
 from pathlib import Path
 
 from ..errors import UsageError, unwritable_error
@@ -25,7 +26,7 @@ def checked_folder(folder: str) -> Path:
     Raises
     ------
     UsageError
-        None is named, or files are missing in it.
+        None is named, or files are missing in it, or damaged, or the key is of another.
     """
     named = folder or os.environ.get(FOLDER_VARIABLE, "")
     if not named:
@@ -42,7 +43,25 @@ def checked_folder(folder: str) -> Path:
             "Make certificates with batch.py farm make-certificates DIR, and copy the folder to "
             "all computers.",
         )
+    try:
+        _context_of(path)
+    except (OSError, ValueError) as error:  # SSLError is one
+        said = getattr(error, "reason", None) or getattr(error, "strerror", None)
+        raise UsageError(
+            f"The certificates in {path} cannot be used: {said or error}.",
+            "Copy the folder again, whole, from the computer where it was made.",
+        ) from None
     return path
+
+
+def _context_of(folder: Path) -> None:
+    """Load all three files, as Dask does later, where an error looks like one of the network."""
+    context = ssl.create_default_context(cafile=str(folder / CA_NAME))
+    context.load_cert_chain(folder / CERTIFICATE_NAME, folder / KEY_NAME, password=_no_password)
+
+
+def _no_password() -> str:
+    raise ValueError("the key has a password")
 
 
 def make_certificates(folder: Path) -> None:

@@ -25,7 +25,8 @@ _CONNECT_S = 15
 _ALIVE_EVERY_S = 15
 _ALIVE_COUNT = 4
 _NAME = re.compile(
-    r"(ssh://)?([A-Za-z0-9_.-]+@)?(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)(:[0-9]{1,5})?"
+    r"(ssh://)?([A-Za-z0-9_.][A-Za-z0-9_.-]*@)?"
+    r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.][A-Za-z0-9_.-]*)(:[0-9]{1,5})?"
 )
 """``[user@]computer``, or ``ssh://[user@]computer[:port]``."""
 
@@ -140,7 +141,7 @@ def worker_command(host: Host, address: str, *more: str) -> str:
 
 def _host(words: list[str], usual: Host) -> Host:
     name, *pairs = words
-    if not _NAME.fullmatch(name) or name.startswith("-"):
+    if not _NAME.fullmatch(name):
         raise UsageError(f"{name!r} is no name of a computer.", "Give it as ssh takes it.")
     changes: dict[str, Any] = {}
     for pair in pairs:

@@ -63,6 +63,7 @@ def test_without_the_commands_of_the_system(monkeypatch: pytest.MonkeyPatch) -> 
         ({"account": "a\nb"}, "is no name of a queue"),
         ({"directives": ("--a\nrm -r /",)}, "has a line break"),
         ({"directives": ("x" * 501,)}, "has a line break"),
+        ({"logs": "/tmp/a\nrm -r x"}, "--logs has a line break"),
     ],
 )
 def test_what_cannot_stand_in_a_script(change: dict[str, Any], says: str) -> None:

@@ -101,3 +101,26 @@ def test_the_folder_is_given_or_that_of_the_environment(
     assert checked_folder(str(tmp_path)) == tmp_path
     monkeypatch.setenv(certificates.FOLDER_VARIABLE, str(tmp_path))
     assert checked_folder("") == tmp_path
+
+
+@pytest.mark.parametrize("name", [CA_NAME, CERTIFICATE_NAME, KEY_NAME])
+@pytest.mark.parametrize("how", ["garbage", "empty", "cut", "of another farm"])
+def test_files_that_are_damaged_or_mixed_up_are_told_as_such(
+    tmp_path: Path, name: str, how: str
+) -> None:
+    """Dask would say that nobody answers, or that it cannot listen."""
+    keys, others = tmp_path / "keys", tmp_path / "others"
+    make_certificates(keys)
+    make_certificates(others)
+    whole = (keys / name).read_bytes()
+    (keys / name).write_bytes(
+        {
+            "garbage": b"garbage\n", "empty": b"", "cut": whole[: len(whole) // 2],
+            "of another farm": (others / name).read_bytes(),
+        }[how]
+    )  # fmt: skip
+    if (how, name) == ("of another farm", CA_NAME):
+        assert checked_folder(str(keys)) == keys, "only the other side can tell"
+        return
+    with pytest.raises(UsageError, match="cannot be used"):
+        checked_folder(str(keys))

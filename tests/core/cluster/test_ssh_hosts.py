@@ -33,7 +33,22 @@ def test_names_of_computers(name: str) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["", "-oProxyCommand=sh", "a b", "a;b", "$(id)", "a`b", "a@-oX=y/z", "me@", "ssh://", "a\nb"],
+    [
+        "",
+        "-oProxyCommand=sh",
+        "a b",
+        "a;b",
+        "$(id)",
+        "a`b",
+        "a@-oX=y/z",
+        "me@",
+        "ssh://",
+        "a\nb",
+        "a@-b",
+        "-a@b",
+        "ssh://-b",
+        "ssh://-a@b:22",
+    ],
 )
 def test_other_names_are_refused(name: str) -> None:
     with pytest.raises(UsageError, match="is no name of a computer"):

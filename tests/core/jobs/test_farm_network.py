@@ -7,6 +7,7 @@ folder.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import socket
@@ -41,6 +42,21 @@ pytestmark = [
     pytest.mark.timeout(1800),
 ]
 PACKAGE = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon"
+
+
+def listening(pid: int) -> set[str]:
+    """Return the addresses, as hexadecimal digits, at which a process accepts connections."""
+    own = set()
+    for path in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):
+            own.add(os.readlink(path))
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            words = line.split()
+            if words[3] == "0A" and f"socket:[{words[9]}]" in own:
+                found.add(words[1].partition(":")[0])
+    return found
 
 
 def free_port() -> int:
@@ -104,6 +120,22 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> farm_jobs.JobFolder:
     folder, job = tiled_sphere(tmp_path_factory.mktemp("alone"), 2)
     assert farm_jobs.run(folder, job).state == "DONE"
     return folder
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
+def test_who_works_for_a_scheduler_of_this_computer_listens_on_it_alone(
+    farm: Farm, host: str
+) -> None:
+    """What is not encrypted runs the programs of whoever reaches it: no other computer may."""
+    address = f"tcp://{host}:{free_port()}"
+    processes = [
+        farm.start("scheduler", address, says="listens at"),
+        farm.start("worker", address, says="works for"),
+    ]
+    found = {at for p in processes for pid in descendants(p.pid) for at in listening(pid)}
+    here = {"0100007F", "00000000000000000000000001000000"}
+    assert len(found) >= 1
+    assert found <= here
 
 
 def test_a_scheduler_that_is_killed_ends_the_job_with_a_sentence_and_loses_nothing(

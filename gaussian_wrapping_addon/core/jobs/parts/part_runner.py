@@ -29,6 +29,7 @@ from ..stages.tile_tasks import TileMaker, tile_file
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done
+from ..training.block_stages import plan_files
 from ..training.training_stage import run_block, run_coarse, run_training
 from .graph import Part, PartsGraph
 from .part_state import PartState, read_state
@@ -135,7 +136,10 @@ class PartRunner:
             self._folder, self._job, cameras, progress, version=STAGE_VERSIONS["train"],
             threads=self._threads, device=self._device,
         )  # fmt: skip
-        return self._finished(part, stage)
+        result = self._finished(part, stage)
+        # What blocks read: a part whose outputs are gone is not done.
+        plan = tuple(self._relative(path) for path in plan_files(stage))
+        return dataclasses.replace(result, outputs=(*result.outputs, *plan))
 
     def _run_block(self, part: Part, progress: Progress) -> PartResult:
         stage = run_block(

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...array_file import is_whole
 from ...devices import DeviceChoice
-from ...errors import WorkerError
+from ...errors import UsageError, WorkerError
 from ...processes.peak_memory import own_peak_bytes
 from ...progress import Progress
 from ...report_warning import ReportWarning, read_warnings
@@ -135,6 +135,8 @@ class BlockStages:
 
         Raises
         ------
+        UsageError
+            There is no such block.
         WorkerError
             The coarse training is not finished.
         ParseError
@@ -142,6 +144,12 @@ class BlockStages:
         ResourceError
             Memory does not suffice.
         """
+
+        if not 0 <= index < self._settings.blocks:
+            raise UsageError(
+                f"The training has no block {index}, but {self._settings.blocks} blocks.",
+                "Plan the parts again: batch.py parts DIR.",
+            )
 
         def whole(folder: Path) -> bool:
             done = read_done(folder) or {}
@@ -317,6 +325,15 @@ class BlockStages:
         return chosen_backend(
             self.device.device, self.threads, or_processor=self.job.settings.device == "auto"
         )
+
+
+def plan_files(stage: Stage) -> list[Path]:
+    """Return the files of the plan beside a coarse training; none beside another stage."""
+    from ...training.blocks.plan_file import ARRAYS_NAME, PLAN_NAME
+
+    if stage.name != COARSE:
+        return []
+    return [stage.folder.parent / name for name in (PLAN_NAME, ARRAYS_NAME)]
 
 
 def _photos(scene: Scene, settings: TrainingSettings) -> PhotoStore:

@@ -56,6 +56,10 @@ def load_plan(folder: Path) -> BlockPlan:
         values = read_json(path)
     except OSError as error:
         raise ParseError(path, "whole file", f"cannot be read ({error}).", _AGAIN) from None
+    except ParseError as error:
+        if not isinstance(error.__cause__, OSError):  # it may be read, but is damaged
+            error.hint = _AGAIN
+        raise
     if not isinstance(values, dict) or values.get("version") != VERSION:
         raise ParseError(path, "version", f"version {VERSION} was expected.", _AGAIN)
     try:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+from ...errors import UsageError
 from ...report_warning import ReportWarning
 from ...settings import TrainingSettings
 from ..blocks.block_settings import BlockSettings
@@ -55,9 +56,19 @@ def estimate_training(
     Estimate
         Of blocks the time of all of them together, one after another, and the memory of the largest
         process.
+
+    Raises
+    ------
+    UsageError
+        There are more blocks than photos: told before the coarse training, not after it.
     """
     if settings.blocks == 1:
         return estimate(facts, settings, machine, first=first)
+    if settings.blocks > facts.photos:
+        raise UsageError(
+            f"The training cannot be divided into {settings.blocks} blocks: "
+            f"{facts.photos} photos.", "Choose fewer blocks.",
+        )  # fmt: skip
     parts = block_estimates(facts, settings, machine)
     count = [1, settings.blocks, 1]
     return Estimate(

@@ -182,6 +182,13 @@ def test_a_block_before_the_coarse_training_is_refused(tmp_path: Path) -> None:
         run_block(folder, job, cameras_of(folder), 0, Progress(), **KNOWN)
 
 
+@pytest.mark.parametrize("index", [-1, 2])
+def test_a_block_that_is_none_is_refused(tmp_path: Path, index: int) -> None:
+    folder, job = row_job(tmp_path)
+    with pytest.raises(UsageError, match=f"no block {index}, but 2 blocks"):
+        run_block(folder, job, cameras_of(folder), index, Progress(), **KNOWN)
+
+
 def test_too_little_memory_names_the_block_and_may_work_elsewhere(
     finished: tuple[JobFolder, JobFile, Stage], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

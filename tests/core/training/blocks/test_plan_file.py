@@ -54,6 +54,14 @@ def test_a_plan_is_read_as_it_was_written(plan_of: Callable[[], BlockPlan], tmp_
         assert np.array_equal(found.kept(index), plan.kept(index))
 
 
+@pytest.mark.parametrize("text", ["{", "[" * 100_000, '{"version": NaN}'])
+def test_what_is_no_json_says_that_the_plan_is_made_again(tmp_path: Path, text: str) -> None:
+    (tmp_path / PLAN_NAME).write_text(text)
+    with pytest.raises(ParseError) as caught:
+        load_plan(tmp_path)
+    assert caught.value.hint == "Delete both files of the plan: it is made again."
+
+
 def _json(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
     def apply(folder: Path) -> None:
         path = folder / PLAN_NAME

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from gaussian_wrapping_addon.core.errors import ResourceError
+from gaussian_wrapping_addon.core.errors import ResourceError, UsageError
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training.blocks.block_settings import BlockSettings
 from gaussian_wrapping_addon.core.training.cost.blocks_estimate import (
@@ -72,6 +72,13 @@ def test_where_memory_is_short_the_number_of_blocks_that_fits_is_told() -> None:
     assert [w.hint for w in memory_warnings(FACTS, LARGE, little, whole)] == [""]
     few = replace(FACTS, photos=30)
     assert blocks_advice(few, LARGE, some) == "", "a block of 15 photos shows too little"
+
+
+def test_more_blocks_than_photos_are_refused_before_anything_is_trained() -> None:
+    few = replace(FACTS, photos=7)
+    assert estimate_training(few, replace(LARGE, blocks=7), MACHINE).seconds_high > 0.0
+    with pytest.raises(UsageError, match="8 blocks: 7 photos"):
+        estimate_training(few, replace(LARGE, blocks=8), MACHINE)
 
 
 def test_a_full_disk_is_refused() -> None:

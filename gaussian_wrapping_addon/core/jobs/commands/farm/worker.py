@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ....cluster import child
-from ....cluster.addresses import scheduler_address
+from ....cluster.addresses import Address, scheduler_address
 from ....cluster.dask_tasks import HTTP, security_of
 from ....errors import UsageError
 from ....processes.helper_process import emit
@@ -35,13 +35,13 @@ def main(arguments: list[str]) -> int:
 
     def work() -> Iterator[str]:
         request = json.loads(arguments[0])
-        address = str(scheduler_address(str(request["address"])))
+        address = scheduler_address(str(request["address"]))
         shared = str(request["shared"])
         if shared and not Path(shared).is_dir():
             raise UsageError(f"{shared} is not a folder.", "Mount the shared folder, or name it.")
         load_extra("farm", "A worker")
         logging.getLogger("distributed").setLevel(logging.ERROR)
-        security = security_of(address, str(request["certificates"]))
+        security = security_of(str(address), str(request["certificates"]))
         os.environ[child.ENTRY_VARIABLE] = str(_ENTRY)
         os.environ[child.PACKAGES_VARIABLE] = str(sys._xoptions.get(PACKAGES_OPTION) or "")
         if shared:
@@ -52,14 +52,15 @@ def main(arguments: list[str]) -> int:
     return run_command(work)
 
 
-async def _run(address: str, security: object, slots: int) -> None:
+async def _run(address: Address, security: object, slots: int) -> None:
     from distributed import Nanny
 
     try:
         nanny = await Nanny(
-            address, nthreads=slots, memory_limit=0, security=security, dashboard=False,
-            dashboard_address=HTTP,
-            death_timeout=SILENCE_S,
+            str(address), nthreads=slots, memory_limit=0, security=security, dashboard=False,
+            dashboard_address=HTTP, death_timeout=SILENCE_S,
+            # By itself a worker listens at all networks, not encrypted where the scheduler is not.
+            host=address.host if address.is_this_computer else None,
         )  # fmt: skip
     except (OSError, TimeoutError) as error:
         raise UsageError(
