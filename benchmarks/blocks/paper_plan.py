@@ -112,8 +112,9 @@ def plan_table(most: Record, curve: Sequence[Record], photos: int, machines: int
     fitted = (
         f"What {most['photos']} photos took, carried on to {times:.0f} times as many by the "
         f"exponents of {', '.join(map(str, counts))} photos, or in proportion where they are "
-        "below 1, as what every process takes to start makes them so; memory by lines; mesh in "
-        "proportion, as if each tile took the cameras beside it, which no job does yet. "
+        "below 1, as what every process takes to start makes them so; blocks in proportion, as "
+        "if none needed more photos than these; memory by lines; mesh in proportion, as if each "
+        "tile took the cameras beside it, which no job does yet. "
         "Two threads of one process are taken for twice as fast as one, which they are at best. "
         "Reading and copying files, and joining tiles, are not counted."
     )
