@@ -13,7 +13,7 @@ import numpy as np
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.files import write_bytes
 
-from .blocks import seen_points
+from .blocks.street import seen_points
 from .camera_solving.ray_caster import Boxes, render
 from .scenes.colmap_project import write_colmap
 from .scenes.sparse_points import SparsePoints

@@ -11,7 +11,7 @@ from PIL import Image
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 from gaussian_wrapping_addon.core.regions.region import write_region
 
-from ..blocks import seen_points
+from ..blocks.street import seen_points
 from ..camera_solving.ray_caster import Boxes, render
 from ..scenes.colmap_project import write_colmap
 from ..scenes.viewpoints import around_thing

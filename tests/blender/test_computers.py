@@ -23,7 +23,7 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.processes.process_identity import process_alive
 from gaussian_wrapping_addon.ops.common import background, known_jobs
-from gaussian_wrapping_addon.ops.computers import dask_test, farm_actions, farm_calls, part_watch
+from gaussian_wrapping_addon.ops.computers import dask_doctor, farm_actions, farm_calls, part_watch
 from gaussian_wrapping_addon.ops.jobs.panel_settings import job_settings
 from gaussian_wrapping_addon.ui.computers import computers_panel
 from tests.blender.fake_layout import FakeLayout, draw
@@ -217,7 +217,7 @@ def play_doctor(monkeypatch: pytest.MonkeyPatch, code: str) -> list[dict[str, ob
         asked.append(json.loads(request))
         return [sys.executable, "-c", code]
 
-    monkeypatch.setattr(dask_test, "child_command", command)
+    monkeypatch.setattr(dask_doctor, "child_command", command)
     return asked
 
 

@@ -29,7 +29,7 @@ from ..jobs.panel_settings import job_settings
 from ..jobs.scene_folders import output_of, source_of
 from ..jobs.watched_jobs import key_of
 from ..worker.preferred_worker import WorkerChoice
-from . import dask_test, farm_calls, part_watch
+from . import dask_doctor, farm_calls, part_watch
 
 _folders: dict[int, str] = {}
 """Job folders submitted in this session, by the session uid of their scene: undo keeps these."""
@@ -83,7 +83,7 @@ def test_computers(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
     if choices.kind == "DASK":
         address = scheduler_address(choices.dask_address)
         _require_access(address)
-        dask_test.start(scene, address, choice)
+        dask_doctor.start(scene, address, choice)
         return
     manager, chosen = manager_of(scene), farm_choices(scene)
     farm_calls.call(choices.flamenco_address, lambda: ask_farm(manager, chosen), _found)
