@@ -13,7 +13,7 @@ from . import batch
 from .ops import cli_command
 from .ops.cameras import camera_operators
 from .ops.common import background
-from .ops.computers import computers_operators, farm_actions, farm_calls, part_watch
+from .ops.computers import computers_operators, farm_calls, part_watch
 from .ops.dataset import input_operators
 from .ops.export import export_operators
 from .ops.jobs import job_attach, job_operators, job_timer, live_points, live_preview
@@ -85,8 +85,6 @@ HANDLERS: Final[tuple[tuple[str, Callable[..., None]], ...]] = (
     ("load_post", region_watch.after_load),
     ("undo_post", job_attach.after_undo),
     ("redo_post", job_attach.after_undo),
-    ("undo_post", farm_actions.after_undo),
-    ("redo_post", farm_actions.after_undo),
     ("undo_post", placement.after_undo),
     ("redo_post", placement.after_undo),
     ("undo_post", region_watch.after_load),
@@ -133,7 +131,6 @@ def unregister() -> None:
     live_points.stop()
     part_watch.stop()
     farm_calls.stop()
-    farm_actions.forget()
     background.stop()  # last of these: what they end is ended by its threads
     cli_command.unregister()
     table.unregister()

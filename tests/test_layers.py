@@ -42,7 +42,6 @@ FOLDERS = (
     "core/cluster", "core/jobs/store", "core/jobs/video", "core/jobs/stages", "core/jobs/masking",
     "core/jobs/training", "core/jobs/baking", "core/jobs/parts", "core/jobs",
     "core/jobs/commands", "core/jobs/commands/farm", "core/setup", "core/farm",
-    "core/farm/flamenco",
     "ops/common", "ops/cameras", "ops/regions", "ops/placement", "ops/results", "ops/baking",
     "ops/export",
     "ops/worker", "ops/jobs", "ops/computers", "ops/presets", "ops/training", "ops/dataset",
@@ -68,8 +67,8 @@ BLENDER_SIDE = (
     "core.jobs.commands.evaluate_command", "core.jobs.store.job_file",
     "core.dataset.loading.check", "core.settings", "core.setup.install",
     "core.processes.worker_environment", "core.regions.box", "core.regions.region_file",
-    "core.names", "core.gaussians.preview_points", "core.farm.flamenco.submission",
-    "core.farm.flamenco.job_state", "core.jobs.parts.planning", "core.farm.part_states",
+    "core.names", "core.gaussians.preview_points",
+    "core.jobs.parts.planning", "core.farm.part_states",
 )  # fmt: skip
 HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl", "av")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The panel "Computers" against a stub of a Flamenco Manager: test, submit, watch, stop, retry."""
+"""The panel "Computers": the choice, the doctor of a Dask cluster, parts of the shown job."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import bpy
@@ -16,19 +16,15 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.farm import part_states
-from gaussian_wrapping_addon.core.farm.flamenco.job_record import read_record
-from gaussian_wrapping_addon.core.farm.flamenco.submission import SHARED_VARIABLE
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
-from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.names import SHARED_VARIABLE
 from gaussian_wrapping_addon.core.processes.process_identity import process_alive
 from gaussian_wrapping_addon.ops.common import background, known_jobs
-from gaussian_wrapping_addon.ops.computers import dask_doctor, farm_actions, farm_calls, part_watch
+from gaussian_wrapping_addon.ops.computers import dask_doctor, farm_calls, part_watch
 from gaussian_wrapping_addon.ops.jobs.panel_settings import job_settings
 from gaussian_wrapping_addon.ui.computers import computers_panel
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.panel_states import buttons, choose_photos, words
-from tests.core.farm.flamenco.stub_manager import JOB, TAG, StubManager, serving
 from tests.core.farm.job_parts import graph, job_folder, write_state
 
 pytestmark = pytest.mark.usefixtures("addon")
@@ -40,21 +36,6 @@ PANEL = computers_panel.GWRAP_PT_computers
 def _nothing_known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(known_jobs, "_session", [])
     monkeypatch.delenv(SHARED_VARIABLE, raising=False)
-
-
-@pytest.fixture
-def stub(tmp_path: Path) -> StubManager:
-    found = StubManager()
-    found.variables["gw_shared"]["value"] = str(tmp_path)
-    return found
-
-
-@pytest.fixture
-def url(stub: StubManager) -> Iterator[str]:
-    with serving(stub) as address:
-        choices = bpy.context.scene.gwrap.computers
-        choices.kind, choices.flamenco_address = "FLAMENCO", str(address)
-        yield str(address)
 
 
 def wait_for(holds: Callable[[], bool], seconds: float = 20.0) -> None:
@@ -76,14 +57,14 @@ def show(folder: Path) -> None:
     """Let the scene show a job folder that was used on this computer."""
     known_jobs.remember(folder)
     properties = bpy.context.scene.gwrap
-    properties.job_folder = properties.computers.folder = str(folder)
+    properties.job_folder = str(folder)
 
 
 def shown(folder: Path) -> FakeLayout:
     """Show the parts of a folder as they are now."""
     show(folder)
+    part_watch.stop()
     draw(PANEL)
-    part_watch.refresh(str(folder))
     wait_for(lambda: part_watch._watched[str(folder)].read_s > 0.0)
     return draw(PANEL)
 
@@ -93,11 +74,6 @@ def shown(folder: Path) -> FakeLayout:
     [
         ("THIS", ["kind", "processes"], []),
         ("DASK", ["kind", "dask_address", "certificates"], ["test_computers"]),
-        (
-            "FLAMENCO",
-            ["kind", "flamenco_address", "shared", "tiles", "priority", "tag"],
-            ["test_computers", "-submit_farm", "save_job_type"],
-        ),
     ],
 )
 def test_the_choice_decides_what_is_asked_for(
@@ -107,7 +83,7 @@ def test_the_choice_decides_what_is_asked_for(
     layout = draw(PANEL)
     assert [field.name for field in layout.fields] == fields
     assert buttons(layout) == offered
-    assert layout.header == {"THIS": "Local", "DASK": "Dask", "FLAMENCO": "Flamenco"}[kind]
+    assert layout.header == {"THIS": "Local", "DASK": "Dask"}[kind]
 
 
 @pytest.mark.parametrize(
@@ -118,7 +94,6 @@ def test_the_choice_decides_what_is_asked_for(
         ("DASK", " tls://computer:8786 ", 3, ("tls://computer:8786", 2)),
         ("DASK", "tcp://localhost:8786", 3, ("tcp://localhost:8786", 2)),
         ("DASK", "tls://[::1]:8786", 1, ("tls://[::1]:8786", 2)),
-        ("FLAMENCO", "tcp://x:1", 3, ("", 2)),
     ],
 )
 def test_the_choice_becomes_settings_of_the_job(
@@ -154,48 +129,6 @@ def test_certificates_of_a_server_are_not_looked_for() -> None:
     choices.certificates = r"\\server\share"
     with pytest.raises(UsageError, match="is on another computer"):
         job_settings(bpy.context.scene, threads=0)
-
-
-def test_a_good_manager(stub: StubManager, url: str, tmp_path: Path) -> None:
-    assert bpy.ops.gwrap.test_computers() == {"FINISHED"}
-    assert "Asking…" in draw(PANEL).texts
-    assert not bpy.ops.gwrap.test_computers.poll(), "one request at a time"
-    said = words(answered())
-    assert "Flamenco 3.8.2 has the job type." in said
-    assert f"Shared folder on this computer: {tmp_path}".replace(" ", "") in said.replace(" ", "")
-    bpy.context.scene.gwrap.computers.flamenco_address = "http://localhost:1"
-    assert "has the job type" not in words(draw(PANEL)), "it was about another address"
-
-
-def test_missing_variables_are_told(stub: StubManager, url: str) -> None:
-    del stub.variables["gw_python"]
-    bpy.ops.gwrap.test_computers()
-    assert "The Manager has no variable gw_python" in words(answered())
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda s: setattr(s, "job_type", None), "has no job type gaussian-wrapping. Put"),
-        (lambda s: s.version.update(shortversion="3.1"), "is Flamenco 3.1; 3.3 or a later 3"),
-        (lambda s: setattr(s, "instead", lambda _m, _p: (200, {}, b"<html>")), "with a web page"),
-        (lambda s: setattr(s, "instead", lambda _m, _p: (302, {}, b"")), "sends on to another"),
-        (lambda s: s.variables.clear(), "Nothing says which folder"),
-    ],
-)
-def test_what_is_wrong_is_told(
-    stub: StubManager, url: str, change: Callable[[StubManager], object], said: str
-) -> None:
-    change(stub)
-    bpy.ops.gwrap.test_computers()
-    assert said in words(answered())
-
-
-def test_nobody_answers() -> None:
-    choices = bpy.context.scene.gwrap.computers
-    choices.kind, choices.flamenco_address = "FLAMENCO", "http://127.0.0.1:9"
-    bpy.ops.gwrap.test_computers()
-    assert "Nothing answers at http://127.0.0.1:9." in words(answered())
 
 
 GOOD_WORKER = {
@@ -305,68 +238,11 @@ def test_without_a_folder_nothing_is_asked(monkeypatch: pytest.MonkeyPatch) -> N
     assert asked == []
 
 
-@pytest.mark.parametrize("kind", ["DASK", "FLAMENCO"])
-def test_other_computers_need_online_access(kind: str) -> None:
+def test_other_computers_need_online_access() -> None:
     assert not bpy.app.online_access, "the bpy module is offline"
-    choices = bpy.context.scene.gwrap.computers
-    choices.kind = kind
-    choices.dask_address, choices.flamenco_address = "tls://10.0.0.1:1", "http://10.0.0.1:1"
+    choose_dask("tls://10.0.0.1:1")
     with pytest.raises(RuntimeError, match=r"may not go online\. Turn on Allow Online Access"):
         bpy.ops.gwrap.test_computers()
-
-
-def submit(tmp_path: Path) -> Path:
-    choose_photos(tmp_path)
-    assert bpy.ops.gwrap.submit_farm() == {"FINISHED"}
-    wait_for(lambda: not farm_calls.is_busy())
-    return tmp_path / "photos_wrap"
-
-
-def test_a_job_is_submitted(
-    stub: StubManager, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    choices = bpy.context.scene.gwrap.computers
-    choices.tiles, choices.priority, choices.tag = 3, 80, "big"
-    folder = submit(tmp_path)
-    (body,) = stub.submitted
-    assert (body["priority"], body["worker_tag"]) == (80, TAG)
-    assert body["settings"]["job_folder"] == "{gw_shared}/photos_wrap"
-    record = read_record(folder)
-    assert record is not None
-    assert (str(record.address), record.job) == (url, JOB)
-    settings = read_job(folder / "job.json").settings
-    assert (settings.meshing.tiles, settings.threads, settings.device) == ("3", 0, "auto")
-    assert (settings.computers, settings.processes) == ("", 1)
-    assert not (folder / "lock.json").exists(), "nothing was started here"
-    wait_for(lambda: draw(PANEL).header == "0 of 13")
-    layout = draw(PANEL)
-    assert "Submitted: 13 parts." in words(layout)
-    assert "Points 0 of 3 Gather 0 of 1 Faces 0 of 3" in words(layout)
-    assert buttons(layout)[-3:] == ["retry_farm", "cancel_farm", "update_farm"]
-
-
-@pytest.mark.parametrize(("tiles", "wanted"), [(1, "off"), (8, "8")])
-def test_one_tile_is_one_piece(
-    stub: StubManager, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tiles: int,
-    wanted: str,
-) -> None:  # fmt: skip
-    bpy.context.scene.gwrap.computers.tiles = tiles
-    folder = submit(tmp_path)
-    assert read_job(folder / "job.json").settings.meshing.tiles == wanted
-    assert len(stub.submitted) == 1
-
-
-def test_a_failed_submission_is_told(
-    stub: StubManager, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def damaged(folder: JobFolder) -> None:
-        (folder.root / "parts.json").write_text('{"version": 1}')
-
-    monkeypatch.setattr(farm_actions, "plan_if_missing", damaged)
-    folder = submit(tmp_path)
-    assert "parts.json, parts: not a list" in words(draw(PANEL))
-    assert stub.submitted == []
-    assert read_record(folder) is None
 
 
 def test_parts_and_failures_are_shown(tmp_path: Path) -> None:
@@ -382,91 +258,7 @@ def test_parts_and_failures_are_shown(tmp_path: Path) -> None:
     assert "Cameras 1 of 1 Train 0 of 1 1 running Plan 0 of 1 Points 0 of 2 1 failed" in said
     assert "points-engine-0001 · blade-7 Too little memory. Close other programs." in said
     assert layout.header == "1 of 11"
-    assert buttons(layout) == ["resume_job", "-cancel_job"], "it was not submitted"
-
-
-def test_flamenco_is_asked_for_the_last_lines(
-    stub: StubManager, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = submit(tmp_path)
-    stub.status = "failed"
-    stub.fail("train", "".join(f"iteration {k}\n" for k in range(9)) + "error: No memory.\n")
-    shown(folder)
-    assert bpy.ops.gwrap.update_farm() == {"FINISHED"}
-    said = words(answered())
-    assert (
-        "State in Flamenco: failed train · blade-3 iteration 7 iteration 8 error: No memory."
-        in said
-    )
-
-
-def test_cancel_and_retry(
-    stub: StubManager, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = submit(tmp_path)
-    shown(folder)
-    assert bpy.ops.gwrap.cancel_farm() == {"FINISHED"}
-    assert "Cancelled. Retry continues it." in words(answered())
-    assert (folder / "cancel").exists()
-    assert bpy.ops.gwrap.retry_farm() == {"FINISHED"}
-    assert "Queued again." in words(answered())
-    assert not (folder / "cancel").exists()
-    assert [c["status"] for c in stub.changes] == ["cancel-requested", "requeueing"]
-
-
-def test_a_finished_job_can_be_imported(
-    stub: StubManager, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    values = graph({"auto": 0})
-    folder = submit(tmp_path)
-    assert "Import Finished Result" not in shown(folder).texts
-    for part in values["parts"]:
-        write_state(folder, part["name"], "DONE")
-    layout = shown(folder)
-    assert layout.header == "6 of 6"
-    assert "Import Finished Result" in layout.texts
-
-
-def test_undo_keeps_the_submitted_job(
-    stub: StubManager, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = submit(tmp_path)
-    choices = bpy.context.scene.gwrap.computers
-    choices.folder = ""  # as an undo leaves it
-    farm_actions.after_undo()
-    assert choices.folder == str(folder)
-    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    farm_actions.after_undo()
-    assert bpy.context.scene.gwrap.computers.folder == "", "another file has another scene"
-
-
-def test_nothing_is_written_where_no_manager_answers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    choices = bpy.context.scene.gwrap.computers
-    choices.kind, choices.flamenco_address = "FLAMENCO", "http://127.0.0.1:9"
-    folder = submit(tmp_path)
-    assert "Nothing answers at http://127.0.0.1:9." in words(draw(PANEL))
-    assert not folder.exists()
-    assert choices.folder == ""
-
-
-def test_a_shared_folder_of_a_server_is_not_looked_for(stub: StubManager, url: str) -> None:
-    bpy.context.scene.gwrap.computers.shared = r"\\server\share"
-    with pytest.raises(RuntimeError, match="names a server"):
-        bpy.ops.gwrap.test_computers()
-    assert stub.asked == []
-
-
-def test_each_choice_shows_its_own_job(tmp_path: Path) -> None:
-    here = job_folder(tmp_path / "here", graph({"a": 0})).root
-    there = job_folder(tmp_path / "there", graph({"a": 2})).root
-    properties = bpy.context.scene.gwrap
-    for kind, wanted in (("THIS", "0 of 6"), ("FLAMENCO", "0 of 11"), ("DASK", "0 of 6")):
-        shown(there)
-        known_jobs.remember(here)
-        properties.job_folder, properties.computers.kind = str(here), kind
-        wait_for(lambda wanted=wanted: draw(PANEL).header == wanted)
+    assert buttons(layout) == ["resume_job", "-cancel_job"]
 
 
 def test_damage_is_told(tmp_path: Path) -> None:
@@ -478,19 +270,14 @@ def test_a_folder_from_elsewhere_is_not_touched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = job_folder(tmp_path / "job", graph({"a": 0})).root
-    (folder / "flamenco.json").write_text(
-        json.dumps({"version": 1, "address": "http://127.0.0.1:9", "job": JOB})
-    )
     touched: list[str] = []
     monkeypatch.setattr(part_watch, "_read", lambda reader: touched.append(str(reader.root)))
     for name in (str(folder), r"\\server\share\job"):
-        properties = bpy.context.scene.gwrap
-        properties.job_folder = properties.computers.folder = name
+        bpy.context.scene.gwrap.job_folder = name
         draw(PANEL)
         for _ in range(5):
             background.poll()
             time.sleep(0.01)
-        assert not bpy.ops.gwrap.cancel_farm.poll()
     assert touched == []
 
 
@@ -523,13 +310,5 @@ def test_the_timer_reads_nothing_itself_and_ends(
     assert read == [False]
 
 
-def test_the_job_type_is_saved(tmp_path: Path) -> None:
-    assert bpy.ops.gwrap.save_job_type(directory=str(tmp_path)) == {"FINISHED"}
-    assert (tmp_path / "gaussian-wrapping.js").is_file()
-    with pytest.raises(RuntimeError, match="is no folder"):
-        bpy.ops.gwrap.save_job_type(directory=str(tmp_path / "none"))
-
-
-def test_buttons_without_a_job() -> None:
-    for name in ("retry_farm", "cancel_farm", "update_farm", "submit_farm", "test_computers"):
-        assert not getattr(bpy.ops.gwrap, name).poll()
+def test_without_an_address_nothing_is_tested() -> None:
+    assert not bpy.ops.gwrap.test_computers.poll()

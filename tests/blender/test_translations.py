@@ -38,7 +38,7 @@ DRAWN = (
 )
 """Modules whose texts are drawn in panels; those of other modules are reports and errors."""
 
-SAME_IN_ALL = {"2", "3", "9", "1024", "2048", "4096", "8192", "GOF", "ImageNet", "Dask", "Flamenco"}
+SAME_IN_ALL = {"2", "3", "9", "1024", "2048", "4096", "8192", "GOF", "ImageNet", "Dask"}
 """Numbers and names that no language changes."""
 
 NOT_SHOWN = {

@@ -212,7 +212,7 @@ def write_pictures(
         return panel(folder, name, places[name], above, below)
 
     if "dask" in places:
-        sheet = beside([of("dask", 2, 6), of("flamenco", 2, 6)])
+        sheet = of("dask", 2, 6)
         palette = sheet.quantize(COLORS, dither=Image.Dither.NONE)
         palette.save(target / "panel-computers.png", optimize=True)
     if "review" not in places:

@@ -121,7 +121,7 @@ def masks() -> Iterator[float]:
 
 
 def computers() -> Iterator[float]:
-    """Show a job on a Dask cluster, and the choices for Flamenco."""
+    """Show a job on a Dask cluster."""
     yield from begin("computers", "bananas")
     properties = bpy.context.scene.gwrap
     choices = properties.computers
@@ -129,9 +129,6 @@ def computers() -> Iterator[float]:
     choices.kind, choices.dask_address = "DASK", "tls://workshop:8786"
     yield 4.0  # the parts are read in the background
     yield from shot("dask")
-    choices.kind, choices.flamenco_address = "FLAMENCO", "http://workshop:8080"
-    choices.tiles, properties.job_folder = 12, ""
-    yield from shot("flamenco")
 
 
 VISITS = {

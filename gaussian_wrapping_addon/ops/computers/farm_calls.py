@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from ...core.errors import WrapError
-from ...core.farm.flamenco.job_state import FarmState
 from ..common.background import Lane
 from ..common.redrawing import redraw_sidebars
 
@@ -38,8 +37,6 @@ class _Memory:
 
 _lane = Lane(of_file=True)
 _memory = _Memory()
-_states: dict[str, FarmState] = {}
-"""What a Manager last said of the job of a folder."""
 
 
 def is_busy() -> bool:
@@ -56,18 +53,6 @@ def outcome(about: str) -> Outcome | None:
     """Return how the last request ended, if it was about this address or folder."""
     found = _memory.outcome
     return found if found is not None and _memory.about == about else None
-
-
-def state_of(folder: str) -> FarmState | None:
-    """Return what a Manager last said of the job of a folder."""
-    return _states.get(folder)
-
-
-def keep_state(folder: str, state: FarmState | None) -> None:
-    """Keep what a Manager says of the job of a folder; None forgets it."""
-    _states.pop(folder, None)
-    if state is not None:
-        _states[folder] = state
 
 
 def call(
@@ -109,7 +94,6 @@ def stop() -> None:
     """Forget everything; a request that runs ends by itself within seconds."""
     _lane.stop()
     _memory.outcome = None
-    _states.clear()
 
 
 def _end(outcome: Outcome) -> None:

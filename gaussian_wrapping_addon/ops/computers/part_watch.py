@@ -14,8 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from ...core.errors import WrapError
-from ...core.farm.flamenco.job_record import read_record
 from ...core.farm.part_states import PartBoard, PartReader
 from ...core.jobs.parts.graph import PARTS_NAME
 from ..common import background, known_jobs
@@ -36,8 +34,6 @@ class Look:
     """What a job folder says of its parts."""
 
     board: PartBoard
-    submitted: bool
-    """Whether the job was submitted to Flamenco."""
 
     @property
     def moves(self) -> bool:
@@ -87,14 +83,6 @@ def start() -> None:
     background.watch(tick)
 
 
-def refresh(folder: str) -> None:
-    """Have a folder read again at once."""
-    watched = _watched.get(folder)
-    if watched is not None:
-        watched.read_s = _NEVER_S
-        start()
-
-
 def tick() -> bool:
     """Read what is due, from the add-on's timer; return whether to go on."""
     again = False
@@ -142,11 +130,4 @@ def _collected(watched: _Watched) -> bool:
 
 def _read(reader: PartReader) -> Look | None:
     """Read the parts of a job folder; runs in a thread."""
-    root = reader.root
-    try:
-        submitted = read_record(root) is not None
-    except (OSError, WrapError):
-        submitted = False
-    if not submitted and not (root / PARTS_NAME).exists():
-        return None
-    return Look(reader.read(), submitted)
+    return Look(reader.read()) if (reader.root / PARTS_NAME).exists() else None

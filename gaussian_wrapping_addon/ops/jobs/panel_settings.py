@@ -98,8 +98,6 @@ def job_settings(scene: bpy.types.Scene, threads: int, device: str = "auto") -> 
 def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
     """Return the settings, by path, that say where the parts of a job run.
 
-    A job for Flamenco is submitted, not started: started here, it runs here.
-
     Raises
     ------
     UsageError

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Final
 
 import bpy
@@ -19,7 +18,7 @@ from ..common.panel_base import Readiness, TabPanel, plain, table
 from ..common.setting_properties import draw_settings, settings_in
 from ..common.text import characters_of, wrapped_label
 
-_KINDS: Final = {"THIS": "Local", "DASK": "Dask", "FLAMENCO": "Flamenco"}
+_KINDS: Final = {"THIS": "Local", "DASK": "Dask"}
 _PARTS: Final = {
     "frames": "Frames", "cameras": "Cameras", "masks": "Masks", "coarse": "Coarse Training",
     "block": "Blocks", "train": "Train", "plan": "Plan", "points": "Points", "gather": "Gather",
@@ -30,8 +29,6 @@ _NOW: Final = ("{count} running", "{count} failed")
 _ICONS: Final = {True: "CHECKMARK", False: "ERROR"}
 _MAX_FAILED: Final = 4
 """Failed parts that are drawn; the others are counted above."""
-_MAX_LINES: Final = 3
-"""Last lines of a failed part that are drawn."""
 _MAX_NAME: Final = 40
 """Characters of a name from elsewhere."""
 
@@ -60,21 +57,12 @@ class GWRAP_PT_computers(TabPanel, bpy.types.Panel):
         row.prop(choices, "kind", expand=True)
         if choices.kind == "THIS":
             draw_settings(column, properties, settings_in("computers"))
-        elif choices.kind == "DASK":
+        else:
             column.prop(choices, "dask_address")
             column.prop(choices, "certificates")
-            self._test(layout, context, choices.dask_address)
-        else:
-            for name in ("flamenco_address", "shared", "tiles", "priority", "tag"):
-                column.prop(choices, name)
-            self._test(layout, context, choices.flamenco_address)
-            layout.operator("gwrap.submit_farm", icon="EXPORT")
-            layout.operator("gwrap.save_job_type", icon="FILE_SCRIPT")
+            layout.operator("gwrap.test_computers", icon="VIEWZOOM")
+            _draw_outcome(layout, context, choices.dask_address)
         self._parts(layout, context)
-
-    def _test(self, layout: Any, context: bpy.types.Context, address: str) -> None:
-        layout.operator("gwrap.test_computers", icon="VIEWZOOM")
-        _draw_outcome(layout, context, address)
 
     def _parts(self, layout: Any, context: bpy.types.Context) -> None:
         folder = shown_folder(context.scene)
@@ -86,25 +74,10 @@ class GWRAP_PT_computers(TabPanel, bpy.types.Panel):
             wrapped_label(layout, look.board.problem, characters, icon="ERROR")
         else:
             table(layout.box(), part_rows(look.board))
-        _draw_failed(layout, context, look, folder)
-        self._buttons(layout, context, look, folder)
-        _draw_outcome(layout, context, folder)
-
-    def _buttons(self, layout: Any, context: bpy.types.Context, look: Look, folder: str) -> None:
+        _draw_failed(layout, context, look)
         row = layout.row(align=True)
-        if look.submitted:
-            row.operator("gwrap.retry_farm", icon="FILE_REFRESH")
-            row.operator("gwrap.cancel_farm", icon="X")
-            layout.operator("gwrap.update_farm", icon="VIEWZOOM")
-        else:
-            row.operator("gwrap.resume_job", text="Retry", icon="FILE_REFRESH")
-            row.operator("gwrap.cancel_job", icon="X")
-        finished = look.submitted and look.board.finished
-        if finished and not watched_jobs.result_to_import(context.scene):
-            operator: Any = layout.operator(
-                "gwrap.import_result", text="Import Finished Result", icon="IMPORT"
-            )
-            operator.directory = str(Path(folder) / "result")
+        row.operator("gwrap.resume_job", text="Retry", icon="FILE_REFRESH")
+        row.operator("gwrap.cancel_job", icon="X")
 
 
 def part_rows(board: PartBoard) -> tuple[tuple[str, str], ...]:
@@ -133,28 +106,17 @@ def _draw_outcome(layout: Any, context: bpy.types.Context, about: str) -> None:
         wrapped_label(layout, line, characters, icon=_ICONS[is_good])
 
 
-def _draw_failed(layout: Any, context: bpy.types.Context, look: Look, folder: str) -> None:
-    """Draw failed parts with their computer and last lines."""
+def _draw_failed(layout: Any, context: bpy.types.Context, look: Look) -> None:
+    """Draw failed parts with their computer and last error."""
     characters = characters_of(context)
-    state = farm_calls.state_of(folder)
-    if state is not None:
-        text = tr("State in Flamenco: {status}", status=state.status)
-        wrapped_label(layout, text, characters, icon="INFO")
-    last = {task.name: task for task in state.failed} if state is not None else {}
-    rows = [
-        (part.name, last[part.name].worker if part.name in last else part.place, part.error)
-        for part in look.board.failed
-    ]
-    told = {name for name, _, _ in rows}
-    rows += [(task.name, task.worker, "") for task in last.values() if task.name not in told]
-    for name, place, error in rows[:_MAX_FAILED]:
+    for part in look.board.failed[:_MAX_FAILED]:
         box = layout.box()
-        head = f"{name[:_MAX_NAME]} · {place[:_MAX_NAME]}" if place else name[:_MAX_NAME]
+        head = part.name[:_MAX_NAME]
+        if part.place:
+            head = f"{head} · {part.place[:_MAX_NAME]}"
         wrapped_label(box, head, characters - 4, icon="ERROR")
-        if error:
-            wrapped_label(box, error, characters - 4, icon="BLANK1")
-        for line in last[name].lines[-_MAX_LINES:] if name in last else ():
-            wrapped_label(box, line, characters - 4, icon="BLANK1")
+        if part.error:
+            wrapped_label(box, part.error, characters - 4, icon="BLANK1")
 
 
 CLASSES: Final = (GWRAP_PT_computers,)

@@ -1,33 +1,24 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lists of parts and records of farms that no job writes, and addresses that lead nowhere."""
+"""Lists of parts that no job writes, and addresses that lead nowhere."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from gaussian_wrapping_addon.core import limits
-from gaussian_wrapping_addon.core.jobs.store.job_file import read_job, write_job
-from gaussian_wrapping_addon.core.settings import with_values
 from tests.hostile.case import Build, Case, Group, Needs, Variant
 from tests.hostile.inputs import file, json_file, link, nothing, pipe, steps
-from tests.hostile.jobs import JOB, begun
+from tests.hostile.jobs import begun
 
 _CORE = "tests/core/farm"
-_FLAMENCO = f"{_CORE}/flamenco"
-_NOWHERE = "http://127.0.0.1:9"
 _VAST = b" " * (limits.MAX_PARTS_BYTES + 1)
 _AGAIN = r"batch\.py parts DIR"
-
-
-def _submit(address: str = _NOWHERE, *more: str) -> tuple[str, ...]:
-    return ("farm", "submit", "out", "--flamenco", address, *more)
+_LOOK = ("parts", "out")
 
 
 def _parts(name: str, values: Any, says: str) -> Variant:
     build = steps(begun, json_file("out/parts.json", values))
-    return Variant(name, build, 3, rf"parts\.json, {says}.*{_AGAIN}", _submit())
+    return Variant(name, build, 3, rf"parts\.json, {says}.*{_AGAIN}", _LOOK)
 
 
 def _listed(*parts: Any) -> dict[str, Any]:
@@ -42,7 +33,7 @@ def _part(name: Any, *needs: Any) -> dict[str, Any]:
 
 
 def _instead(build: Build, name: str, says: str) -> Variant:
-    return Variant(name, steps(begun, build), 3, says, _submit(), needs=Needs.POSIX)
+    return Variant(name, steps(begun, build), 3, says, _LOOK, needs=Needs.POSIX)
 
 
 _LISTS = Case(
@@ -51,11 +42,11 @@ _LISTS = Case(
     (
         Variant(
             "not JSON", steps(begun, file("out/parts.json", "{")), 3,
-            r"parts\.json, line 1: not JSON", _submit(),
+            r"parts\.json, line 1: not JSON", _LOOK,
         ),
         Variant(
             "vast", steps(begun, file("out/parts.json", _VAST)), 3,
-            r"parts\.json, whole file: more than", _submit(),
+            r"parts\.json, whole file: more than", _LOOK,
         ),
         _parts("a list", [], "version: it is not 1"),
         _parts("no parts", _listed(), "parts: not a list of 1 to 50,000 parts"),
@@ -77,30 +68,8 @@ _LISTS = Case(
         "tests/core/jobs/parts/test_graph.py::test_what_does_not_fit_is_refused",
         f"{_CORE}/test_part_states.py::test_damaged_states_count_as_left",
         f"{_CORE}/test_part_states.py::test_odd_entries_do_no_harm",
-        f"{_FLAMENCO}/test_job_type.py::test_damage_is_refused_with_words",
     ),
 )  # fmt: skip
-
-
-def _in_one_piece(folder: Path) -> None:
-    """Make a job whose region is meshed in one piece."""
-    begun(folder)
-    path = folder / JOB / "job.json"
-    job = read_job(path)
-    write_job(path, replace(job, settings=with_values(job.settings, {"meshing.tiles": "off"})))
-
-
-_WHOLE = _in_one_piece
-
-
-def _address(name: str, address: str, says: str, code: int = 2) -> Variant:
-    return Variant(name, _WHOLE, code, says, _submit(address))
-
-
-def _record(name: str, text: str) -> Variant:
-    build = steps(begun, file("out/flamenco.json", text))
-    says = r"flamenco\.json, .*Delete it, then submit again|flamenco\.json, line 1: not JSON"
-    return Variant(name, build, 3, says, ("farm", "status", "out"))
 
 
 _HERE = "tcp://127.0.0.1:9"
@@ -111,28 +80,10 @@ def _hosts(name: str, build: Build, says: str) -> Variant:
     return Variant(name, build, 3, f"hosts, {says}", ("farm", "ssh", _HERE, "--hosts", "hosts"))
 
 
-_MANAGERS = Case(
+_COMPUTERS = Case(
     74,
-    "Addresses and records of farms",
+    "Addresses and lists of computers",
     (
-        _address("no scheme", "localhost:8080", "is not an address of http or https.*such as http://"),
-        _address("a file", "file:///etc/passwd", "is not an address of http or https"),
-        _address("a line break", "http://x\r\nY: z", "is not an address"),
-        _address("a password", "http://me:secret@x", "a Manager asks for none"),
-        _address("a page of it", "http://x:8080/app/jobs", "Give http://x:8080 alone"),
-        _address("nobody there", _NOWHERE, f"Nothing answers at {_NOWHERE}.*running there", 1),
-        Variant(
-            "a priority of 101", _WHOLE, 2, "priority 101 is out of range.*from 0 to 100",
-            _submit(_NOWHERE, "--priority", "101"),
-        ),
-        Variant("a folder that is no job", nothing, 2, "out holds no job", _submit()),
-        Variant(
-            "a job that was not submitted", begun, 2,
-            "out was not submitted to Flamenco.*farm submit", ("farm", "cancel", "out"),
-        ),
-        _record("a record of a file", '{"version": 1, "address": "file:///x", "job": "1"}'),
-        _record("a record with a path", '{"version": 1, "address": "http://x", "job": "../x"}'),
-        _record("a record that is cut", '{"version"'),
         Variant(
             "a scheduler that others can read", nothing, 2, "is not encrypted.*make-certificates",
             ("farm", "doctor", "tcp://10.0.0.7:8786", "--shared", "."),
@@ -156,10 +107,8 @@ _MANAGERS = Case(
         ),
     ),
     (
-        f"{_FLAMENCO}/test_exchange.py::*",
-        f"{_FLAMENCO}/test_manager.py::test_ids_of_others_are_not_put_into_paths",
         "tests/blender/test_computers.py::test_a_folder_from_elsewhere_is_not_touched",
     ),
 )  # fmt: skip
 
-GROUP = Group("Farms", (_LISTS, _MANAGERS))
+GROUP = Group("Farms", (_LISTS, _COMPUTERS))
