@@ -13,12 +13,12 @@ from tests.hostile.jobs import begun
 _CORE = "tests/core/farm"
 _VAST = b" " * (limits.MAX_PARTS_BYTES + 1)
 _AGAIN = r"batch\.py parts DIR"
-_LOOK = ("parts", "out")
+_LOOK = ("run-part", "out", "cameras")
 
 
 def _parts(name: str, values: Any, says: str) -> Variant:
     build = steps(begun, json_file("out/parts.json", values))
-    return Variant(name, build, 3, rf"parts\.json, {says}.*{_AGAIN}", _LOOK)
+    return Variant(name, build, 1, rf"parts\.json, {says}.*{_AGAIN}", _LOOK)
 
 
 def _listed(*parts: Any) -> dict[str, Any]:
@@ -33,7 +33,7 @@ def _part(name: Any, *needs: Any) -> dict[str, Any]:
 
 
 def _instead(build: Build, name: str, says: str) -> Variant:
-    return Variant(name, steps(begun, build), 3, says, _LOOK, needs=Needs.POSIX)
+    return Variant(name, steps(begun, build), 1, says, _LOOK, needs=Needs.POSIX)
 
 
 _LISTS = Case(
@@ -41,11 +41,11 @@ _LISTS = Case(
     "Lists of the parts of a job",
     (
         Variant(
-            "not JSON", steps(begun, file("out/parts.json", "{")), 3,
+            "not JSON", steps(begun, file("out/parts.json", "{")), 1,
             r"parts\.json, line 1: not JSON", _LOOK,
         ),
         Variant(
-            "vast", steps(begun, file("out/parts.json", _VAST)), 3,
+            "vast", steps(begun, file("out/parts.json", _VAST)), 1,
             r"parts\.json, whole file: more than", _LOOK,
         ),
         _parts("a list", [], "version: it is not 1"),

@@ -84,13 +84,8 @@ def fixed_tiles(job: JobFile) -> dict[str, PlannedTiles]:
     return known
 
 
-def plan_if_missing(folder: JobFolder, *, write: bool = True) -> PartsGraph:
+def plan_if_missing(folder: JobFolder) -> PartsGraph:
     """Return the parts of a job folder; plan them if that was never done, or for another job.
-
-    Parameters
-    ----------
-    write : bool
-        Whether a new plan is written.
 
     Raises
     ------
@@ -103,8 +98,7 @@ def plan_if_missing(folder: JobFolder, *, write: bool = True) -> PartsGraph:
         if graph.plan == plan_hash(job):
             return graph
     graph = plan_parts(folder.root, job, fixed_tiles(job))
-    if write:
-        write_parts(folder.root, graph)
+    write_parts(folder.root, graph)
     return graph
 
 
