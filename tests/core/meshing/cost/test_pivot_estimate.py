@@ -30,7 +30,7 @@ HALF = Region.box("half", np.array([-0.1, -2, -2]), np.array([2, 2, 2]))
 @pytest.mark.parametrize("pivots", PIVOTS)
 @pytest.mark.parametrize("region", [cube(1.5), HALF], ids=["whole", "half"])
 @pytest.mark.parametrize("shape", first_then_proofs([sphere, torus]))
-@pytest.mark.parametrize("samples", ["depth", "none"])
+@pytest.mark.parametrize("samples", first_then_proofs(["depth", "none"]))
 def test_ranges_hold_the_mesh(shape, region: Region, pivots: int, samples: str) -> None:
     arrays = gaussians_on(shape(), cube(1.5), 4000, SIGMA)
     expected = estimate_pivot_mesh(arrays, region, pivots, 0, alone=samples == "none")
