@@ -126,6 +126,20 @@ def test_tests_are_spread_over_files_fastest_first() -> None:
     assert mutations.spread(["a::1", "a::2", "b::1"], seconds, 2) == ["a::2", "b::1"]
 
 
+def test_the_tests_that_execute_a_line_are_taken(tree: Path, tmp_path: Path) -> None:
+    coverage = pytest.importorskip("coverage")
+    data = coverage.CoverageData(str(tmp_path / "covered"))
+    for test, line in (("tests/a.py::test_far|run", 3), ("tests/a.py::test_near[1]|setup", 2)):
+        data.set_context(test)
+        data.add_lines({"/elsewhere/gaussian_wrapping_addon/core/shapes.py": [line]})
+    data.write()
+    select = mutations.Selection(tree, tmp_path / "covered", {}, 9)
+    site = mutations.Site("gaussian_wrapping_addon/core/shapes.py", "check", 2, 0, 1, "", False)
+    assert select.tests(site) == (["tests/a.py::test_near[1]"], "coverage")
+    elsewhere = mutations.Site(site.path, "check", 1, 0, 1, "", False)
+    assert select.tests(elsewhere) == (["tests/test_shapes.py"], "names")
+
+
 def test_two_trees_are_compared_by_the_same_faults(
     tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
