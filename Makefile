@@ -4,7 +4,7 @@ PY := .venv/bin/python
 # One process of tests for each core, at most four; each file stays in one (tests/conftest.py).
 PARALLEL := -n auto --maxprocesses 4 --dist loadgroup --no-loadscope-reorder
 
-.PHONY: demo test quick lint docs settings-table zip prepare blenders clean
+.PHONY: demo test quick proofs lint docs settings-table zip prepare blenders clean
 
 prepare:
 	@bash tools/prepare.sh
@@ -12,11 +12,14 @@ prepare:
 demo: prepare
 	$(PY) gaussian_wrapping_addon/batch.py wrap examples/bananas --out demo_out --preset draft
 
-test: lint blenders
+test: lint
 	$(PY) -m pytest $(PARALLEL)
 
 quick: lint
-	$(PY) -m pytest $(PARALLEL) -q -m "not slow and not gui"
+	$(PY) -m pytest $(PARALLEL) -q -m "not slow and not proof"
+
+proofs: lint blenders
+	$(PY) -m pytest $(PARALLEL) -m proof
 
 lint: prepare
 	.venv/bin/ruff check .

@@ -26,6 +26,7 @@ from tests.blender.baked_ball import add_ball, image_of, import_ball, psnr_of_te
 from tests.blender.ball_job import write_ball_job
 from tests.blender.fake_layout import draw
 from tests.blender.synthetic_result import write_region_result
+from tests.proofs import first_then_proofs
 
 pytestmark = [
     pytest.mark.usefixtures("ended_workers"),
@@ -62,7 +63,7 @@ def press(job: JobFolder, *states: str) -> JobStatus:
     return job_play.play_to(job.root, *(states or ("DONE", "FAILED")))
 
 
-@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("told", first_then_proofs([True, False]))
 def test_a_foreign_mesh_without_uvs_gets_uvs_and_texture(
     told: bool, job: JobFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,6 +135,7 @@ def uvs_of(thing: bpy.types.Object) -> np.ndarray:
     return values
 
 
+@pytest.mark.proof
 def test_udim_tiles_become_one_tiled_image(job: JobFolder) -> None:
     import_ball(job)
     thing = add_ball(uvs=True)
@@ -196,6 +198,7 @@ def test_fewer_faces_become_a_lighter_object_with_a_normal_map(job: JobFolder) -
     assert abs(len(bpy.data.objects["Foreign light"].data.polygons) - 300) <= 8
 
 
+@pytest.mark.proof
 def test_quads_become_an_object_with_photos_and_maps(job: JobFolder) -> None:
     """One button: QuadriFlow, UVs, photos, the detail of the dense mesh and its occlusion."""
     frame = import_ball(job)
@@ -257,6 +260,7 @@ def file_content() -> set[tuple[str, str]]:
     return {(k, block.name) for k in ("objects", "meshes") for block in getattr(bpy.data, k)}
 
 
+@pytest.mark.proof
 def test_a_bake_of_quads_that_fails_or_is_cancelled_leaves_nothing(job: JobFolder) -> None:
     import_ball(job)
     thing = add_ball()
@@ -279,6 +283,7 @@ def test_a_bake_of_quads_that_fails_or_is_cancelled_leaves_nothing(job: JobFolde
     assert {len(p.vertices) for p in bpy.data.objects["Foreign quads"].data.polygons} == {4}
 
 
+@pytest.mark.proof
 def test_detail_comes_from_another_mesh(job: JobFolder) -> None:
     import_ball(job)
     dense = add_ball("Dense")
@@ -296,6 +301,7 @@ def test_detail_comes_from_another_mesh(job: JobFolder) -> None:
     assert material.node_tree.nodes.active.image.name.startswith("albedo")
 
 
+@pytest.mark.proof
 def test_a_mirrored_object_is_not_inside_out(job: JobFolder) -> None:
     import_ball(job)
     thing = add_ball(uvs=True)
@@ -401,6 +407,7 @@ def test_a_mesh_edited_meanwhile_keeps_its_edits_and_says_so(job: JobFolder) -> 
     assert not thing.data.materials
 
 
+@pytest.mark.proof
 def test_a_result_mesh_that_is_made_anew_loses_its_bake(job: JobFolder) -> None:
     """The cube inside the ball, baked onto, then meshed again: the texture is the region's."""
     frame = import_ball(job)
@@ -416,6 +423,7 @@ def test_a_result_mesh_that_is_made_anew_loses_its_bake(job: JobFolder) -> None:
     assert tags.BAKE not in thing
 
 
+@pytest.mark.proof
 def test_a_cancelled_bake_is_resumed_onto_its_object(job: JobFolder) -> None:
     import_ball(job)
     thing = add_ball()

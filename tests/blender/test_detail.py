@@ -100,6 +100,7 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
     return float(-10.0 * np.log10(((colors[0] - colors[1])[covered] ** 2).mean()))
 
 
+@pytest.mark.proof
 @pytest.mark.slow
 def test_5k_faces_with_a_normal_map_look_like_200k(tmp_path: Path) -> None:
     dense = bumpy_ball(129)

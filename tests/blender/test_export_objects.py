@@ -91,6 +91,7 @@ def test_a_file_read_again_gives_the_same_picture(
     assert found["materials"] == ["albedo" if "own" in format else "auto.001"]
 
 
+@pytest.mark.proof
 @pytest.mark.parametrize("format", ["glb", "own-glb", "own-obj", "obj", "usd"])
 def test_two_atlases_are_read_back_with_the_same_picture(format: str, tmp_path: Path) -> None:
     name = "tests.blender.reimport_pictures"

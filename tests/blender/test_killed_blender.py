@@ -101,6 +101,7 @@ def test_quitting_leaves_no_process_behind(tmp_path: Path) -> None:
     wait_until_ended(words(iter(done.stdout.splitlines()))["pid"])
 
 
+@pytest.mark.proof
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(("keep", "found"), [("end", "CANCELLED"), ("keep", "RUNNING")])

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.proofs import first_then_proofs
+
 HERE = Path(__file__).parent
 REPOSITORY = HERE.parents[1]
 CACHE = REPOSITORY / ".cache"
@@ -24,7 +26,7 @@ def _oldest() -> str:
     pytest.skip(f"no bpy 4.2: {why}")
 
 
-@pytest.mark.parametrize("version", ["4.2", "present"])
+@pytest.mark.parametrize("version", first_then_proofs(["present", "4.2"]))
 def test_the_zip_registers_twice_and_leaves_cleanly(version: str, tmp_path: Path) -> None:
     python = _oldest() if version == "4.2" else sys.executable
     built = subprocess.run(

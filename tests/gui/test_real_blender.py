@@ -16,7 +16,7 @@ from tests.blender.ball_job import write_ball_job
 
 from .conftest import REPOSITORY, Visit, colours_of
 
-pytestmark = [pytest.mark.gui, pytest.mark.slow]
+pytestmark = [pytest.mark.gui, pytest.mark.proof]
 
 SCREENSHOTS = ("1-start", "2-running", "3-cancelled", "4-failed", "5-result", "6-camera")
 

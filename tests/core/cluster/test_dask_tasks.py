@@ -68,6 +68,7 @@ def test_children_run_side_by_side_and_end_as_they_end(tasks: DaskTasks, tmp_pat
     assert "signal 9" in ends["killed"].error
 
 
+@pytest.mark.proof
 def test_what_kills_three_dask_workers_is_given_up(tasks: DaskTasks, tmp_path: Path) -> None:
     count = (
         "import json,os,pathlib,sys,uuid;"

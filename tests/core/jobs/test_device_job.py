@@ -159,6 +159,7 @@ def mean_psnr(report: dict[str, Any]) -> float:
     return float(report["regions"]["ball"]["mesh_rendering"]["psnr"])
 
 
+@pytest.mark.proof
 def test_the_mesh_of_a_gpu_is_that_of_the_processor(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

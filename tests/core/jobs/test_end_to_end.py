@@ -183,6 +183,7 @@ def test_another_region_and_resolution_needs_no_training(
     assert 0.02 < np.median(edges) < 0.08
 
 
+@pytest.mark.proof
 def test_each_region_of_one_job_has_its_own_edge_length(
     wrapped: tuple[BallScene, Path, str],
 ) -> None:
@@ -238,6 +239,7 @@ def test_a_region_without_surface_leaves_the_finished_job_as_it_was(
     assert again.returncode == 0, again.stdout + again.stderr
 
 
+@pytest.mark.proof
 def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str]) -> None:
     scene, root, _ = wrapped
     box = write_box(root / "open.json", scene, 0.6, (0, 0, 1.0))
@@ -318,6 +320,7 @@ def test_fewer_faces_get_a_normal_map_occlusion_and_levels(
     assert len(offsets) == 1
 
 
+@pytest.mark.proof
 def test_a_region_is_estimated_and_meshed_in_tiles_by_two_processes(
     wrapped: tuple[BallScene, Path, str],
 ) -> None:

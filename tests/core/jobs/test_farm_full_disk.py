@@ -15,6 +15,7 @@ from tests.core.jobs.small_disk import fill, mounted_disk
 
 pytest.importorskip("distributed", reason="Dask is not installed: set-up-worker --add farm")
 pytestmark = [
+    pytest.mark.proof,
     pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="processes are killed by a signal"),
     pytest.mark.timeout(1800),
 ]

@@ -43,6 +43,7 @@ def kind_of(name: str) -> str:
     return name.partition("-")[0]
 
 
+@pytest.mark.proof
 def test_two_processes_make_the_mesh_of_one_though_a_part_of_each_kind_is_killed(
     alone: JobFolder, tmp_path: Path
 ) -> None:
@@ -81,6 +82,7 @@ def test_dask_workers_that_die_are_replaced(alone: JobFolder, tmp_path: Path) ->
     assert not any(process_alive(pid, 0) for pair in killed.values() for pid in pair)
 
 
+@pytest.mark.proof
 def test_a_driver_that_dies_leaves_nothing_behind_and_resumes(
     alone: JobFolder, tmp_path: Path
 ) -> None:
@@ -129,6 +131,7 @@ def test_a_part_that_always_crashes_is_named_and_the_rest_is_done(tmp_path: Path
     assert {name: after[name].token for name in kept} == {name: before[name] for name in kept}
 
 
+@pytest.mark.proof
 def test_a_cancelled_job_leaves_nothing_running_and_resumes(
     alone: JobFolder, tmp_path: Path
 ) -> None:

@@ -35,6 +35,7 @@ from tests.core.jobs.farm_jobs import (
     wait,
     wait_until,
 )
+from tests.proofs import first_then_proofs
 
 pytest.importorskip("distributed", reason="Dask is not installed: set-up-worker --add farm")
 pytestmark = [
@@ -122,7 +123,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> farm_jobs.JobFolder:
     return folder
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
+@pytest.mark.parametrize("host", first_then_proofs(["127.0.0.1", "localhost"]))
 def test_who_works_for_a_scheduler_of_this_computer_listens_on_it_alone(
     farm: Farm, host: str
 ) -> None:
@@ -186,6 +187,7 @@ def test_a_worker_of_another_version_is_told(farm: Farm, tmp_path: Path) -> None
     assert [state.state for state in states(folder).values()] == []
 
 
+@pytest.mark.proof
 def test_a_worker_of_another_version_beside_a_right_one_is_asked_once(
     farm: Farm, alone: farm_jobs.JobFolder, tmp_path: Path
 ) -> None:
@@ -223,6 +225,7 @@ def resume_words(folder: farm_jobs.JobFolder) -> list[str]:
     return [sys.executable, str(PACKAGE / "batch.py"), "resume", str(folder.root), "--no-blend"]
 
 
+@pytest.mark.proof
 def test_of_two_clients_on_two_computers_one_is_told_and_one_ends_the_job(
     attic: list[str], alone: farm_jobs.JobFolder, tmp_path: Path
 ) -> None:
@@ -243,6 +246,7 @@ def test_of_two_clients_on_two_computers_one_is_told_and_one_ends_the_job(
     assert same_mesh(folder, alone)
 
 
+@pytest.mark.proof
 def test_a_silent_computer_s_job_is_taken_over_by_another(
     attic: list[str], alone: farm_jobs.JobFolder, tmp_path: Path
 ) -> None:
@@ -340,6 +344,7 @@ def link() -> Iterator[Link]:
     made.remove()
 
 
+@pytest.mark.proof
 def test_two_computers_with_tls_other_paths_and_a_cut_link(
     farm: Farm, link: Link, alone: farm_jobs.JobFolder, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -31,6 +31,7 @@ from gaussian_wrapping_addon.core.settings import (
 )
 from tests.core.dataset.model_writers import ImageRecord, Model, write_text
 from tests.poses import look_at_pose
+from tests.proofs import first_then_proofs
 from tests.synthetic import trace
 
 BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"
@@ -209,7 +210,7 @@ def wrapped(case: Case, place: Path) -> JobFolder:
     return folder
 
 
-@pytest.mark.parametrize("name", MESHED)
+@pytest.mark.parametrize("name", first_then_proofs(MESHED, 4))
 def test_it_ends_in_a_closed_mesh(name: str, tmp_path: Path) -> None:
     folder = wrapped(MESHED[name], tmp_path)
     with np.load(folder.result / "auto" / "mesh.npz", allow_pickle=False) as arrays:
@@ -247,7 +248,9 @@ def batch(*arguments: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [*REFUSED_AT_ONCE, *REFUSED])
+@pytest.mark.parametrize(
+    "name", first_then_proofs([*REFUSED_AT_ONCE, *REFUSED], len(REFUSED_AT_ONCE) + 1)
+)
 def test_the_command_line_says_what_is_wrong(name: str, tmp_path: Path) -> None:
     case, message, hint = {**REFUSED, **REFUSED_AT_ONCE}[name]
     source = case.write(tmp_path / "input")

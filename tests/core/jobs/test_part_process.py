@@ -71,6 +71,7 @@ def test_a_job_made_part_by_part_is_the_job(planned: JobFolder, tmp_path: Path) 
     assert run(planned, "plan-ball") == (0, '{"line": "part plan-ball was done before"}\n')
 
 
+@pytest.mark.proof
 @pytest.mark.timeout(900)
 def test_a_list_that_cannot_grow_makes_its_tiles_in_one_part(tmp_path: Path) -> None:
     folder, job = tiled_sphere(tmp_path, 2)

@@ -96,6 +96,7 @@ def test_jobs_run_in_turn_and_what_is_done_is_kept(tmp_path: Path) -> None:
     assert report.stat().st_mtime_ns == written
 
 
+@pytest.mark.proof
 @pytest.mark.timeout(900)
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are killed by a signal")
 def test_jobs_run_side_by_side_though_two_workers_are_killed(tmp_path: Path) -> None:

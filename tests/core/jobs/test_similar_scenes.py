@@ -143,6 +143,7 @@ def meshed(inputs: dict[str, BallScene]) -> dict[str, Path]:
     return results
 
 
+@pytest.mark.proof
 @pytest.mark.parametrize("name", list(SIMILARITIES)[1:])
 def test_the_mesh_has_the_same_bits(meshed: dict[str, Path], name: str) -> None:
     with (

@@ -34,6 +34,7 @@ def write_foreign_splat(path: Path) -> Path:
     return write_ply(path, columns, order=permuted(columns), kinds={"label": "u1", "x": "f8"})
 
 
+@pytest.mark.proof
 @pytest.mark.slow
 def test_a_permuted_splat_becomes_a_closed_mesh_on_its_surface(tmp_path: Path) -> None:
     path = write_foreign_splat(tmp_path / "other.ply")

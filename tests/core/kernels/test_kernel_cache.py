@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core.kernels import kernel_cache
+from tests.proofs import first_then_proofs
 from tests.read_only import read_only
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -64,13 +65,14 @@ RUN = (
 )
 
 
-@pytest.mark.slow
-def test_fresh_and_cached_kernels_give_the_same_bits(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "order", first_then_proofs([["losses"], ["one_view", "losses", "fields"]]), ids=len
+)
+def test_fresh_and_cached_kernels_give_the_same_bits(order: list[str], tmp_path: Path) -> None:
     def run(order: list[str], folder: str) -> subprocess.Popen[str]:
         return start([str(STAGES), *order], ROOT, NUMBA_CACHE_DIR=str(tmp_path / folder))
 
-    order = ["one_view", "losses", "fields"]
-    both = run(order, "a"), run(["fields", "losses"], "b")
+    both = run(order, "a"), run(order[:0:-1], "b")
     fresh, otherwise = (finish(process)[0].splitlines() for process in both)
     cached = finish(run(order[::-1], "a"))[0].splitlines()
     assert len(fresh) == len(order), "kernels left functions that others could call"

@@ -233,6 +233,7 @@ def test_scale_invariance(scale: float) -> None:
     assert figures.volume / scale**3 == pytest.approx(small.volume, rel=5e-3)
 
 
+@pytest.mark.proof
 def test_automatic_density_gives_tens_of_thousands_of_faces() -> None:
     mesh = mesh_shape(sphere(), cube(1.3))
     figures = assert_closed_manifold(mesh)

@@ -38,6 +38,7 @@ from gaussian_wrapping_addon.core.texture.detail.levels_of_detail import levels_
 from gaussian_wrapping_addon.core.texture.files.textured_files import write_textured
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
+from tests.proofs import first_then_proofs
 
 SIDES = {1: 512, 2: 362, 3: 296}
 """About as many texels in all."""
@@ -86,7 +87,7 @@ def each_alone(textured: TexturedMesh) -> list[TexturedMesh]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("atlases", [2, 3])
+@pytest.mark.parametrize("atlases", first_then_proofs([2, 3]))
 def test_several_atlases_bring_the_texture_back_as_one_does(
     atlases: int,
     baked: Bakes,
@@ -114,7 +115,7 @@ def test_several_atlases_bring_the_texture_back_as_one_does(
         assert raster.mean() > 0.2, number
 
 
-@pytest.mark.parametrize("atlases", [2, 3])
+@pytest.mark.parametrize("atlases", first_then_proofs([2, 3]))
 def test_what_two_photos_show_is_baked(atlases: int, baked: Bakes, photos: RenderedPhotos) -> None:
     from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
 
@@ -131,7 +132,7 @@ def test_what_two_photos_show_is_baked(atlases: int, baked: Bakes, photos: Rende
         assert (maps.views.ravel()[texels[often]] > 0).all()
 
 
-@pytest.mark.parametrize("atlases", [2, 3])
+@pytest.mark.parametrize("atlases", first_then_proofs([2, 3]))
 def test_the_mesh_stays_whole_and_looks_the_same(
     atlases: int, baked: Bakes, photos: RenderedPhotos
 ) -> None:

@@ -112,8 +112,8 @@ def test_46_handled(case: str, tmp_path: Path) -> None:
     ("splits", "noise"),
     [
         pytest.param(6, 0.0, id="81,920 faces"),
-        pytest.param(6, 0.3, id="81,920 noisy faces", marks=pytest.mark.slow),
-        pytest.param(7, 0.0, id="327,680 faces", marks=pytest.mark.slow),
+        pytest.param(6, 0.3, id="81,920 noisy faces", marks=pytest.mark.proof),
+        pytest.param(7, 0.0, id="327,680 faces", marks=pytest.mark.proof),
     ],
 )
 def test_47_large(splits: int, noise: float, tmp_path: Path) -> None:

@@ -84,6 +84,7 @@ def test_masks_of_the_user_are_taken_instead(made: Turntable, photos: Path, tmp_
     assert [w.code for w in scene.warnings if "turntable" in w.code] == ["turntable-with-masks"]
 
 
+@pytest.mark.proof
 def test_the_camera_may_stand_in_two_places(tmp_path: Path) -> None:
     """Between both the background moves as one body, which masks need not contain."""
     made = turntable(36, 480, 360, elevations=2)
@@ -93,6 +94,7 @@ def test_the_camera_may_stand_in_two_places(tmp_path: Path) -> None:
     assert np.median(pose_errors(scene.cameras, made.cameras).rotation_degrees) < 1.0
 
 
+@pytest.mark.proof
 def test_a_pause_over_a_repeated_pattern_is_no_turntable(tmp_path: Path) -> None:
     """Wrong matches among tiles move as one body; nothing differs in the photos."""
     random = np.random.default_rng(0)

@@ -26,6 +26,7 @@ from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.rollback import finished_job
 from tests.core.jobs.finished_sphere import write_finished_sphere
 from tests.core.training.small_scene import surface_color
+from tests.proofs import first_then_proofs
 
 BATCH = Path(__file__).resolve().parents[4] / "gaussian_wrapping_addon" / "batch.py"
 WORLD_FROM_SCENE = Similarity(
@@ -76,7 +77,10 @@ def psnr_of_colors(job: JobFolder, name: str) -> float:
     return float(10.0 * np.log10(255.0**2 / squared.mean()))
 
 
-@pytest.mark.parametrize(("name", "up"), [("ball.ply", "z"), ("ball.obj", "y"), ("ball.glb", "y")])
+@pytest.mark.parametrize(
+    ("name", "up"),
+    first_then_proofs([("ball.ply", "z"), ("ball.obj", "y"), ("ball.glb", "y")], names=2),
+)
 def test_a_file_in_world_coordinates_is_baked_in_its_place(
     name: str, up: str, job: JobFolder, tmp_path: Path
 ) -> None:
@@ -218,6 +222,7 @@ def test_refined_poses_are_used_where_the_training_has_them(tmp_path: Path) -> N
     assert turned < 0.2 * straight
 
 
+@pytest.mark.proof
 def test_a_cancelled_bake_leaves_no_files_and_is_resumed(job: JobFolder, tmp_path: Path) -> None:
     from gaussian_wrapping_addon.core.jobs.store.bake_request import BakeRequest
     from gaussian_wrapping_addon.core.jobs.store.job_file import make_bake_job

@@ -21,6 +21,7 @@ from tests.core.meshing.meshing_scenes import (
     sphere,
     torus,
 )
+from tests.proofs import first_then_proofs
 
 SIGMA = 0.05
 HALF = Region.box("half", np.array([-0.1, -2, -2]), np.array([2, 2, 2]))
@@ -28,8 +29,8 @@ HALF = Region.box("half", np.array([-0.1, -2, -2]), np.array([2, 2, 2]))
 
 @pytest.mark.parametrize("pivots", PIVOTS)
 @pytest.mark.parametrize("region", [cube(1.5), HALF], ids=["whole", "half"])
-@pytest.mark.parametrize("shape", [sphere, torus])
-@pytest.mark.parametrize("samples", ["depth", "none"])
+@pytest.mark.parametrize("shape", first_then_proofs([sphere, torus]))
+@pytest.mark.parametrize("samples", first_then_proofs(["depth", "none"]))
 def test_ranges_hold_the_mesh(shape, region: Region, pivots: int, samples: str) -> None:
     arrays = gaussians_on(shape(), cube(1.5), 4000, SIGMA)
     expected = estimate_pivot_mesh(arrays, region, pivots, 0, alone=samples == "none")

@@ -14,6 +14,7 @@ from gaussian_wrapping_addon.core.errors import DeviceError
 from gaussian_wrapping_addon.core.render.cuda import compiler, driver, source
 from gaussian_wrapping_addon.core.render.cuda.compiler import compile_text, find_nvrtc
 from gaussian_wrapping_addon.core.render.cuda.source import KERNELS, PARTS, cuda_source
+from tests.proofs import first_then_proofs
 
 REPOSITORY = Path(__file__).resolve().parents[4]
 # Turing, Ampere (data centre, consumer), Ada, Hopper, Blackwell (data centre, consumer).
@@ -33,7 +34,9 @@ def nvrtc() -> Path:
     return library
 
 
-@pytest.mark.parametrize("capability", CAPABILITIES, ids=lambda c: f"sm_{c[0]}{c[1]}")
+@pytest.mark.parametrize(
+    "capability", first_then_proofs(CAPABILITIES), ids=lambda c: f"sm_{c[0]}{c[1]}"
+)
 def test_compiles_with_sane_registers(nvrtc: Path, capability: tuple[int, int]) -> None:
     compiled = compile_text(cuda_source(), capability, nvrtc, verbose=True)
     assert compiled.image[:4] == b"\x7fELF", "machine code, not PTX"

@@ -74,6 +74,7 @@ def test_shared_memory_starts_as_nan(tmp_path: Path) -> None:
     assert torch.isnan(out).all()
 
 
+@pytest.mark.proof
 @pytest.mark.parametrize("kernel", ["forward_tile(", "backward_tile("])
 def test_every_barrier_of_the_tiles_is_needed(tmp_path: Path, kernel: str) -> None:
     # Without any one of them, the order of the threads decides what comes out.

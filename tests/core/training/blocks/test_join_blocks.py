@@ -124,6 +124,7 @@ def test_joined_gaussians_are_trained_together_and_can_be_interrupted(tmp_path: 
     assert longer.iterations == 100
 
 
+@pytest.mark.proof
 def test_two_blocks_are_as_good_as_one_training(tmp_path: Path) -> None:
     """All of it, from the sparse points on: whole photos, and what lies about the border."""
     scene, photos = row_scene(48)

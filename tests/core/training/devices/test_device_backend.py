@@ -16,6 +16,7 @@ from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.device_kernels import DEVICES
 from tests.core.training.devices.device_training import backend_of, perturbed_sphere
 from tests.core.training.small_scene import sphere_scene
+from tests.proofs import first_then_proofs
 
 ITERATIONS = 50
 
@@ -34,7 +35,7 @@ LOSS = 1e-3
 the emulator, in ten runs: up to 5.3e-6."""
 
 
-@pytest.mark.parametrize(("seed", "word"), [(1, "on"), (2, "auto")])
+@pytest.mark.parametrize(("seed", "word"), first_then_proofs([(1, "on"), (2, "auto")], names=2))
 @pytest.mark.parametrize("device", DEVICES)
 def test_fifty_iterations_come_to_the_same_end(
     request: pytest.FixtureRequest,

@@ -25,6 +25,7 @@ from gaussian_wrapping_addon.core.jobs.parts.code_version import code_version
 from gaussian_wrapping_addon.core.names import SHARED_VARIABLE
 from tests.core.jobs.farm_jobs import wait_until
 from tests.core.jobs.test_farm_network import PACKAGE, Farm, descendants, end, free_port
+from tests.proofs import first_then_proofs
 
 pytest.importorskip("distributed", reason="Dask is not installed: set-up-worker --add farm")
 pytestmark = [
@@ -107,7 +108,7 @@ def test_each_worker_has_a_line_and_nothing_is_left(farm: Farm, tmp_path: Path) 
     assert [*here.iterdir(), *other.iterdir()] == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", first_then_proofs([signal.SIGINT, signal.SIGKILL]))
 def test_a_doctor_that_is_ended_leaves_nothing(
     farm: Farm, tmp_path: Path, number: signal.Signals
 ) -> None:
@@ -126,6 +127,7 @@ def test_a_doctor_that_is_ended_leaves_nothing(
     wait_until(lambda: not Path(f"/proc/{child}").exists(), 15.0)
 
 
+@pytest.mark.proof
 def test_a_scheduler_that_hangs_is_told(farm: Farm, tmp_path: Path) -> None:
     address = f"tcp://127.0.0.1:{free_port()}"
     scheduler = farm.start("scheduler", address, says="listens at")

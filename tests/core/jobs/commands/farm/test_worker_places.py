@@ -22,6 +22,7 @@ from gaussian_wrapping_addon.core.cluster.certificates import make_certificates
 from gaussian_wrapping_addon.core.errors import EXIT_CANCELLED, EXIT_OTHER, EXIT_USAGE
 from tests.core.jobs.farm_jobs import kill, wait_until
 from tests.core.jobs.test_farm_network import PACKAGE, descendants, free_port
+from tests.proofs import first_then_proofs
 
 pytest.importorskip("dask_jobqueue", reason="Dask is not installed: set-up-worker --add farm")
 pytestmark = [
@@ -132,7 +133,7 @@ def workers_of(address: str) -> list[int]:
     return found
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", first_then_proofs([signal.SIGINT, signal.SIGKILL]))
 def test_computers_by_ssh_work_and_end_with_the_command(
     stubs: Path, run: Callable[..., Running], tmp_path: Path, number: signal.Signals
 ) -> None:
@@ -174,6 +175,7 @@ def test_where_no_computer_works_the_command_ends(stubs: Path, run: Callable[...
     assert any("warning: a has ended with code 127: " in line for line in odd.said())
 
 
+@pytest.mark.proof
 @pytest.mark.parametrize(
     ("system", "number"),
     [("slurm", signal.SIGINT), ("pbs", signal.SIGINT), ("slurm", signal.SIGKILL)],
