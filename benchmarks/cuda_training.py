@@ -28,7 +28,6 @@ import torch
 if __package__ in (None, ""):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.workload import surface_gaussians, view
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
@@ -42,6 +41,8 @@ from gaussian_wrapping_addon.core.training.losses.multi_view import (
     add_image_gradients,
 )
 from gaussian_wrapping_addon.core.training.optimizer.adam import TRAINED, Adam
+
+from .workload import surface_gaussians, view
 
 REFERENCE_COUNT = 50_000
 """The workload's sizes are for this many Gaussians."""

@@ -26,13 +26,9 @@ from gaussian_wrapping_addon.core.errors import WorkerError
 from gaussian_wrapping_addon.core.files import read_json, write_bytes, write_json
 from gaussian_wrapping_addon.core.machine import processor_name
 
-from .speed_error.runs import BATCH, LAST_LINES, ROOT
-from .speed_error.tables import Row, table_of
-from .study.command import DOCUMENTS
-from .study.making import KEPT_RUNS
-from .study.origin import reading
-from .study.record import PACKAGE, RECORDS
-from .tables import versions
+from .runs import BATCH, LAST_LINES, ROOT
+from .study import DOCUMENTS, KEPT_RUNS, PACKAGE, RECORDS, reading
+from .tables import Row, table_of, versions
 
 _logger = logging.getLogger("benchmarks")
 

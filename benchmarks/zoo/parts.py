@@ -20,17 +20,22 @@ from gaussian_wrapping_addon.core.errors import WrapError
 from gaussian_wrapping_addon.core.files import write_bytes
 from gaussian_wrapping_addon.core.settings import MODEL_SELECTION
 
-from ..speed_error.tables import AT, Row, table_of, three, two
-from ..study.case import Case
-from ..study.command import DOCUMENTS
-from ..study.figures import f1_middle, f1_seen, view_psnr
-from ..study.making import carry_out
-from ..study.origin import made_by, reading
-from ..study.record import RECORDS, Record, read_records
-from ..tables import Table
+from ..study import (
+    DOCUMENTS,
+    RECORDS,
+    Case,
+    Record,
+    carry_out,
+    f1_middle,
+    f1_seen,
+    made_by,
+    read_records,
+    reading,
+    view_psnr,
+)
+from ..tables import AT, Row, Table, table_of, three, two
 from .catalogue import SCENES
-from .document import floaters
-from .runs import find_scene, make_one, scene_photos
+from .study import find_scene, floaters, make_one, scene_photos
 
 _logger = logging.getLogger("benchmarks")
 

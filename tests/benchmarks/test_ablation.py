@@ -12,33 +12,30 @@ from xml.etree import ElementTree
 
 import pytest
 
-from benchmarks.ablation_study import document, tables
-from benchmarks.ablation_study.plan import (
+from benchmarks import ablation as document
+from benchmarks import ablation as tables
+from benchmarks.ablation import (
     CELLS,
     CLONES,
     FIXED,
     OFF,
     ON,
     ORIENTED,
+    PARTS,
     PLAIN,
     SCENES,
     SEEDS,
     Cell,
-    plan,
-)
-from benchmarks.ablation_study.plots import write_plot
-from benchmarks.ablation_study.tables import (
-    PARTS,
     cell_table,
     differences,
     fixed_options,
     part_table,
+    plan,
     settings_table,
+    write_plot,
 )
 from benchmarks.scenes import ALL_KINDS
-from benchmarks.study.case import options
-from benchmarks.study.figures import f1_middle, thin
-from benchmarks.study.record import Record
+from benchmarks.study import Record, f1_middle, options, thin
 from benchmarks.tables import Table
 from gaussian_wrapping_addon.core.settings import MODEL_SELECTION
 from tests.benchmarks.invented_records import invented

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.camera_solving.document import page
-from benchmarks.camera_solving.places import hall, town
-from benchmarks.camera_solving.ray_caster import render
-from benchmarks.camera_solving.retrieval import recall
+from benchmarks.camera_places import hall, render, town
+from benchmarks.camera_solving import page, recall
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from tests.synthetic import look_at
 

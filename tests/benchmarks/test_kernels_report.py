@@ -8,13 +8,13 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-
 from benchmarks.fma_peak import _chains
 from benchmarks.kernel_results import BACKWARD, FORWARD, Result, Workload
 from benchmarks.kernel_speed import measure_workload
+from benchmarks.timing import measure
+
 from benchmarks.kernels import PARTS, main, panels, speed_sections
 from benchmarks.tables import Table
-from benchmarks.timing import measure
 from gaussian_wrapping_addon.core.evaluation.report.plot import write_svg
 
 

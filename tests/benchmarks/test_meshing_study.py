@@ -12,12 +12,9 @@ from xml.etree import ElementTree
 import pytest
 
 from benchmarks import meshing
-from benchmarks.meshing_study import carry_out
-from benchmarks.meshing_study.acceptance import checks
-from benchmarks.meshing_study.carry_out import Made, Outcome
-from benchmarks.meshing_study.document import write_document
-from benchmarks.meshing_study.figures import write_plots
-from benchmarks.meshing_study.plan import (
+from benchmarks import meshing_runs as carry_out
+from benchmarks.meshing import write_document
+from benchmarks.meshing_runs import (
     ADAPTIVE,
     FUSION,
     LARGE_POINTS,
@@ -26,20 +23,24 @@ from benchmarks.meshing_study.plan import (
     SPACING_SCENES,
     TETRAHEDRA,
     UNIFORM,
+    Made,
     Method,
+    Outcome,
     Plan,
     Subject,
     full_plan,
     quick_plan,
 )
-from benchmarks.meshing_study.tables import (
+from benchmarks.meshing_tables import (
+    checks,
     cost_table,
     isosurface_table,
     solid_table,
     truth_table,
+    write_plots,
 )
+from benchmarks.runs import Settings
 from benchmarks.scenes import ALL_KINDS
-from benchmarks.speed_error.runs import Settings
 from benchmarks.tables import Table
 from gaussian_wrapping_addon.core.errors import WorkerError
 

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from benchmarks import speed_vs_error
+from benchmarks import speed_vs_error as document
+from benchmarks.alpha_shape import alpha_shape
+from benchmarks.runs import PRESETS
 from benchmarks.scenes import ALL_KINDS
-from benchmarks.speed_error import document
-from benchmarks.speed_error.alpha_shape import alpha_shape
-from benchmarks.speed_error.cases import (
+from benchmarks.speed_vs_error import (
     ALPHA,
     LABELS,
     MESHED_PRESETS,
@@ -25,14 +26,14 @@ from benchmarks.speed_error.cases import (
     SCENES,
     alpha_case,
     mesher_case,
+    mesher_table,
     preset_case,
+    preset_table,
+    spent_s,
     study_plan,
+    write_plot,
 )
-from benchmarks.speed_error.plan import PRESETS
-from benchmarks.speed_error.plots import write_plot
-from benchmarks.speed_error.preset_tables import mesher_table, preset_table, spent_s
-from benchmarks.study.case import Case, options
-from benchmarks.study.record import Record
+from benchmarks.study import Case, Record, options
 from benchmarks.tables import Table
 from tests.benchmarks.invented_records import invented
 

@@ -12,23 +12,28 @@ from typing import Any
 
 import pytest
 
-from benchmarks.speed_error import runs as speed_error_runs
-from benchmarks.speed_error.plan import Photos, Run
-from benchmarks.speed_error.runs import Settings, warm_up
-from benchmarks.study import command, making, mesh_based, record
-from benchmarks.study.case import Case, named, options
-from benchmarks.study.making import carry_out, kept_scores
-from benchmarks.study.origin import made_by
-from benchmarks.study.record import (
+from benchmarks import runs as speed_error_runs
+from benchmarks import study as command
+from benchmarks import study as making
+from benchmarks import study as mesh_based
+from benchmarks import study as record
+from benchmarks.runs import Photos, Run, Settings, warm_up
+from benchmarks.study import (
+    Case,
     Record,
+    carry_out,
     code_of_tree,
+    kept_scores,
+    made_by,
+    named,
+    options,
     read_record,
     read_records,
     record_path,
     said_versions,
     write_record,
 )
-from benchmarks.study.spread import Spread, shown
+from benchmarks.tables import Spread, shown
 from gaussian_wrapping_addon.core.errors import ParseError, UsageError, WorkerError
 from tests.benchmarks.invented_records import CODE, invented, surface
 

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.study.record import record_path, write_record
-from benchmarks.zoo import taken_photos
-from benchmarks.zoo.cache import scene_folder
-from benchmarks.zoo.runs import FIGURES, TAKEN, find_scene, is_made, run_case
-from benchmarks.zoo.taken_photos import compressed, ensure_taken_scene, taken, taken_folder
+from benchmarks.study import record_path, write_record
+from benchmarks.zoo import scene as taken_photos
+from benchmarks.zoo.scene import compressed, ensure_taken_scene, scene_folder, taken, taken_folder
+from benchmarks.zoo.study import FIGURES, TAKEN, find_scene, is_made, run_case
 from tests.benchmarks.invented_records import invented
 
 NAME = "thin-d1"

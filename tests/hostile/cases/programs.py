@@ -9,6 +9,7 @@ from pathlib import Path
 
 from benchmarks.camera_files import writers
 from benchmarks.camera_files.writers import Shots
+
 from tests.core.dataset.model_writers import HEIGHT, WIDTH, ring_poses
 from tests.hostile.case import Build, Variant
 from tests.hostile.inputs import COUNT, changed, file, remove, steps, transforms

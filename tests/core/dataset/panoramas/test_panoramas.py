@@ -10,11 +10,11 @@ from typing import Any, NoReturn
 
 import numpy as np
 import pytest
+from benchmarks.camera_files import writers
+from benchmarks.camera_files.writers import Shots
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from benchmarks.camera_files import writers
-from benchmarks.camera_files.writers import Shots
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.loading import load as load_module
 from gaussian_wrapping_addon.core.dataset.loading.check import check_input

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.turntable.photos import Turntable, turntable, write_photos
 from PIL import Image
 
-from benchmarks.turntable.photos import Turntable, turntable, write_photos
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
 from gaussian_wrapping_addon.core.dataset.scene import Scene

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from benchmarks.units.marker_scene import (
     DICTIONARY,
     SIDE_M,
@@ -17,6 +16,7 @@ from benchmarks.units.marker_scene import (
     table_scene,
     write_photos,
 )
+
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.loading import load
 from gaussian_wrapping_addon.core.dataset.loading.real_world import UnitsRequest

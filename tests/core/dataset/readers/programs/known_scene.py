@@ -6,9 +6,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from benchmarks.camera_files.writers import Shots
 from PIL import Image
 
-from benchmarks.camera_files.writers import Shots
 from gaussian_wrapping_addon.core.dataset.lenses.lens_fit import fit_lens
 from gaussian_wrapping_addon.core.dataset.lenses.undistort import project
 from gaussian_wrapping_addon.core.dataset.loading.source_kind import read_poses, source_kind

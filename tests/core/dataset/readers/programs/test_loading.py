@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-
 from benchmarks.camera_files import writers
 from benchmarks.camera_files.writers import Shots
+from PIL import Image
+
 from gaussian_wrapping_addon.core.dataset.frames.scene_grid import POINT_STEP
 from gaussian_wrapping_addon.core.dataset.loading.check import check_input
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
