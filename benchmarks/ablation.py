@@ -16,13 +16,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from gaussian_wrapping_addon.core.evaluation.report.plot import Panel, Series, write_svg
-from gaussian_wrapping_addon.core.files import write_bytes
 
+from .provenance import write_page
 from .study import (
     MBR_NOTE,
     PHOTOS,
     Case,
     Record,
+    commits,
     f1_fine,
     f1_middle,
     f1_seen,
@@ -303,7 +304,7 @@ def write_plot(records: Records, path: Path) -> None:
     write_svg(panels, path)
 
 
-PAGE, PLOT, READING = "ablation.md", "ablation.svg", "ablation-reading.md"
+PAGE, PLOT = "ablation.md", "ablation.svg"
 COMMAND = "python -m benchmarks.ablation"
 
 _GROWTH = {"on": ("With `--growth on` only the cap ends growth, and nothing is pruned.",)}
@@ -316,8 +317,6 @@ def write_document(out: Path, records: Records, cases: Sequence[Case]) -> Path:
     given = ", ".join(f"`{name} {value}`" for name, value in fixed.items())
     tables = (settings_table(cases), part_table(records), cell_table(records))
     lines = [
-        "# Ablation: multi-view terms, orientation, clones",
-        "",
         *made_by(COMMAND, list(records.values()), cases),
         "",
         photos_said(PHOTOS),
@@ -327,16 +326,15 @@ def write_document(out: Path, records: Records, cases: Sequence[Case]) -> Path:
         "Clones turn around what orientation has found. Without orientation there are none: six",
         "cells, not eight.",
         "",
-        *reading(out / READING),
+        *reading("ablation"),
         f"![F1 against processor time, every run a dot]({PLOT})",
         "",
         "## Tables",
         "",
         *(table.markdown() for table in tables if table.rows),
     ]
-    path = out / PAGE
-    write_bytes(path, ("\n".join(lines).rstrip() + "\n").encode())
-    return path
+    title = "Ablation: multi-view terms, orientation, clones"
+    return write_page(out / PAGE, title, commits(records.values()), lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -24,18 +24,11 @@ from gaussian_wrapping_addon.core.machine import processor_name
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.region import read_region
 
+from .provenance import code_of_tree, versions
 from .runs import THRESHOLD_SHARES
 from .score import SURFACE_SAMPLES
-from .study import (
-    Case,
-    Record,
-    SceneFinder,
-    code_of_tree,
-    kept_surface,
-    rendered_scene,
-    write_record,
-)
-from .tables import MIDDLE, versions
+from .study import Case, Record, SceneFinder, kept_surface, rendered_scene, write_record
+from .tables import MIDDLE
 
 ALPHA_SHARES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)
 """Of the crop volume's diagonal."""

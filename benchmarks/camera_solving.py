@@ -11,7 +11,6 @@ look the same, ``odm_caliterra`` and ``odm_brighton_beach`` are photos of drones
 from __future__ import annotations
 
 import argparse
-import datetime
 import logging
 import resource
 import sys
@@ -38,13 +37,13 @@ from gaussian_wrapping_addon.core.dataset.poses.solution_check import check_solu
 from gaussian_wrapping_addon.core.dataset.pycolmap_import import import_pycolmap
 from gaussian_wrapping_addon.core.dataset.readers.source_model import SourceModel
 from gaussian_wrapping_addon.core.evaluation.alignment.pose_error import pose_errors
-from gaussian_wrapping_addon.core.files import read_json, write_json
-from gaussian_wrapping_addon.core.machine import processor_name
+from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.processes.peak_memory import largest_helper_bytes
 from gaussian_wrapping_addon.core.progress import Progress
 
+from . import provenance
 from .camera_places import PLACES, ensure_photos, hall_tracks, write_database
-from .runs import ROOT
+from .provenance import DOCUMENTS, code_of_tree, write_figures, write_page
 
 _EARTH_M = 6_371_000.0
 
@@ -107,9 +106,6 @@ def run(case: Case, data: Path | None, threads: int, tell: Callable[[str], None]
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     record = {
         "case": case.identity,
-        "date": datetime.date.today().isoformat(),
-        "processor": processor_name(),
-        "threads": threads,
         "seconds": time.monotonic() - begun_s,
         "processor_seconds": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
         "peak_bytes": largest_helper_bytes(),
@@ -281,7 +277,7 @@ Records = Mapping[str, Mapping[str, Any]]
 
 _HEAD = (
     "`python -m benchmarks.camera_solving --data DIR`, with `odm_caliterra`, `odm_brighton_beach`, "
-    "`fox` and `conch_turntable` in DIR; from records, which name machine and date. Processor "
+    "`fox` and `conch_turntable` in DIR; from records. Processor "
     "seconds are of the solver's process and all its threads; seconds on the clock mean something "
     "only where nothing else runs."
 )
@@ -302,18 +298,15 @@ _REPEATING = (
 )
 
 
-def page(records: Records) -> str:
-    """Return the page."""
-    lines = [
-        "# Cameras of hundreds of photos",
-        "",
+def page(records: Records) -> list[str]:
+    """Return the lines of the page below its title."""
+    return [
         _HEAD,
         "",
         *_runs(records),
         *_retrieval(records),
         *_repeating(records),
     ]
-    return "\n".join(lines).rstrip() + "\n"
 
 
 def _runs(records: Records) -> list[str]:
@@ -337,17 +330,24 @@ def _runs(records: Records) -> list[str]:
                 _number(gps and gps["median_m"], 1),
                 facts["pairs_contradicting_cameras"],
                 ", ".join(warning["code"] for warning in record["warnings"]) or "none",
-                record["date"],
+                record["date"][:10],
+                record.get("code", {}).get("commit", "not recorded"),
             ]
         )
     if not rows:
         return []
     head = [
         "photos", "placed", "mapper", "pairs", "processor s", "clock s", "GiB", "rotation deg",
-        "centre %", "reprojection px", "GPS m", "contradicting pairs", "warnings", "date",
+        "centre %", "reprojection px", "GPS m", "contradicting pairs", "warnings", "date", "commit",
     ]  # fmt: skip
-    threads = sorted({record["threads"] for record in records.values() if "threads" in record})
-    processors = sorted({record["processor"] for record in records.values() if "threads" in record})
+    threads = sorted({record["threads"] for record in records.values() if "placed" in record})
+    processors = sorted(
+        {
+            record.get("machine") or record["processor"]
+            for record in records.values()
+            if "placed" in record
+        }
+    )
     return [
         "## Solved cameras",
         "",
@@ -432,8 +432,8 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
 
 
 _logger = logging.getLogger("benchmarks")
-RECORDS = ROOT / "benchmarks" / "records" / "camera_solving"
-PAGE = ROOT / "docs" / "benchmarks" / "camera-solving.md"
+RECORDS = provenance.RECORDS / "camera_solving"
+PAGE = "camera-solving.md"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -445,25 +445,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--again", action="store_true", help="make runs that have a record, too")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    RECORDS.mkdir(parents=True, exist_ok=True)
+    code = code_of_tree()
 
     def wanted(name: str) -> bool:
         is_new = options.again or not (RECORDS / f"{name}.json").is_file()
         return is_new and (options.only is None or name in options.only)
 
+    def keep(name: str, figures: dict[str, Any]) -> None:
+        write_figures(RECORDS / f"{name}.json", figures, options.threads, code)
+
     for case in CASES:
         if wanted(case.identity) and (case.count or options.data is not None):
             record = run(case, options.data, options.threads, _logger.info)
-            write_json(RECORDS / f"{case.identity}.json", record)
+            keep(case.identity, record)
             _logger.info("%s: %s", case.identity, record)
     if wanted("repeating"):
-        write_json(RECORDS / "repeating.json", repeating_record(_logger.info))
+        keep("repeating", repeating_record(_logger.info))
     for name in ("fox", "odm_caliterra", "conch_turntable"):
         if options.data is not None and wanted(f"recall-{name}"):
             photos = options.data / name / "images"
-            write_json(RECORDS / f"recall-{name}.json", recall_record(photos, options.threads))
+            keep(f"recall-{name}", recall_record(photos, options.threads))
     records = {path.stem: read_json(path) for path in sorted(RECORDS.glob("*.json"))}
-    PAGE.write_text(page(records), "utf-8")
+    commits = [record.get("code", {}).get("commit") for record in records.values()]
+    write_page(DOCUMENTS / PAGE, "Cameras of hundreds of photos", commits, page(records))
     return 0
 
 

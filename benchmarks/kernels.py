@@ -324,8 +324,10 @@ def part_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 def thread_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Return times on the clock of each number of threads, with the gain over one."""
     single = {tuple(r["workload"]): r["parts"] for r in rows if r["threads"] == 1}
-    shown = ("raster forward, isosurface", "raster backward, isosurface",
-             "projection, binning, rows", f"{WHOLE}, colour", f"{WHOLE}, depth and normals")  # fmt: skip
+    shown = (
+        "raster forward, isosurface", "raster backward, isosurface", "projection, binning, rows",
+        f"{WHOLE}, colour", f"{WHOLE}, depth and normals",
+    )  # fmt: skip
     cells: list[Row] = []
     for row in rows:
         one = single.get(tuple(row["workload"]))

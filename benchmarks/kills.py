@@ -39,16 +39,16 @@ from gaussian_wrapping_addon.core.errors import (
     ResourceError,
     WorkerError,
 )
-from gaussian_wrapping_addon.core.files import read_json, write_bytes, write_json
+from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.jobs.client import WORKER_MODULE
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.machine import processor_name
 from tools.version_comparison.contents import Contents, LeftOut, differences, read_contents
 
-from .runs import BATCH, ROOT
-from .scenes import ensure_scene
-from .study import DOCUMENTS, RECORDS, code_of_tree
-from .tables import Table, versions
+from .provenance import DOCUMENTS, RECORDS, ROOT, code_of_tree, versions, write_page
+from .runs import BATCH
+from .scenes.cache import ensure_scene
+from .tables import Table
 
 KILL, CANCEL, DISK, MEMORY, CALLER = "kill", "cancel", "disk", "memory", "caller"
 WAYS = {
@@ -315,6 +315,9 @@ class Outcome:
     code_name: str
     """Version of the program."""
     date: str
+    commit: str = ""
+    """Empty in records of before it was kept, as is the machine."""
+    machine: str = ""
 
     @property
     def faults(self) -> list[str]:
@@ -368,7 +371,7 @@ SHOWN_DIFFERENCES = 5
 
 def carry_out(trial: Trial, reference: Reference, place: Path) -> Outcome:
     """Make one trial in a folder of its own below ``place``, which is removed afterwards."""
-    out = place / trial.identity
+    out, code_before = place / trial.identity, code_of_tree()
     limit = _limit(trial, reference)
     with _small_disk(out, limit) if trial.way == DISK else contextlib.nullcontext():
         job = out / "job" if trial.way == DISK else out
@@ -410,7 +413,9 @@ def carry_out(trial: Trial, reference: Reference, place: Path) -> Outcome:
         resumed=0 if again is None else again.returncode,
         compared=len(reference.contents.items),
         differences=tuple(f"{name}: {how}" for name, how in apart[:SHOWN_DIFFERENCES]),
-        code_name=code_of_tree().name,
+        code_name=code_before.name,
+        commit=code_before.commit,
+        machine=f"{processor_name()}; {versions()}",
         date=datetime.date.today().isoformat(),
     )
 
@@ -506,16 +511,15 @@ _NOTE = (
 
 def write_document(out: Path, outcomes: dict[str, Outcome], count: int) -> Path:
     """Write the page into a folder and return its path."""
-    path = out / PAGE
-    write_bytes(path, (page(list(outcomes.values()), count).rstrip() + "\n").encode())
-    return path
+    every = list(outcomes.values())
+    return write_page(out / PAGE, "Interrupted jobs", [o.commit for o in every], page(every, count))
 
 
-def page(outcomes: list[Outcome], count: int) -> str:
-    """Return the page."""
+def page(outcomes: list[Outcome], count: int) -> list[str]:
+    """Return the lines of the page below its title."""
     dates = sorted({o.date for o in outcomes})
     codes = sorted({o.code_name for o in outcomes})
-    machine = f"{processor_name()}; {versions()}"
+    machines = "; ".join(sorted({o.machine for o in outcomes if o.machine})) or "not recorded"
     items = max((o.compared for o in outcomes), default=0)
     faults = [
         f"- {o.trial.identity} (at {o.hit or 'the end'}): {fault}"
@@ -523,9 +527,8 @@ def page(outcomes: list[Outcome], count: int) -> str:
         for fault in o.faults
     ]
     lines = [
-        "# Interrupted jobs",
-        "",
-        f"`{COMMAND} --n {count}`, {' and '.join(dates)}. {machine}. Code: {', '.join(codes)}.",
+        f"`{COMMAND} --n {count}`, {' and '.join(dates)}. Machine: {machines}.",
+        f"Code: {', '.join(codes)}.",
         "",
         f"A small job ({PHOTOS} photos of {WIDTH_PX} x {HEIGHT_PX} pixels with cameras, 1 thread)",
         "goes through all stages by the command line. It is interrupted at a moment drawn from a",
@@ -538,7 +541,7 @@ def page(outcomes: list[Outcome], count: int) -> str:
         "",
         *(faults or ["Nothing."]),
     ]
-    return "\n".join(lines)
+    return lines
 
 
 def _table(outcomes: list[Outcome]) -> Table:

@@ -66,7 +66,7 @@ def _volume(random: np.random.Generator) -> np.ndarray:
     return (volume / volume.std()).astype(np.float32)
 
 
-MESHES = Path(__file__).resolve().parents[1] / "meshes"
+MESHES = Path(__file__).resolve().parent / "meshes"
 DIAGONAL = 2.0
 DISTANCE = 2.1
 BACKGROUND = (40.0, 90.0, 60.0)

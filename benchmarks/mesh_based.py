@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Mesh-based rendering of one mesh: a colour field trained on it, compared with the test views.
 
-``python -m benchmarks.speed_error.mesh_based SCENE OUT.json [--mesh FOLDER --job FOLDER | --file
+``python -m benchmarks.mesh_based SCENE OUT.json [--mesh FOLDER --job FOLDER | --file
 MESH] [--pixels outline|whole]``; without a mesh, the true surface is judged, which shows what the
 measure can reach. The field is trained on the scene's training photos and judged on its test
 views, which no job was given (docs/method.md, section 9.3).

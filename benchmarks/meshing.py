@@ -3,15 +3,14 @@
 
 Each scene is trained once through the command line. Then marching tetrahedra on two and nine
 pivots, primal adaptive meshing with uniform and adaptive spacing, and TSDF fusion of rendered depth
-maps mesh it, each in a process of its own. ``meshing.md`` and its plots go into
-``docs/benchmarks``: the targets of meshing with what was measured, and all figures.
+maps mesh it, each in a process of its own. The figures are kept in
+``benchmarks/records/meshing.json``; ``meshing.md`` and its plots go into ``docs/benchmarks``: the targets of meshing with what was measured, and all figures.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import datetime
 import logging
 import sys
 import time
@@ -20,11 +19,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from gaussian_wrapping_addon.core.files import write_bytes
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
-from gaussian_wrapping_addon.core.machine import processor_name
 
-from .meshing_runs import Outcome, carry_out, full_plan, quick_plan
+from .meshing_runs import Made, Outcome, Plan, carry_out, full_plan, quick_plan
 from .meshing_tables import (
     SHOWN,
     acceptance_table,
@@ -35,11 +32,21 @@ from .meshing_tables import (
     truth_table,
     write_plots,
 )
-from .runs import ROOT, Settings
-from .tables import missing_table, versions
+from .provenance import (
+    RECORDS,
+    ROOT,
+    UNKNOWN,
+    Code,
+    code_of_tree,
+    read_figures,
+    write_figures,
+    write_page,
+)
+from .runs import Settings
+from .tables import missing_table
 
 PAGE = "meshing"
-"""Name of the page; a hand-written ``meshing-reading.md`` may lie beside it."""
+"""Name of the page and of the record."""
 
 
 def write_document(out: Path, outcome: Outcome, facts: dict[str, Any]) -> Path:
@@ -51,7 +58,7 @@ def write_document(out: Path, outcome: Outcome, facts: dict[str, Any]) -> Path:
         Must exist.
     outcome : Outcome
     facts : dict
-        ``command``, ``date`` and ``threads``.
+        ``command``, ``date``, ``threads``, ``machine`` and ``versions``.
     """
     made = outcome.made
     plots = out / f"{PAGE}.svg"
@@ -67,22 +74,19 @@ def write_document(out: Path, outcome: Outcome, facts: dict[str, Any]) -> Path:
     ]
     targets = acceptance_table(outcome)
     lines = [
-        "# Meshing: speed against error",
-        "",
         *_made_by(outcome, facts),
         "",
         *_photos(outcome),
         "",
-        *reading(out / f"{PAGE}-reading.md", facts["date"]),
         *([targets.markdown()] if targets.rows else []),
         *([f"![Plots]({PAGE}.svg)", "", _plot_words(), ""] if plots.is_file() else []),
         "## Tables",
         "",
         *(table.markdown() for table in tables if table.rows),
     ]
-    path = out / f"{PAGE}.md"
-    write_bytes(path, ("\n".join(lines).rstrip() + "\n").encode())
-    return path
+    codes = {m.figures["code"].split()[0] for m in made}
+    codes |= {str(run.get("code", UNKNOWN)).split()[0] for run in outcome.trainings.values()}
+    return write_page(out / f"{PAGE}.md", "Meshing: speed against error", sorted(codes), lines)
 
 
 def _made_by(outcome: Outcome, facts: dict[str, Any]) -> list[str]:
@@ -95,8 +99,8 @@ def _made_by(outcome: Outcome, facts: dict[str, Any]) -> list[str]:
     seconds += sum(run["wall_s"] for run in outcome.trainings.values())
     load = f"{max(loads):.1f}" if loads else "not recorded"
     return [
-        f"`{facts['command']}`, {facts['date']}. {processor_name()}, {facts['threads']} threads;",
-        f"{versions()}, Open3D {_open3d()}.",
+        f"`{facts['command']}`, {facts['date']}. {facts['machine']}, {facts['threads']} threads;",
+        f"{facts['versions']}, Open3D {_open3d()}.",
         f"Code of the meshes: {', '.join(codes) or 'none'}; of the trainings:",
         f"{', '.join(trained) or 'none'}. {len(made)} meshes; they, their scores and the trainings",
         f"took {seconds / 60:.0f} minutes (references not counted); largest load average before a",
@@ -133,16 +137,34 @@ def _open3d() -> str:
         return "is not installed"
 
 
-def reading(path: Path, date: str) -> list[str]:
-    """Return the hand-written reading; its first line is the date of the figures that it reads."""
-    if not path.is_file():
-        return []
-    written, _, text = path.read_text(encoding="utf-8").partition("\n")
-    stale = (
-        [] if written.strip() == date else [f"*Written for the figures of {written.strip()}.*", ""]
-    )
-    heading, _, rest = text.strip().partition("\n")
-    return [heading, "", *stale, rest.strip(), ""]
+def keep(path: Path, outcome: Outcome, facts: dict[str, Any], code: Code) -> None:
+    """Write the record of a study."""
+    made = [
+        {"scene": m.subject.name, "method": m.method.identity, "figures": m.figures,
+         "scores": m.scores}
+        for m in outcome.made
+    ]  # fmt: skip
+    figures = {
+        "command": facts["command"], "made": made, "trainings": outcome.trainings,
+        "vacancy": outcome.vacancy, "missing": outcome.missing,
+    }  # fmt: skip
+    write_figures(path, figures, facts["threads"], code)
+
+
+def kept(path: Path, plan: Plan) -> tuple[Outcome, dict[str, Any]]:
+    """Return outcome and facts of a record, as far as the plan still has its scenes."""
+    record = read_figures(path)
+    subjects = {subject.name: subject for subject in plan.subjects}
+    made = []
+    for row in record["made"]:
+        subject = subjects.get(row["scene"])
+        for method in subject.methods if subject else ():
+            if method.identity == row["method"]:
+                made.append(Made(subject, method, row["figures"], row["scores"]))
+    missing = [(name, reason) for name, reason in record["missing"]]
+    facts = {name: record[name] for name in ("command", "threads", "machine", "versions")}
+    outcome = Outcome(made, record["trainings"], record["vacancy"], missing, False)
+    return outcome, {**facts, "date": record["date"][:10]}
 
 
 _logger = logging.getLogger("benchmarks")
@@ -184,7 +206,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     settings = Settings(CACHE / kind, threads, options.reuse)
     out = options.out or (CACHE / "quick-report" if options.quick else ROOT / "docs/benchmarks")
     out.mkdir(parents=True, exist_ok=True)
-    begun_s = time.monotonic()
+    begun_s, code = time.monotonic(), code_of_tree()
     outcome = carry_out(
         plan, settings, options.data, options.only, keep_trainings=options.keep_trainings
     )
@@ -196,10 +218,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else list(arguments)
     facts = {
         "command": " ".join(["python -m benchmarks.meshing", *_without_folders(words)]),
-        "date": datetime.date.today().isoformat(),
         "threads": threads,
     }
-    path = write_document(out, outcome, facts)
+    record = out / f"{PAGE}.json" if options.out or options.quick else RECORDS / f"{PAGE}.json"
+    keep(record, outcome, facts, code)
+    path = write_document(out, *kept(record, plan))
     _logger.info("report after %.0f minutes: %s", (time.monotonic() - begun_s) / 60, path)
     return int(outcome.failed)
 

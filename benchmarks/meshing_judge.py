@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Judge one mesh: against the field, the isosurface's reference mesh, the truth, and as a solid.
 
-``python -m benchmarks.meshing_study.judge SCENE JOB MESH.npz REFERENCE.npz OUT.json``
+``python -m benchmarks.meshing_judge SCENE JOB MESH.npz REFERENCE.npz OUT.json``
 
 Every mesh is judged by the same program, whatever made it.
 """

@@ -16,9 +16,8 @@ from typing import Any
 from gaussian_wrapping_addon.core.errors import WorkerError
 from gaussian_wrapping_addon.core.files import read_json, write_json
 
-from .one_mesh import MEASURED, MESH
 from .runs import Photos, Run, Settings, code_state, first_line, judged_by, measured, run_wrap
-from .scenes import ensure_scene
+from .scenes.cache import ensure_scene
 
 TETRAHEDRA, UNIFORM, ADAPTIVE, FUSION = "tetrahedra", "uniform", "adaptive", "tsdf"
 METHODS = (TETRAHEDRA, UNIFORM, ADAPTIVE, FUSION)
@@ -167,11 +166,13 @@ def quick_plan() -> Plan:
 
 _logger = logging.getLogger("benchmarks")
 
-_ONE_MESH = f"{__package__}.one_mesh"
-_JUDGE = f"{__package__}.judge"
-_VACANCY = f"{__package__}.vacancy_line"
+_ONE_MESH = "benchmarks.one_mesh"
+_JUDGE = "benchmarks.meshing_judge"
+_VACANCY = "benchmarks.vacancy_scale"
 
 WARM_POINTS = 1500
+MESH, MEASURED = "mesh.npz", "measured.json"
+"""What :mod:`.one_mesh` writes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,7 +184,7 @@ class Made:
     figures: dict[str, Any]
     """Of :mod:`.one_mesh`, with ``code`` and ``load_before``."""
     scores: dict[str, Any]
-    """Of :mod:`.judge`."""
+    """Of :mod:`.meshing_judge`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,7 +195,7 @@ class Outcome:
     trainings: dict[str, dict[str, Any]]
     """What the trainings measured of themselves, by scene."""
     vacancy: dict[str, Any] | None
-    """Of :mod:`.vacancy_line`."""
+    """Of :mod:`.vacancy_scale`."""
     missing: list[tuple[str, str]]
     """What was not measured, or failed, each with the reason."""
     failed: bool

@@ -39,7 +39,7 @@ from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 
-from .meshing_runs import FUSION, METHODS, PAM, TETRAHEDRA, Method
+from .meshing_runs import FUSION, MEASURED, MESH, METHODS, PAM, TETRAHEDRA, Method
 from .score import mesh_scene, stage_folder
 
 
@@ -148,9 +148,6 @@ def fuse(trained: Trained, voxels: int, *, threads: int) -> tuple[np.ndarray, np
     faces = faces[region.contains(vertices[faces].mean(1))] if len(faces) else faces
     used, inverse = np.unique(faces, return_inverse=True)
     return vertices[used], inverse.reshape(-1, 3)
-
-
-MESH, MEASURED = "mesh.npz", "measured.json"
 
 
 def make_mesh(trained: Trained, method: Method, *, threads: int, seed: int = 0) -> SurfaceMesh:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What every page of a benchmark rests on: which code ran where and when, and whether it is today's.
+"""What every page of a benchmark rests on: which code ran where and when, and if it is today's.
 
 A record names the commit, machine and date of its run. A page is written from records alone, and
 :func:`write_page` puts a warning into its first line where the package's core has changed since.

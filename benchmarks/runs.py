@@ -17,6 +17,8 @@ from typing import Any
 from gaussian_wrapping_addon.core.errors import WorkerError
 from gaussian_wrapping_addon.core.files import read_json, write_json
 
+from .provenance import ROOT, code_of_tree
+
 PRESETS = ("draft", "standard", "fine")
 THRESHOLD_SHARES = (0.0025, 0.005, 0.01)
 """Thresholds of precision, recall and F1, as shares of the crop volume's diagonal."""
@@ -63,7 +65,6 @@ class Run:
         return "-".join(parts)
 
 
-ROOT = Path(__file__).resolve().parents[2]
 BATCH = ROOT / "gaussian_wrapping_addon" / "batch.py"
 LAST_LINES = 12
 
@@ -157,18 +158,9 @@ def _batch(arguments: list[str], folder: Path, settings: Settings, out: Path | N
 
 
 def code_state() -> str:
-    """Return the commit of the package, and whether its files differ from it."""
-    git = ["git", "-C", str(ROOT)]
-    commit = subprocess.run(
-        [*git, "rev-parse", "--short=10", "HEAD"], capture_output=True, text=True, check=False
-    )
-    if commit.returncode != 0:
-        return "unknown commit"
-    changed = subprocess.run(
-        [*git, "status", "--porcelain", "--", "gaussian_wrapping_addon"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    return commit.stdout.strip() + (" with changes" if changed.stdout.strip() else "")
+    """Return the commit, and whether files of the core differ from it."""
+    code = code_of_tree()
+    return f"{code.commit} with changes" if code.changed else code.commit
 
 
 def _region(scene: Path) -> list[str]:
@@ -196,7 +188,7 @@ def judged_by(module: str, arguments: list[str], path: Path, settings: Settings)
     Parameters
     ----------
     module : str
-        Name in this package, or a full one with dots.
+        Full name.
     arguments : list of str
         Its command line, without the threads.
     path : Path
@@ -208,8 +200,7 @@ def judged_by(module: str, arguments: list[str], path: Path, settings: Settings)
         With the last lines of its output.
     """
     if not (settings.reuse and path.is_file()):
-        name = module if "." in module else f"{__package__}.{module}"
-        command = [sys.executable, "-m", name, *arguments, "--threads", str(settings.threads)]
+        command = [sys.executable, "-m", module, *arguments, "--threads", str(settings.threads)]
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
         if done.returncode != 0:
             words = "\n".join((done.stdout + done.stderr).splitlines()[-LAST_LINES:])

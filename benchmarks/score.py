@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Judge one run against the ground truth.
 
-``python -m benchmarks.speed_error.score SCENE OUT.json [--mesh FOLDER --job FOLDER [--stages]]``;
+``python -m benchmarks.score SCENE OUT.json [--mesh FOLDER --job FOLDER [--stages]]``;
 without a mesh, the true surface itself is judged, which shows what each protocol can reach.
 
 Everything is judged in world coordinates with the known poses: no alignment. The test views of the

@@ -5,8 +5,8 @@ Presets and meshers on photos of scenes whose surface is known exactly (``benchm
 through the command line as a user would run it. Each run leaves a record in
 ``benchmarks/records/speed``; a run that has one is not made again, so that the study may take
 several sittings: stop the command whenever you like. At the end, or with ``--document``,
-``docs/benchmarks/README.md`` and its plot are written from the records alone; ``--pictures`` draws
-the runs that this machine has kept.
+``docs/benchmarks/speed-vs-error.md`` and its plot are written from the records alone;
+``--pictures`` draws the runs that this machine has kept.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import (
     BACKGROUND,
     TexturedRenderer,
 )
-from gaussian_wrapping_addon.core.files import read_json, write_bytes
+from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
 from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
 
 from .alpha_shape import make_alpha
+from .provenance import write_page
 from .runs import PRESETS, THRESHOLD_SHARES
-from .scenes import ensure_scene
+from .scenes.cache import ensure_scene
 from .score import read_textured, stage_folder, test_views
 from .study import (
     KEPT_RUNS,
@@ -40,6 +41,7 @@ from .study import (
     PHOTOS,
     Case,
     Record,
+    commits,
     f1_fine,
     f1_middle,
     f1_seen,
@@ -337,7 +339,7 @@ def _labelled(image: np.ndarray, text: str) -> np.ndarray:
     return np.asarray(picture)
 
 
-PAGE, PLOT, READING = "README.md", "speed-vs-error.svg", "reading.md"
+PAGE, PLOT = "speed-vs-error.md", "speed-vs-error.svg"
 COMMAND = "python -m benchmarks.speed_vs_error"
 
 
@@ -346,8 +348,6 @@ def write_document(out: Path, records: Records, cases: Sequence[Case]) -> Path:
     write_plot(records, out / PLOT)
     tables = (preset_table(records), mesher_table(records))
     lines = [
-        "# Speed against error",
-        "",
         *made_by(COMMAND, list(records.values()), cases),
         "",
         photos_said(PHOTOS),
@@ -356,17 +356,13 @@ def write_document(out: Path, records: Records, cases: Sequence[Case]) -> Path:
         "",
         f"![Processor seconds against error]({PLOT})",
         "",
-        *reading(out / READING),
+        *reading("speed-vs-error"),
         *(table.markdown() for table in tables[:1] if table.rows),
         *_pictures(out),
         *(table.markdown() for table in tables[1:] if table.rows),
-        _words("elsewhere"),
-        _words("protocol"),
-        _words("other_measurements"),
+        *reading("protocol"),
     ]
-    path = out / PAGE
-    write_bytes(path, ("\n".join(lines).rstrip() + "\n").encode())
-    return path
+    return write_page(out / PAGE, "Speed against error", commits(records.values()), lines)
 
 
 def picture(scene: str) -> str:
@@ -388,11 +384,6 @@ def _pictures(out: Path) -> list[str]:
         "",
         *(line for scene, name in names.items() for line in (f"![{scene}]({name})", "")),
     ]
-
-
-def _words(name: str) -> str:
-    """Return prose that does not depend on figures, with its heading."""
-    return Path(__file__).with_name(f"{name}.md").read_text(encoding="utf-8").strip() + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

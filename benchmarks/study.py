@@ -23,14 +23,15 @@ from typing import Any, Protocol
 
 from gaussian_wrapping_addon.core.errors import ParseError, UsageError, WorkerError
 from gaussian_wrapping_addon.core.files import finite_json, read_json, write_json
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS
 from gaussian_wrapping_addon.core.machine import processor_name
 
-from .runs import BATCH, LAST_LINES, ROOT, Photos, Settings, judged_by
+from .provenance import DOCUMENTS, RECORDS, ROOT, Code, code_of_tree, versions
+from .runs import BATCH, LAST_LINES, Photos, Settings, judged_by
 from .runs import warm_up as run_warm_up
-from .scenes import ensure_scene
-from .tables import MIDDLE, thin_recall, versions
+from .scenes.cache import ensure_scene
+from .tables import MIDDLE, thin_recall
 
+READINGS = ROOT / "benchmarks" / "readings"
 PHOTOS = Photos(40, 640, 480)
 """Of every rendered scene of the studies."""
 
@@ -102,30 +103,7 @@ def named(cases: Sequence[Case], words: Sequence[str]) -> list[Case]:
     return [c for c in cases if c.identity in kept]
 
 
-RECORDS = ROOT / "benchmarks" / "records"
 VERSION = 1
-PACKAGE = "gaussian_wrapping_addon/core"
-"""The code that decides a result."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Code:
-    """Which code made a run."""
-
-    commit: str
-    """Short hash of the commit; ``unknown`` outside of a repository."""
-    core: str
-    """Short hash of the content of :data:`PACKAGE`: equal hashes are equal code, whatever else
-    the commits changed."""
-    changed: bool
-    """Whether files of :data:`PACKAGE` differed from the commit."""
-    stages: dict[str, int]
-    """``STAGE_VERSIONS``: a stage whose number is the same is meant to compute the same."""
-
-    @property
-    def name(self) -> str:
-        """What distinguishes versions."""
-        return f"{self.core}, changed" if self.changed else self.core
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +127,7 @@ class Record:
     mesh: dict[str, Any]
     """``vertices``, ``faces``, ``closed``, ``components``."""
     scores: dict[str, Any]
-    """See :mod:`.making`."""
+    """See :func:`kept_scores`."""
     mbr: dict[str, Any] | None = None
     """Mesh-based rendering: filled in afterwards from the kept mesh."""
 
@@ -235,23 +213,6 @@ def read_records(cases: Iterable[Case], root: Path = RECORDS) -> dict[str, Recor
     return found
 
 
-def code_of_tree() -> Code:
-    """Return the code of the working tree."""
-
-    def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=False
-        )
-        return done.stdout.strip() if done.returncode == 0 else "unknown"
-
-    return Code(
-        git("rev-parse", "--short=10", "HEAD"),
-        git("rev-parse", "--short=10", f"HEAD:{PACKAGE}"),
-        git("status", "--porcelain", "--", PACKAGE) != "",
-        dict(STAGE_VERSIONS),
-    )
-
-
 def said_versions(records: Sequence[Record]) -> str:
     """Return one sentence: which code the runs are of, and whether versions are mixed."""
     names = list(dict.fromkeys(r.code.name for r in records))
@@ -275,7 +236,7 @@ def said_versions(records: Sequence[Record]) -> str:
     words = (
         f"between them the result of {', '.join(differing)} was changed on purpose"
         if differing
-        else "the numbers of their stages say that results did not change on purpose"
+        else "that their stages have the same numbers does not say that their results are the same"
     )
     return (
         f"**Runs of {len(names)} versions of the code are mixed** ({', '.join(counts)}); {words}."
@@ -323,9 +284,14 @@ def photos_said(photos: Photos) -> str:
     )
 
 
-def reading(path: Path) -> list[str]:
-    """Return the hand-written reading, if there is one."""
-    return [path.read_text(encoding="utf-8").strip(), ""] if path.is_file() else []
+def reading(name: str) -> list[str]:
+    """Return the hand-written part of a page, ``benchmarks/readings/NAME.md``."""
+    return [(READINGS / f"{name}.md").read_text(encoding="utf-8").strip(), ""]
+
+
+def commits(records: Iterable[Record]) -> list[str]:
+    """Return the commits of records, for :func:`~.provenance.write_page`."""
+    return [record.code.commit for record in records]
 
 
 def _threads(record: Record) -> str:
@@ -586,7 +552,7 @@ def _judge(scene: Path, job: Path, folder: Path, path: Path, threads: int) -> No
     shutil.copytree(job / "result" / _region_name(job), mesh)
     _child(
         [
-            sys.executable, "-m", "benchmarks.speed_error.score", str(scene), str(path),
+            sys.executable, "-m", "benchmarks.score", str(scene), str(path),
             "--mesh", str(mesh), "--job", str(job), "--stages", "--threads", str(threads),
         ],
         f"See {folder}.",
@@ -617,8 +583,6 @@ def _region_name(job: Path) -> str:
     return name
 
 
-MODULE = "mesh_based"
-"""Of :mod:`benchmarks.speed_error`."""
 KEPT = ("psnr", "ssim", "covered_psnr", "inside_psnr", "uncovered", "beyond")
 """Means over the test views that a record keeps."""
 
@@ -676,10 +640,8 @@ def _judged(record: Record, folder: Path, threads: int) -> dict[str, Any]:
     path = folder / "mesh-based.json"
     arguments = [str(scene), str(path), "--mesh", str(folder / "mesh")]
     arguments += ["--job", str(folder / "out")]
-    return judged_by(MODULE, arguments, path, Settings(folder, threads, False))
+    return judged_by("benchmarks.mesh_based", arguments, path, Settings(folder, threads, False))
 
-
-DOCUMENTS = ROOT / "docs" / "benchmarks"
 
 Writer = Callable[[Path, Mapping[str, Record], Sequence[Case]], Path]
 """Writes the document of the records into a folder and returns its page."""

@@ -8,53 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import platform
 import statistics
 from collections.abc import Sequence
-from importlib import metadata
 from typing import Any
 
 from gaussian_wrapping_addon.core.evaluation.surface.scores import MIN_THIN_SHARE
 
 from .runs import THRESHOLD_SHARES
-
-SHARES = tuple(f"{100 * share:g} %" for share in THRESHOLD_SHARES)
-MIDDLE = 1
-"""The threshold that is shown where there is room for one: 0.5 %."""
-AT = SHARES[MIDDLE]
-
-Row = dict[str, Cell]
-
-
-def table_of(title: str, rows: Sequence[Row], *notes: str) -> Table:
-    """Return a table whose columns are the keys of its rows."""
-    header = tuple(rows[0]) if rows else ()
-    return Table(title, header, [tuple(row[name] for name in header) for row in rows], notes)
-
-
-def thin_recall(surface: dict[str, Any]) -> float | None:
-    """Return the recall of thin parts, or ``None`` where there are practically none."""
-    few = surface["thin_count"] < MIN_THIN_SHARE * surface["truth_count"]
-    return None if few or surface["thin_recall"] is None else surface["thin_recall"][MIDDLE]
-
-
-def missing_table(missing: Sequence[tuple[str, str]]) -> Table:
-    """Return runs that were planned and have no figures."""
-    rows: list[Row] = [
-        {"run": name, "reason": reason.replace("|", "/")} for name, reason in missing
-    ]
-    return table_of("Not measured", rows)
-
-
-def two(value: float | None) -> str | None:
-    """Return a figure with two decimals; an empty cell where it was not measured."""
-    return None if value is None else f"{value:.2f}"
-
-
-def three(value: float | None) -> str | None:
-    """Return a figure with three decimals; an empty cell where it was not measured."""
-    return None if value is None else f"{value:.3f}"
-
 
 Cell = str | float | int | None
 
@@ -115,12 +75,42 @@ def _text(cell: Cell) -> str:
     return f"{cell:.1f}" if abs(cell) >= 20.0 else f"{cell:.2f}"
 
 
-def versions() -> str:
-    """Return the versions of what the figures depend on."""
-    packages = ("numpy", "numba", "llvmlite", "torch")
-    return ", ".join(
-        [f"Python {platform.python_version()}", *(f"{p} {metadata.version(p)}" for p in packages)]
-    )
+SHARES = tuple(f"{100 * share:g} %" for share in THRESHOLD_SHARES)
+MIDDLE = 1
+"""The threshold that is shown where there is room for one: 0.5 %."""
+AT = SHARES[MIDDLE]
+
+Row = dict[str, Cell]
+
+
+def table_of(title: str, rows: Sequence[Row], *notes: str) -> Table:
+    """Return a table whose columns are the keys of its rows."""
+    header = tuple(rows[0]) if rows else ()
+    return Table(title, header, [tuple(row[name] for name in header) for row in rows], notes)
+
+
+def thin_recall(surface: dict[str, Any]) -> float | None:
+    """Return the recall of thin parts, or ``None`` where there are practically none."""
+    few = surface["thin_count"] < MIN_THIN_SHARE * surface["truth_count"]
+    return None if few or surface["thin_recall"] is None else surface["thin_recall"][MIDDLE]
+
+
+def missing_table(missing: Sequence[tuple[str, str]]) -> Table:
+    """Return runs that were planned and have no figures."""
+    rows: list[Row] = [
+        {"run": name, "reason": reason.replace("|", "/")} for name, reason in missing
+    ]
+    return table_of("Not measured", rows)
+
+
+def two(value: float | None) -> str | None:
+    """Return a figure with two decimals; an empty cell where it was not measured."""
+    return None if value is None else f"{value:.2f}"
+
+
+def three(value: float | None) -> str | None:
+    """Return a figure with three decimals; an empty cell where it was not measured."""
+    return None if value is None else f"{value:.3f}"
 
 
 CLEAR = 2.0

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import datetime
 import json
 import logging
 import subprocess
@@ -56,6 +55,15 @@ from .known_texture import (
     steps_between_texels,
     true_albedo,
     uneven,
+)
+from .provenance import (
+    DOCUMENTS,
+    RECORDS,
+    code_of_tree,
+    read_figures,
+    said_origin,
+    write_figures,
+    write_page,
 )
 from .score import test_views
 from .zoo.scene import ensure_zoo_scene
@@ -132,7 +140,7 @@ def held_out_figures(job: Path, picture: Path | None, threads: int) -> dict[str,
     Returns
     -------
     dict
-        What :func:`.compared.compared` returns; ``fitted_psnr`` counts, since nobody knows the
+        What :func:`compared` returns; ``fitted_psnr`` counts, since nobody knows the
         exposure of a photo that was held out. ``itself_psnr``: of a texture baked from the held-out
         photos alone, about as much as one unlit texture can have.
     """
@@ -193,7 +201,7 @@ def glossy_figures(name: str, picture: Path, threads: int) -> dict[str, Any]:
     Returns
     -------
     dict
-        What :func:`.compared.compared` returns, ``photos`` and ``size_px``.
+        What :func:`compared` returns, ``photos`` and ``size_px``.
     """
     folder = ensure_zoo_scene(name, threads)
     truth = read_truth(folder).mesh
@@ -218,7 +226,7 @@ def glossy_figures(name: str, picture: Path, threads: int) -> dict[str, Any]:
 
 _logger = logging.getLogger("benchmarks")
 
-OUT = Path(__file__).resolve().parents[1] / "docs" / "benchmarks"
+STUDY, COMMAND = "texturing", "python -m benchmarks.texturing"
 PHOTOS, WIDTH, HEIGHT, SUPERSAMPLING = 24, 640, 480, 3
 SIZES_PX = (512, 1024)
 GREY = 140.0
@@ -240,19 +248,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--only", nargs="+", choices=PARTS, default=list(PARTS), help="only these parts"
     )
+    parser.add_argument("--document", action="store_true", help="measure nothing, write the page")
     options = parser.parse_args(arguments)
-    if len(options.only) < len(PARTS) and options.out is None:
-        parser.error("--only makes a part of the report: name its folder with --out")
-    out = options.out or OUT
+    out = options.out or DOCUMENTS
     out.mkdir(parents=True, exist_ok=True)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    only = " ".join(["--only", *options.only]) if len(options.only) < len(PARTS) else ""
-    command = f"python -m benchmarks.texturing {only}".strip()
-    lines = [
-        "# Unwrap and bake",
-        "",
-        f"`{command}`, {datetime.date.today().isoformat()}, {options.threads} threads.",
-    ]
     parts = {
         "known": _known,
         "uneven": _uneven,
@@ -260,10 +260,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "real": lambda threads: _real(options.jobs, out, threads, options.unshown),
         "glossy": lambda threads: _glossy(out, threads),
     }
-    for name in options.only:
-        lines += ["", *parts[name](options.threads)]
-    (out / "texturing.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    records = RECORDS / STUDY if options.out is None else out
+    for name in () if options.document else options.only:
+        code = code_of_tree()
+        figures = {"lines": parts[name](options.threads)}
+        write_figures(records / f"{STUDY}-{name}.json", figures, options.threads, code)
+    _logger.info("%s", write_document(records, out))
     return 0
+
+
+def write_document(records: Path, out: Path) -> Path:
+    """Write the page of all parts that have a record; each says where it is from."""
+    lines, commits = [], []
+    for name in PARTS:
+        path = records / f"{STUDY}-{name}.json"
+        if path.is_file():
+            record = read_figures(path)
+            commits.append(record["code"]["commit"])
+            lines += [*record["lines"], "", said_origin(f"{COMMAND} --only {name}", record), ""]
+    return write_page(out / "texturing.md", "Unwrap and bake", commits, lines)
 
 
 def _baked(photos: RenderedPhotos, size_px: int, threads: int) -> TexturedMesh:
@@ -359,7 +374,7 @@ def _uneven(threads: int) -> list[str]:
 
 def _large(threads: int) -> list[str]:
     _logger.info("a large mesh at 4096")
-    module = "benchmarks.texturing_parts.large_mesh"
+    module = "benchmarks.large_mesh"
     done = subprocess.run(
         [sys.executable, "-m", module, str(threads)], capture_output=True, text=True, check=True
     )

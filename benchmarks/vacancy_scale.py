@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Vacancy of a million points from fifty cameras: seconds, and error against the definition.
 
-``python -m benchmarks.meshing_parts.vacancy_scale``, with ``--device cuda`` on a GPU
+``python -m benchmarks.vacancy_scale``, with ``--device cuda`` on a GPU
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.field.vacancy.brute_force import brute_force_vacancy
 from gaussian_wrapping_addon.core.field.vacancy.cuda_vacancy import CudaVacancyField
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import SETTLED, VacancyField
+from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 
@@ -186,6 +188,7 @@ def _timed(work: Callable[[], object]) -> tuple[float, float, object]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and log the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path, nargs="?", help="JSON file of the figures")
     parser.add_argument("--gaussians", type=int, default=50_000)
     parser.add_argument("--cameras", type=int, default=50)
     parser.add_argument("--points", type=int, default=1_000_000)
@@ -202,6 +205,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         threads=options.threads,
         device=options.device,
     )
+    if options.out is not None:
+        write_json(options.out, {**dataclasses.asdict(figures), "seconds": figures.seconds})
     values = ", ".join(
         f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}"
         for name, value in dataclasses.asdict(figures).items()

@@ -7,7 +7,7 @@ role "test" are reported and nothing may be tuned on them; "development" scenes 
 
 from __future__ import annotations
 
-from ..cache import ALL_KINDS, ensure_scene
-from ..catalogue import KINDS, SceneKind
+from .cache import ALL_KINDS, ensure_scene
+from .catalogue import KINDS, SceneKind
 
 __all__ = ["ALL_KINDS", "KINDS", "SceneKind", "ensure_scene"]

@@ -431,7 +431,7 @@ WALL_DENSITY_AT_640 = 140.0
 def build_matte_thing(
     kind: SceneKind, content: SceneContent, size: BuildSize, folder: Path
 ) -> None:
-    """Make the scene in an empty folder, as :func:`.build.build_scene` makes the others.
+    """Make the scene in an empty folder, as :func:`build_scene` makes the others.
 
     Raises
     ------
@@ -506,7 +506,7 @@ def _cameras(
 
 
 def build_cup_inside(size: BuildSize, folder: Path) -> None:
-    """Make the scene in an empty folder, as :func:`.build.build_scene` makes the others.
+    """Make the scene in an empty folder, as :func:`build_scene` makes the others.
 
     Raises
     ------

@@ -26,15 +26,8 @@ from .rendering import require_bpy
 REPOSITORY = Path(__file__).resolve().parents[2]
 CACHE = REPOSITORY / ".cache" / "scenes"
 
-_DECIDES_NOTHING = {"__init__.py", "__main__.py", "cache.py", "contact_sheet.py"}
-"""Files of this package that have no influence on a scene folder's content."""
-
-_OF_SOME_SCENES = {
-    "looking_in.py": {CUP_INSIDE.name},
-    "torus_and_plate.py": {TORUS.name},
-    "matte_thing.py": {CUP_INSIDE.name, TORUS.name},
-}
-"""Files of this package that have an influence on these scenes only."""
+DRAWN = 1
+"""Raised whenever a scene comes out otherwise."""
 
 ALL_KINDS = {**KINDS, CUP_INSIDE.name: CUP_INSIDE, TORUS.name: TORUS}
 """Every scene that can be rendered."""
@@ -53,19 +46,14 @@ def kind_named(name: str) -> SceneKind:
     return ALL_KINDS[name] if name in ALL_KINDS else scene_kind(name)
 
 
-def deciding_sources(name: str) -> list[Path]:
-    """Return the files of this package that a scene folder's content depends on."""
-    others = {file for file, scenes in _OF_SOME_SCENES.items() if name not in scenes}
-    ignored = _DECIDES_NOTHING | others
-    return sorted(p for p in Path(__file__).parent.glob("*.py") if p.name not in ignored)
-
-
 def scene_folder(name: str, size: BuildSize, root: Path | None = None) -> Path:
-    """Return where a scene of this size is kept; its hash covers sources, meshes and size."""
+    """Return where a scene of this size is kept; its hash covers description, meshes and size."""
     kind = kind_named(name)
-    digest = hashlib.sha256(json.dumps([asdict(kind), asdict(size)], sort_keys=True).encode())
+    digest = hashlib.sha256(
+        json.dumps([DRAWN, asdict(kind), asdict(size)], sort_keys=True).encode()
+    )
     meshes = sorted(p for p in MESHES.iterdir() if p.suffix != ".md")
-    for path in [*deciding_sources(name), *meshes]:
+    for path in meshes:
         # Line ends differ between checkouts and change nothing.
         digest.update(path.name.encode() + path.read_bytes().replace(b"\r\n", b"\n"))
     return (root or CACHE) / f"{name}-{digest.hexdigest()[:12]}"

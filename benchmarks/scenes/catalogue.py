@@ -317,7 +317,7 @@ def scene_kind(name: str) -> SceneKind:
 
 def _thing(name: str) -> Part:
     if name == "glossy":
-        vertices, faces = furniture.gourd()
+        vertices, faces = gourd()
         return Part(name, scaled_to(vertices, THING_DIAGONAL), faces, "glaze")
     file, material = {
         "spot": ("spot.obj", "spot"),
@@ -360,8 +360,8 @@ def _thing_content(kind: SceneKind, photos: int, tests: int, size: tuple[int, in
 
 def _room_content(kind: SceneKind, photos: int, tests: int, size: tuple[int, int]) -> SceneContent:
     random = np.random.default_rng(kind.seed)
-    low, high = furniture.ROOM_LOW, furniture.ROOM_HIGH
-    things = furniture.furniture(random)
+    low, high = ROOM_LOW, ROOM_HIGH
+    things = furniture(random)
     shell = room_shell(
         low,
         high,
@@ -378,9 +378,9 @@ def _room_content(kind: SceneKind, photos: int, tests: int, size: tuple[int, int
     test_cameras = inside_room(tests, *size, low, high, random, "test")
     return SceneContent(
         (*things, *shell),
-        union_of([furniture.wall_solid(), *things]),
-        _grown("region", low, high, furniture.WALL_THICKNESS),
-        _grown("crop", low, high, 0.35 * furniture.WALL_THICKNESS),
+        union_of([wall_solid(), *things]),
+        _grown("region", low, high, WALL_THICKNESS),
+        _grown("crop", low, high, 0.35 * WALL_THICKNESS),
         Light(sun=1.7, direction=(0.5, 0.35, -0.8)),
         tuple(cameras),
         tuple(test_cameras),

@@ -17,7 +17,8 @@ from pathlib import Path
 
 from gaussian_wrapping_addon.core.errors import UsageError, WrapError
 
-from ..study import DOCUMENTS, carry_out, read_records
+from ..provenance import DOCUMENTS
+from ..study import carry_out, read_records
 from .catalogue import DEVELOPMENT, PARTS, SCENES, zoo_scene
 from .scene import build_zoo_scene, draw_sheet, ensure_taken_scene, ensure_zoo_scene
 from .study import (

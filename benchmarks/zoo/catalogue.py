@@ -59,7 +59,7 @@ class ZooScene:
     part: str
     number: int
     path: str
-    """A way of :mod:`.paths`."""
+    """A way of :mod:`.places`."""
     surroundings: str = ""
     few: bool = False
     """Whether it has :data:`FEW` photos only."""

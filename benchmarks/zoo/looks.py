@@ -182,9 +182,9 @@ class Photography:
     height: int
     photos: int
     path: str
-    """A way of :mod:`.paths`."""
+    """A way of :mod:`.places`."""
     surroundings: str
-    """Of a thing: near, far or open (:mod:`.surroundings`); of a place: empty."""
+    """Of a thing: near, far or open; of a place: empty."""
     exposure: bool
     """Whether exposure and white balance change from photo to photo."""
     pose_noise_px: float

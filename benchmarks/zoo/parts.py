@@ -17,15 +17,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gaussian_wrapping_addon.core.errors import WrapError
-from gaussian_wrapping_addon.core.files import write_bytes
 from gaussian_wrapping_addon.core.settings import MODEL_SELECTION
 
+from ..provenance import DOCUMENTS, RECORDS, write_page
 from ..study import (
-    DOCUMENTS,
-    RECORDS,
     Case,
     Record,
     carry_out,
+    commits,
     f1_middle,
     f1_seen,
     made_by,
@@ -40,7 +39,7 @@ from .study import find_scene, floaters, make_one, scene_photos
 _logger = logging.getLogger("benchmarks")
 
 STUDY = "zoo-parts"
-PAGE, READING = "zoo-parts.md", "zoo-parts-reading.md"
+PAGE = "zoo-parts.md"
 COMMAND = "python -m benchmarks.zoo.parts"
 PRESET = "draft"
 SEEDS = (0, 1, 2)
@@ -180,13 +179,12 @@ def write_document(folder: Path, root: Path = RECORDS) -> Path | None:
         return None
     begun = {(r.case.scene, r.case.name in PARTS, r.case.seed) for r in records}
     awaited = [c for c in cases.values() if (c.scene, c.name in PARTS, c.seed) in begun]
-    lines = ["# Parts of the method, and decisions", "", *reading(folder / READING)]
+    lines = reading("zoo-parts")
     lines += made_by(COMMAND, records, awaited)
     lines += ["", f"Preset {PRESET}.", ""]
     lines += [parts_table(records).markdown(), "", decisions_table(records).markdown()]
-    path = folder / PAGE
-    write_bytes(path, ("\n".join(lines).rstrip() + "\n").encode())
-    return path
+    title = "Parts of the method, and decisions"
+    return write_page(folder / PAGE, title, commits(records), lines)
 
 
 if __name__ == "__main__":

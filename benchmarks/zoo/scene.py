@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import os
 import shutil
@@ -59,7 +58,7 @@ def found_points(
 ) -> SparsePoints:
     """Return the sparse points of a scene.
 
-    Those of :func:`~benchmarks.scenes.sparse_points.sparse_points` without what lies where a photo
+    Those of :func:`~benchmarks.scenes.build.sparse_points` without what lies where a photo
     has no texture, moved further along what their tracks do not determine, and some anywhere on
     one of their rays.
 
@@ -235,42 +234,17 @@ def _read(path: Path) -> np.ndarray:
         return np.asarray(image.convert("RGB"))
 
 
-_PACKAGE = Path(__file__).parent
-
-_DECIDING = (
-    "build", "catalogue", "content", "looks", "paths", "places", "points", "rendering", "shapes",
-    "surroundings", "things",
-)  # fmt: skip
-"""Modules of this package that a scene folder's content depends on."""
-_DECIDING_SCENES = (
-    "colmap_project", "exposure", "geometry", "ground_truth", "nodes", "rendering",
-    "sparse_points", "viewpoints", "visibility",
-)  # fmt: skip
-"""Modules of :mod:`benchmarks.scenes` besides."""
-
-_OF_FAMILIES = {
-    "things": lambda family: family not in ("rooms", "streets"),
-    "places": lambda family: family in ("rooms", "streets"),
-}
-"""Modules that decide some families only."""
+DRAWN = 1
+"""Raised whenever a scene comes out otherwise: its records then say that they are older."""
+_TAKEN = 1
+"""The same of photos as a camera takes them."""
 
 _LAST_WORDS = 1500
 
 
 def scene_folder(name: str, root: Path | None = None) -> Path:
-    """Return where a scene is kept; its hash covers the sources that decide its content."""
-    family = zoo_scene(name).family
-    digest = hashlib.sha256(name.encode())
-    sources = [
-        _PACKAGE / f"{module}.py"
-        for module in _DECIDING
-        if module not in _OF_FAMILIES or _OF_FAMILIES[module](family)
-    ]
-    sources += [_PACKAGE.parent / "scenes" / f"{module}.py" for module in _DECIDING_SCENES]
-    for path in sources:
-        # Line ends differ between checkouts and change nothing.
-        digest.update(path.name.encode() + path.read_bytes().replace(b"\r\n", b"\n"))
-    return (root or CACHE) / f"zoo-{name}-{digest.hexdigest()[:12]}"
+    """Return where a scene is kept, by the version of what draws it."""
+    return (root or CACHE) / f"zoo-{zoo_scene(name).name}-v{DRAWN}"
 
 
 def ensure_zoo_scene(name: str, threads: int = 1, root: Path | None = None) -> Path:
@@ -326,10 +300,9 @@ _QUALITIES = (85, 96)
 
 
 def taken_folder(name: str, root: Path | None = None) -> Path:
-    """Return where a scene with photos as taken is kept; its hash covers this module, too."""
-    source = Path(__file__).read_bytes().replace(b"\r\n", b"\n")
+    """Return where a scene with photos as taken is kept."""
     clean = scene_folder(name, root)
-    return clean.with_name(f"{clean.name}-taken-{hashlib.sha256(source).hexdigest()[:8]}")
+    return clean.with_name(f"{clean.name}-taken-v{_TAKEN}")
 
 
 def ensure_taken_scene(name: str, threads: int = 1, root: Path | None = None) -> Path:

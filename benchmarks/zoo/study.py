@@ -15,16 +15,17 @@ from scipy.ndimage import binary_erosion, binary_fill_holes
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.files import finite_json, read_json, write_bytes
+from gaussian_wrapping_addon.core.files import finite_json, read_json
 
 from ..alpha_shape import make_alpha
+from ..provenance import RECORDS, write_page
 from ..runs import Photos
 from ..score import read_textured, stage_folder, true_mask
 from ..study import (
     KEPT_RUNS,
-    RECORDS,
     Case,
     Record,
+    commits,
     f1_middle,
     f1_seen,
     made_by,
@@ -48,7 +49,7 @@ ALPHA = "alpha"
 """The alpha shape of the sparse points, with the best alpha by the truth."""
 
 TAKEN = "-taken"
-"""Ends the labels of runs on photos as a camera takes them (:mod:`.taken_photos`)."""
+"""Ends the labels of runs on photos as a camera takes them (:func:`.scene.ensure_taken_scene`)."""
 
 FIGURES = "zoo"
 """Key of a record's scores for what :func:`judged` returns, and the scene's folder (``scene``)."""
@@ -162,7 +163,7 @@ def open_share(
     return opened / seen if seen >= _FEWEST_PX else None
 
 
-PAGE, READING = "zoo.md", "zoo-reading.md"
+PAGE = "zoo.md"
 COMMAND = "python -m benchmarks.zoo"
 _WIDEST = 2
 """Index of the threshold beyond which a part of the mesh is a floater: 1 %."""
@@ -285,13 +286,11 @@ def write_document(out: Path, root: Path = RECORDS) -> Path | None:
     if not found:
         return None
     lines = [
-        "# Zoo of scenes",
-        "",
         "Nine families of scenes drawn from seeds (`benchmarks/zoo`), rendered on first use; exact",
         "truth, poses and sparse points as a solver returns them. Settings may be tuned on",
         "the part *development* only.",
         "",
-        *reading(out / READING),
+        *reading("zoo"),
     ]
     for label, records in found.items():
         given = next(iter(records.values())).case
@@ -308,6 +307,5 @@ def write_document(out: Path, root: Path = RECORDS) -> Path | None:
             make(records, baselines, part) for part in PARTS for make in (family_table, scene_table)
         ]
         lines += [table.markdown() for table in tables if table.rows]
-    path = out / PAGE
-    write_bytes(path, ("\n".join(lines).rstrip() + "\n").encode())
-    return path
+    every = [record for records in found.values() for record in records.values()]
+    return write_page(out / PAGE, "Zoo of scenes", commits(every), lines)

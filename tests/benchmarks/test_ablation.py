@@ -34,7 +34,7 @@ from benchmarks.ablation import (
     settings_table,
     write_plot,
 )
-from benchmarks.scenes import ALL_KINDS
+from benchmarks.scenes.cache import ALL_KINDS
 from benchmarks.study import Record, f1_middle, options, thin
 from benchmarks.tables import Table
 from gaussian_wrapping_addon.core.settings import MODEL_SELECTION

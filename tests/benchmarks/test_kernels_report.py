@@ -9,12 +9,12 @@ from xml.etree import ElementTree
 
 import pytest
 from benchmarks.fma_peak import _chains
-from benchmarks.kernel_results import BACKWARD, FORWARD, Result, Workload
-from benchmarks.kernel_speed import measure_workload
+from benchmarks.kernel_results import BACKWARD, Result, Workload
 from benchmarks.timing import measure
 
-from benchmarks.kernels import PARTS, main, panels, speed_sections
+from benchmarks.kernels import PARTS, main, measure_workload, panels, speed_sections
 from benchmarks.tables import Table
+from benchmarks.zoo.places import FORWARD
 from gaussian_wrapping_addon.core.evaluation.report.plot import write_svg
 
 

@@ -34,7 +34,7 @@ from benchmarks.kills import (
     write_document,
     write_outcomes,
 )
-from benchmarks.runs import ROOT
+from benchmarks.provenance import ROOT
 from tools.version_comparison.contents import Contents, differences, read_contents
 
 GOOD = Outcome(

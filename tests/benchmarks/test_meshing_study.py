@@ -40,7 +40,7 @@ from benchmarks.meshing_tables import (
     write_plots,
 )
 from benchmarks.runs import Settings
-from benchmarks.scenes import ALL_KINDS
+from benchmarks.scenes.cache import ALL_KINDS
 from benchmarks.tables import Table
 from gaussian_wrapping_addon.core.errors import WorkerError
 

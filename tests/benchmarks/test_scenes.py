@@ -33,7 +33,7 @@ from benchmarks.scenes.build import (
     torus_content,
     truth_samples,
 )
-from benchmarks.scenes.cache import ALL_KINDS, deciding_sources, kind_named
+from benchmarks.scenes.cache import kind_named
 from benchmarks.scenes.catalogue import KINDS, scene_content, scene_kind
 from benchmarks.scenes.geometry import joined
 from benchmarks.scenes.rendering import Light, render_photos
@@ -327,14 +327,6 @@ def test_a_scene_of_its_own_module_is_built_like_the_others(
     assert files == wanted
     described = json.loads((folder / "scene.json").read_text())
     assert (described["name"], described["role"]) == ("cup_inside", "test")
-
-
-def test_sources_of_one_scene_do_not_make_others_stale() -> None:
-    own = {name: {path.name for path in deciding_sources(name)} for name in ALL_KINDS}
-    assert own["cup_inside"] - own["cup"] == {"looking_in.py", "matte_thing.py"}
-    assert own["torus"] - own["cup"] == {"torus_and_plate.py", "matte_thing.py"}
-    assert own["cup"] < own["cup_inside"]
-    assert {"build.py", "catalogue.py", "viewpoints.py"} <= own["cup"]
 
 
 def test_unknown_scenes_are_named() -> None:

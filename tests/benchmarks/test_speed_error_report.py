@@ -16,7 +16,7 @@ from benchmarks import speed_vs_error
 from benchmarks import speed_vs_error as document
 from benchmarks.alpha_shape import alpha_shape
 from benchmarks.runs import PRESETS
-from benchmarks.scenes import ALL_KINDS
+from benchmarks.scenes.cache import ALL_KINDS
 from benchmarks.speed_vs_error import (
     ALPHA,
     LABELS,

@@ -17,12 +17,12 @@ from benchmarks import study as command
 from benchmarks import study as making
 from benchmarks import study as mesh_based
 from benchmarks import study as record
+from benchmarks.provenance import code_of_tree
 from benchmarks.runs import Photos, Run, Settings, warm_up
 from benchmarks.study import (
     Case,
     Record,
     carry_out,
-    code_of_tree,
     kept_scores,
     made_by,
     named,

@@ -10,8 +10,6 @@ from typing import Any, NoReturn
 
 import numpy as np
 import pytest
-from benchmarks.camera_files import writers
-from benchmarks.camera_files.writers import Shots
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
@@ -43,6 +41,8 @@ from gaussian_wrapping_addon.core.jobs.commands.estimate_command import input_fa
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.dataset.panoramas.room import HALF, color_of, poses, write_panoramas
+from tests.core.dataset.readers.programs import writers
+from tests.core.dataset.readers.programs.writers import Shots
 
 WIDTH = 400
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks.turntable.photos import Turntable, turntable
 
 from benchmarks.scenes.geometry import RayScene
 from gaussian_wrapping_addon.core.dataset.poses.turntable_masks import (
@@ -14,6 +13,7 @@ from gaussian_wrapping_addon.core.dataset.poses.turntable_masks import (
     whole_parts,
     without_holes,
 )
+from tests.core.dataset.poses.turntable_photos import Turntable, turntable
 
 COUNT, WIDTH, HEIGHT = 24, 240, 180
 

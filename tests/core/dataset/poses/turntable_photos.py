@@ -13,15 +13,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from benchmarks.known_texture import SolidTexture, spot
+from benchmarks.scenes.geometry import RayScene, count_views, look_at
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.evaluation.surface.samples import sample_uniformly
 from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-
-from ..scenes.viewpoints import look_at
-from ..scenes.visibility import RayScene, count_views
-from ..texturing_parts.photographed import spot
-from ..texturing_parts.solid_texture import SolidTexture
 
 DISTANCE, ELEVATIONS_DEGREES, FOCAL_SHARE = 3.1, (18.0, 42.0), 1.25
 """The camera stands still at one elevation after the other, for as many photos each."""

@@ -6,7 +6,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from benchmarks.camera_files.writers import Shots
 from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.lenses.lens_fit import fit_lens
@@ -17,6 +16,7 @@ from gaussian_wrapping_addon.core.dataset.readers.source_model import (
     SourceModel,
     counts_stored_pixels,
 )
+from tests.core.dataset.readers.programs.writers import Shots
 from tests.poses import look_at_pose
 
 WIDTH, HEIGHT = 96, 64
