@@ -189,7 +189,6 @@ def part_table(records: Records) -> Table:
     """Return what each part changes: means over pairs of runs that differ by it alone."""
     rows: list[Row] = []
     measured = _measured(records)
-    several = len({r.case.seed for r in records.values()}) > 1
     for scene in (*SCENES, ""):
         for part in PARTS:
             row: Row = {"scene": scene or "all", "added": part.name}
@@ -198,7 +197,8 @@ def part_table(records: Records) -> Table:
                 found = differences(records, part, figure, scene)
                 counts.add(len(found))
                 spread = Spread.of(found)
-                row[name] = None if spread is None else _judged(spread, digits, more, several)
+                seeds = sum(bool(differences(records, part, figure, scene, (s,))) for s in SEEDS)
+                row[name] = None if spread is None else _judged(spread, digits, more, seeds > 1)
             if max(counts) > 0:
                 rows.append({**row, "pairs": max(counts)})
     return table_of(
@@ -206,18 +206,24 @@ def part_table(records: Records) -> Table:
         rows,
         "Mean ± standard deviation of the differences between two runs of the same scene and seed "
         "that differ by this part alone. **Bold** with “better” or “worse”: the mean is more than "
-        f"{CLEAR:g} standard errors from 0; all other differences say nothing. Nothing is judged "
-        "before there are two seeds. Pairs of one seed share its randomness: with so few seeds the "
-        "spread is somewhat too narrow.",
+        f"{CLEAR:g} standard errors from 0; all other differences say nothing. A figure that "
+        "one seed alone has is not judged. Pairs of one seed share its randomness: with so few "
+        "seeds the spread is somewhat too narrow.",
     )
 
 
-def differences(records: Records, part: Part, figure: Figure, scene: str = "") -> list[float]:
+def differences(
+    records: Records,
+    part: Part,
+    figure: Figure,
+    scene: str = "",
+    seeds: Sequence[int] = SEEDS,
+) -> list[float]:
     """Return the figure with a part less without it, for every pair of runs (of a scene)."""
     found = []
     for name in SCENES if not scene else (scene,):
         for without, with_it in part.pairs:
-            for seed in SEEDS:
+            for seed in seeds:
                 pair = [records.get(c.case(name, seed).identity) for c in (without, with_it)]
                 values = [None if r is None else figure(r) for r in pair]
                 if values[0] is not None and values[1] is not None:

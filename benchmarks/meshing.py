@@ -4,7 +4,8 @@
 Each scene is trained once through the command line. Then marching tetrahedra on two and nine
 pivots, primal adaptive meshing with uniform and adaptive spacing, and TSDF fusion of rendered depth
 maps mesh it, each in a process of its own. The figures are kept in
-``benchmarks/records/meshing.json``; ``meshing.md`` and its plots go into ``docs/benchmarks``: the targets of meshing with what was measured, and all figures.
+``benchmarks/records/meshing.json``; ``meshing.md`` and its plots go into ``docs/benchmarks``: the
+targets of meshing with what was measured, and all figures.
 """
 
 from __future__ import annotations

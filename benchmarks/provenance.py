@@ -27,6 +27,7 @@ DOCUMENTS = ROOT / "docs" / "benchmarks"
 PACKAGE = "gaussian_wrapping_addon/core"
 """The code that decides a result."""
 UNKNOWN = "unknown"
+_NAMELESS = "**Of unknown code**: records of this page name no commit."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +139,7 @@ def age(commits: Iterable[str | None], root: Path = ROOT) -> str:
     nameless = [c for c in named if c in (None, "", UNKNOWN)]
     last = git("log", "-1", "--format=%h %cs", "--abbrev=10", "HEAD", "--", PACKAGE, root=root)
     if not last:
-        return "" if not nameless else "> **Records of this page name no commit.**"
+        return f"> {_NAMELESS}" if nameless else ""
     changed, day = last.split()
     old = [
         c
@@ -149,12 +150,12 @@ def age(commits: Iterable[str | None], root: Path = ROOT) -> str:
     words = []
     if old:
         words.append(
-            f"measured at {', '.join(map(str, old))}, before the last change of the core "
-            f"({changed}, {day})"
+            f"**Older than the code**: measured at {', '.join(map(str, old))}; the core was last "
+            f"changed at {changed} ({day})."
         )
     if nameless:
-        words.append("with records that name no commit")
-    return f"> **Older than the code:** {'; and '.join(words)}." if words else ""
+        words.append(_NAMELESS)
+    return f"> {' '.join(words)}" if words else ""
 
 
 def write_page(

@@ -173,13 +173,12 @@ def test_the_plot_shows_all_scenes_presets_and_meshers(tmp_path: Path) -> None:
 
 
 def test_the_page_is_written_from_records_alone(tmp_path: Path) -> None:
-    (tmp_path / document.READING).write_text("## Reading\n\nSober words.\n")
     (tmp_path / document.picture("spot")).write_bytes(b"")
     found = {n: r for n, r in all_records().items() if r.case.scene == "spot"}
     text = document.write_document(tmp_path, found, CASES).read_text(encoding="utf-8")
     for words in (
-        "Sober words.", "a processor, 1 thread a run", "2026-01-02", "are not made yet", "OpenMVS",
-        "not in this repository",
+        "How to read this", "a processor, 1 thread a run", "2026-01-02", "are not made yet",
+        "## Protocol", "measured at 0123456789",
     ):  # fmt: skip
         assert words in text
     assert re.findall(r"!\[[^]]*\]\(([^)]+)\)", text) == [document.PLOT, "scene-spot.jpg"]

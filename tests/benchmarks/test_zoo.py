@@ -279,7 +279,9 @@ def test_a_run_on_an_earlier_version_of_its_scene_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     case = run_case("thin-d1", "x", "draft", ())
-    monkeypatch.setattr("benchmarks.zoo.runs.record_path", lambda case: record_path(case, tmp_path))
+    monkeypatch.setattr(
+        "benchmarks.zoo.study.record_path", lambda case: record_path(case, tmp_path)
+    )
     assert not is_made(case)
     for scene, made in (("zoo-thin-d1-before", False), (scene_folder("thin-d1").name, True)):
         record = invented(case)
