@@ -3,7 +3,7 @@
 
 Each part alone and whole iterations as the trainer runs them, for several scenes, image sizes and
 numbers of threads. The figures are kept in ``benchmarks/records/kernels.json``, and
-``docs/benchmarks/kernels.md`` is written from them. Errors of the kernels are held by tests
+its page in ``docs/benchmarks`` is written from them. Errors of the kernels are held by tests
 (``tests/core/render``). ``--print`` measures one scene and shows it, without record and page.
 """
 

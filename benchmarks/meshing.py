@@ -4,7 +4,7 @@
 Each scene is trained once through the command line. Then marching tetrahedra on two and nine
 pivots, primal adaptive meshing with uniform and adaptive spacing, and TSDF fusion of rendered depth
 maps mesh it, each in a process of its own. The figures are kept in
-``benchmarks/records/meshing.json``; ``meshing.md`` and its plots go into ``docs/benchmarks``: the
+``benchmarks/records/meshing.json``; a page and its plots go into ``docs/benchmarks``: the
 targets of meshing with what was measured, and all figures.
 """
 
@@ -51,7 +51,7 @@ PAGE = "meshing"
 
 
 def write_document(out: Path, outcome: Outcome, facts: dict[str, Any]) -> Path:
-    """Write ``meshing.md`` and its plots into a folder.
+    """Write the page and its plots into a folder.
 
     Parameters
     ----------

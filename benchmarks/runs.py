@@ -34,18 +34,8 @@ class Photos:
 
 
 @dataclasses.dataclass(frozen=True)
-class Variant:
-    """Another mesh or texture from the training of a run."""
-
-    name: str
-    arguments: tuple[str, ...]
-    parameter: int
-    """The value that is varied."""
-
-
-@dataclasses.dataclass(frozen=True)
 class Run:
-    """One job through the command line, and the meshes made from its training."""
+    """One job through the command line."""
 
     scene: str
     preset: str
@@ -54,7 +44,6 @@ class Run:
     """What is varied, empty for the plain preset."""
     arguments: tuple[str, ...] = ()
     parameter: int = 0
-    variants: tuple[Variant, ...] = ()
 
     @property
     def identity(self) -> str:
@@ -115,23 +104,9 @@ def warm_up(scene: Path, settings: Settings, more: tuple[str, ...] = ()) -> None
         run_wrap(run, scene, dataclasses.replace(settings, folder=Path(folder)))
 
 
-def run_variant(variant: Variant, base: Path, scene: Path, settings: Settings) -> Path:
-    """Mesh or texture the training of ``base`` once more; return the variant's folder."""
-    folder = base / f"{variant.name}{variant.parameter}"
-    if settings.reuse and (folder / "measured.json").is_file():
-        return folder
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    arguments = [
-        "mesh", "--out", str(base / "out"), *_region(scene), *variant.arguments,
-    ]  # fmt: skip
-    _batch(arguments, folder, settings, out=base / "out")
-    return folder
-
-
-def _batch(arguments: list[str], folder: Path, settings: Settings, out: Path | None = None) -> None:
+def _batch(arguments: list[str], folder: Path, settings: Settings) -> None:
     """Run the command and keep its result (without the Gaussians) and its wall time."""
-    out = out or folder / "out"
+    out = folder / "out"
     command = [
         sys.executable, str(BATCH), *arguments, "--export", "ply", "--no-blend",
         "--threads", str(settings.threads),

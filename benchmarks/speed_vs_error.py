@@ -64,7 +64,7 @@ STUDY = "speed"
 SCENES = ("wheel", "spot", "fence", "room")
 MESHED_PRESETS = ("standard",)
 """Whose trainings every mesher gets: differences between meshers hardly depend on the training
-(docs/benchmarks/meshing.md)."""
+(benchmarks/meshing.py)."""
 ALPHA = "alpha"
 """The alpha shape of the sparse points: what is there before anything is trained."""
 

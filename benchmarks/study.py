@@ -285,7 +285,7 @@ def photos_said(photos: Photos) -> str:
 
 
 def reading(name: str) -> list[str]:
-    """Return the hand-written part of a page, ``benchmarks/readings/NAME.md``."""
+    """Return the hand-written part of a page, of that name in :data:`READINGS`."""
     return [(READINGS / f"{name}.md").read_text(encoding="utf-8").strip(), ""]
 
 

@@ -4,8 +4,8 @@
 Photos of spot with a known texture are rendered by rays and baked back; then a mesh of 375 thousand
 faces is unwrapped and baked at 4096 x 4096 from 40 photos of 2 megapixels, in a process of its own.
 With ``--jobs`` finished jobs of real photos are textured without their held-out photos and compared
-with these, and so are true meshes of the zoo's glossy scenes with its test views. ``texturing.md``
-and its pictures go into ``docs/benchmarks``.
+with these, and so are true meshes of the zoo's glossy scenes with its test views. A page
+and its pictures go into ``docs/benchmarks``, the figures into ``benchmarks/records``.
 """
 
 from __future__ import annotations

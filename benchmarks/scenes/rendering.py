@@ -498,7 +498,7 @@ _BLENDER_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class Light:
-    """A soft sun; the sky's even light is part of the materials (``nodes.py``)."""
+    """A soft sun; the sky's even light is part of the materials."""
 
     sun: float
     """Irradiance; a white matte surface that faces it returns this / pi."""

@@ -80,8 +80,8 @@ LOW, HIGH = 0.75, 1.95
 """The reported range is the model's time times these: it covers every measured training."""
 
 MESH_AND_TEXTURE_SHARE = (0.2, 0.9)
-"""Time of meshing and texture, as a share of the training before them: from 17 to 94 % in the jobs
-of benchmarks/photo_sets.py and of benchmarks/scenes, with one region of about 50 thousand faces. Long
+"""Time of meshing and texture, as a share of the training before them: from 17 to 94 % in jobs
+on real photos and on benchmarks/scenes, with one region of about 50 thousand faces. Long
 trainings have the small shares."""
 
 ROUND_GROWTH = 1.8
