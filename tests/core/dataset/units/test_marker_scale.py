@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.known_texture import photograph
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.loading import load
 from gaussian_wrapping_addon.core.dataset.loading.real_world import UnitsRequest
@@ -25,6 +24,7 @@ from tests.core.dataset.units.marker_scene import (
     DICTIONARY,
     SIDE_M,
     UNITS_PER_METRE,
+    photograph,
     ring_cameras,
     table_scene,
     write_photos,
