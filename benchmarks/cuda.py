@@ -23,7 +23,6 @@ from torch import Tensor
 if __package__ in (None, ""):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.workload import surface_gaussians, view
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
@@ -37,6 +36,8 @@ from gaussian_wrapping_addon.core.render.cuda.kernels import (
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types.images import Render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+
+from .workload import surface_gaussians, view
 
 IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")
 BUDGET_BYTES = 4 << 30

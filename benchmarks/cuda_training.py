@@ -28,9 +28,8 @@ import torch
 if __package__ in (None, ""):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.workload import surface_gaussians, view
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 from gaussian_wrapping_addon.core.render.cuda.kernels import cuda_available
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
@@ -41,7 +40,9 @@ from gaussian_wrapping_addon.core.training.losses.multi_view import (
     MultiViewOptions,
     add_image_gradients,
 )
-from gaussian_wrapping_addon.core.training.optimizer.adam import TRAINED, Adam
+from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
+
+from .workload import surface_gaussians, view
 
 REFERENCE_COUNT = 50_000
 """The workload's sizes are for this many Gaussians."""

@@ -23,21 +23,18 @@ from pathlib import Path
 from typing import Any
 
 from gaussian_wrapping_addon.core.errors import WorkerError
-from gaussian_wrapping_addon.core.files import read_json, write_bytes, write_json
+from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.machine import processor_name
 
-from .speed_error.runs import BATCH, LAST_LINES, ROOT
-from .speed_error.tables import Row, table_of
-from .study.command import DOCUMENTS
-from .study.making import KEPT_RUNS
-from .study.origin import reading
-from .study.record import PACKAGE, RECORDS
-from .tables import versions
+from .provenance import DOCUMENTS, PACKAGE, RECORDS, ROOT, UNKNOWN, git, versions, write_page
+from .runs import BATCH, LAST_LINES
+from .study import KEPT_RUNS, reading
+from .tables import Row, table_of
 
 _logger = logging.getLogger("benchmarks")
 
 STUDY = "photo_sets"
-PAGE, READING = "photo-sets.md", "photo-sets-reading.md"
+PAGE = "photo-sets.md"
 COMMAND = "python -m benchmarks.photo_sets"
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 
@@ -61,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.folder is None and not options.document:
         parser.error("say which FOLDER has the sets, or --document")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    if not options.document and _git(options.checkout, "status", "--porcelain", "--", PACKAGE):
+    if not options.document and git("status", "--porcelain", "--", PACKAGE, root=options.checkout):
         parser.error(f"{options.checkout / PACKAGE} has changes: commit them, a record names code")
     failed = 0
     for photos in [] if options.document else _sets(options.folder, options.only):
@@ -97,13 +94,8 @@ def record_path(photos: str, preset: str, core: str, root: Path = RECORDS) -> Pa
     return root / STUDY / f"{photos}-{preset}-{core}.json"
 
 
-def _git(root: Path, *words: str) -> str:
-    git = ["git", "-C", str(root), *words]
-    return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-
-
 def _commit(root: Path, what: str = "HEAD") -> str:
-    return _git(root, "rev-parse", "--short=10", what)
+    return git("rev-parse", "--short=10", what, root=root) or UNKNOWN
 
 
 def _run(photos: Path, preset: str, root: Path, threads: int) -> dict[str, Any]:
@@ -215,10 +207,9 @@ def write_document(folder: Path, root: Path = RECORDS) -> Path | None:
         "Textured mesh: what of these photos it covers, baked without them."
     )
     table = table_of("Photo sets", [_row(record) for record in records])
-    lines = ["# Photos that people took", "", *reading(folder / READING), table.markdown()]
-    path = folder / PAGE
-    write_bytes(path, ("\n".join([*lines, "", origin]).rstrip() + "\n").encode())
-    return path
+    lines = [origin, "", *reading("photo-sets"), table.markdown()]
+    commits = [record["commit"] for record in records]
+    return write_page(folder / PAGE, "Photos that people took", commits, lines)
 
 
 if __name__ == "__main__":

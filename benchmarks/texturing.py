@@ -4,14 +4,14 @@
 Photos of spot with a known texture are rendered by rays and baked back; then a mesh of 375 thousand
 faces is unwrapped and baked at 4096 x 4096 from 40 photos of 2 megapixels, in a process of its own.
 With ``--jobs`` finished jobs of real photos are textured without their held-out photos and compared
-with these, and so are true meshes of the zoo's glossy scenes with its test views. ``texturing.md``
-and its pictures go into ``docs/benchmarks``.
+with these, and so are true meshes of the zoo's glossy scenes with its test views. A page
+and its pictures go into ``docs/benchmarks``, the figures into ``benchmarks/records``.
 """
 
 from __future__ import annotations
 
 import argparse
-import datetime
+import dataclasses
 import json
 import logging
 import subprocess
@@ -19,32 +19,214 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
+from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
+from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
+from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
+from gaussian_wrapping_addon.core.evaluation.views.held_out_texture import bake_held_out_texture
+from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
+from gaussian_wrapping_addon.core.evaluation.views.side_by_side import write_side_by_side
+from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import TexturedRenderer
+from gaussian_wrapping_addon.core.files import read_json
+from gaussian_wrapping_addon.core.limits import MAX_IMAGE_SIDE_PX
+from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
 from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 
-from .texturing_parts.glossy import SCENES as GLOSSY
-from .texturing_parts.glossy import glossy_figures
-from .texturing_parts.held_out import held_out_figures
-from .texturing_parts.judge import photos_that_see, psnr, seams, steps_between_texels, true_albedo
-from .texturing_parts.photographed import (
+from .known_texture import (
     RenderedPhotos,
+    SolidTexture,
     Unevenness,
     cameras_around,
     photograph,
+    photos_that_see,
+    psnr,
+    seams,
     spot,
+    steps_between_texels,
+    true_albedo,
     uneven,
 )
-from .texturing_parts.solid_texture import SolidTexture
+from .provenance import (
+    DOCUMENTS,
+    RECORDS,
+    code_of_tree,
+    read_figures,
+    said_origin,
+    write_figures,
+    write_page,
+)
+from .score import test_views
+from .zoo.scene import ensure_zoo_scene
+
+PICTURE_WIDTH_PX = 1400
+
+
+def compared(
+    textured: TexturedMesh,
+    cameras: Sequence[Camera],
+    photos: Sequence[np.ndarray],
+    picture: Path | None,
+    threads: int,
+) -> dict[str, float]:
+    """Compare renderings with photos, over the pixels that the mesh covers wholly.
+
+    Parameters
+    ----------
+    picture : Path or None
+        Gets the photo of median PSNR, left, and the rendering, right.
+
+    Returns
+    -------
+    dict
+        Means over the photos: ``psnr``, ``ssim``, ``covered``, and ``fitted_psnr``, with one gain
+        a channel fitted to each photo; ``views``: number of photos compared.
+    """
+    shown: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+    def keep(name: str, photo: np.ndarray, image: np.ndarray) -> None:
+        shown[name] = photo, image
+
+    score = render_views(textured, list(cameras), list(photos), threads=threads, on_view=keep)
+    renderer = TexturedRenderer(textured, threads=threads)
+    fitted = [
+        _fitted_psnr(*shown[camera.name], renderer.render(camera).covered)
+        for camera in cameras
+        if camera.name in shown
+    ]
+    if picture is not None:
+        ranked = sorted(score.views, key=lambda view: view.scores.psnr)
+        middle = ranked[len(ranked) // 2].name
+        write_side_by_side(picture, *shown[middle], max_width_px=PICTURE_WIDTH_PX)
+    return {
+        "psnr": score.psnr,
+        "fitted_psnr": float(np.mean(fitted)),
+        "ssim": score.ssim,
+        "covered": score.covered,
+        "views": len(score.views),
+    }
+
+
+def _fitted_psnr(photo: np.ndarray, image: np.ndarray, covered: np.ndarray) -> float:
+    """Return the PSNR over covered pixels with the best gain of each channel, dB."""
+    a, b = image[covered].astype(np.float64), photo[covered].astype(np.float64)
+    gain = (a * b).sum(0) / np.maximum((a * a).sum(0), 1e-9)
+    error = np.clip(gain * a, 0, 255) - b
+    return float(10 * np.log10(255.0**2 / max(float((error**2).mean()), 1e-9)))
+
+
+LONG_SIDE_PX = 800
+
+
+def held_out_figures(job: Path, picture: Path | None, threads: int) -> dict[str, Any]:
+    """Texture a finished job's mesh anew without its held-out photos, and compare with these.
+
+    Parameters
+    ----------
+    job : Path
+        A job folder; the region that was meshed last counts.
+    picture : Path or None
+        Gets the photo of median PSNR, left, and the rendering, right.
+
+    Returns
+    -------
+    dict
+        What :func:`compared` returns; ``fitted_psnr`` counts, since nobody knows the
+        exposure of a photo that was held out. ``itself_psnr``: of a texture baked from the held-out
+        photos alone, about as much as one unlit texture can have.
+    """
+    scene = load_saved_scene(_newest(job, "cameras"))
+    trained = read_json(_newest(job, "train") / "done.json")
+    names = {figure["name"] for figure in trained["held_out"]}
+    mesh = load_mesh(_newest(job, "mesh") / "mesh.npz")
+    seen = tuple(view for view in scene.views if view.camera.name not in names)
+    kept = dataclasses.replace(scene, views=seen)
+    with tempfile.TemporaryDirectory() as folder:
+        textured = texture_mesh(
+            mesh, kept, PhotoStore(kept, MAX_IMAGE_SIDE_PX), TextureSettings(), Path(folder),
+            Progress(), threads=threads,
+        )  # fmt: skip
+    photos = PhotoStore(scene, MAX_IMAGE_SIDE_PX)
+    cameras, images = [], []
+    for index, view in enumerate(scene.views):
+        if view.camera.name in names:
+            full = photos.camera(index, 1)
+            divisor = -(-max(full.width, full.height) // LONG_SIDE_PX)
+            cameras.append(photos.camera(index, divisor))
+            images.append(photos.photo(index, divisor))
+    figures = compared(textured, cameras, images, picture, threads)
+    with tempfile.TemporaryDirectory() as folder:
+        # On the same UVs, from the photos that it is compared with.
+        itself = bake_held_out_texture(
+            textured, scene, photos, [view.camera.name for view in seen], 1, Path(folder),
+            Progress(), threads=threads,
+        )  # fmt: skip
+    return {
+        "photos": len(seen),
+        "faces": len(mesh.faces),
+        "texture": textured.statistics,
+        "itself_psnr": compared(itself, cameras, images, None, threads)["psnr"],
+        **figures,
+    }
+
+
+def _newest(job: Path, name: str) -> Path:
+    """Return the folder of the stage that finished last: a job may have been meshed again."""
+    done = list((job / "stages").glob(f"{name}-*/done.json"))
+    return max(done, key=lambda path: path.stat().st_mtime).parent
+
+
+SCENES = ("gloss-d1", "gloss-d2", "gloss-d3")
+
+
+def glossy_figures(name: str, picture: Path, threads: int) -> dict[str, Any]:
+    """Texture the true mesh of a scene from its photos, and compare with its test views.
+
+    Parameters
+    ----------
+    name : str
+        Of a scene of the zoo; its photos are rendered where they are missing.
+    picture : Path
+        Gets the test view of median PSNR, left, and the rendering, right.
+
+    Returns
+    -------
+    dict
+        What :func:`compared` returns, ``photos`` and ``size_px``.
+    """
+    folder = ensure_zoo_scene(name, threads)
+    truth = read_truth(folder).mesh
+    assert truth is not None
+    vertices, faces = truth
+    with tempfile.TemporaryDirectory() as work:
+        scene = load_scene(folder, Path(work), Progress())
+        to_scene = scene.world_from_scene.inverse()
+        mesh = SurfaceMesh(to_scene.points(vertices), np.asarray(faces, np.int32))
+        textured = texture_mesh(
+            mesh, scene, PhotoStore(scene, MAX_IMAGE_SIDE_PX), TextureSettings(), Path(work),
+            Progress(), threads=threads,
+        )  # fmt: skip
+    views = test_views(folder, to_scene)
+    cameras, photos = zip(*views, strict=True)
+    return {
+        "photos": len(scene.views),
+        "size_px": textured.statistics["size_px"],
+        **compared(textured, cameras, photos, picture, threads),
+    }
+
 
 _logger = logging.getLogger("benchmarks")
 
-OUT = Path(__file__).resolve().parents[1] / "docs" / "benchmarks"
+STUDY, COMMAND = "texturing", "python -m benchmarks.texturing"
 PHOTOS, WIDTH, HEIGHT, SUPERSAMPLING = 24, 640, 480, 3
 SIZES_PX = (512, 1024)
 GREY = 140.0
@@ -66,19 +248,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--only", nargs="+", choices=PARTS, default=list(PARTS), help="only these parts"
     )
+    parser.add_argument("--document", action="store_true", help="measure nothing, write the page")
     options = parser.parse_args(arguments)
-    if len(options.only) < len(PARTS) and options.out is None:
-        parser.error("--only makes a part of the report: name its folder with --out")
-    out = options.out or OUT
+    out = options.out or DOCUMENTS
     out.mkdir(parents=True, exist_ok=True)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    only = " ".join(["--only", *options.only]) if len(options.only) < len(PARTS) else ""
-    command = f"python -m benchmarks.texturing {only}".strip()
-    lines = [
-        "# Unwrap and bake",
-        "",
-        f"`{command}`, {datetime.date.today().isoformat()}, {options.threads} threads.",
-    ]
     parts = {
         "known": _known,
         "uneven": _uneven,
@@ -86,10 +260,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "real": lambda threads: _real(options.jobs, out, threads, options.unshown),
         "glossy": lambda threads: _glossy(out, threads),
     }
-    for name in options.only:
-        lines += ["", *parts[name](options.threads)]
-    (out / "texturing.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    records = RECORDS / STUDY if options.out is None else out
+    for name in () if options.document else options.only:
+        code = code_of_tree()
+        figures = {"lines": parts[name](options.threads)}
+        write_figures(records / f"{STUDY}-{name}.json", figures, options.threads, code)
+    _logger.info("%s", write_document(records, out))
     return 0
+
+
+def write_document(records: Path, out: Path) -> Path:
+    """Write the page of all parts that have a record; each says where it is from."""
+    lines, commits = [], []
+    for name in PARTS:
+        path = records / f"{STUDY}-{name}.json"
+        if path.is_file():
+            record = read_figures(path)
+            commits.append(record["code"]["commit"])
+            lines += [*record["lines"], "", said_origin(f"{COMMAND} --only {name}", record), ""]
+    return write_page(out / "texturing.md", "Unwrap and bake", commits, lines)
 
 
 def _baked(photos: RenderedPhotos, size_px: int, threads: int) -> TexturedMesh:
@@ -185,7 +374,7 @@ def _uneven(threads: int) -> list[str]:
 
 def _large(threads: int) -> list[str]:
     _logger.info("a large mesh at 4096")
-    module = "benchmarks.texturing_parts.large_mesh"
+    module = "benchmarks.large_mesh"
     done = subprocess.run(
         [sys.executable, "-m", module, str(threads)], capture_output=True, text=True, check=True
     )
@@ -260,7 +449,7 @@ def _glossy(out: Path, threads: int) -> list[str]:
         "| --- | --- | --- | --- | --- | --- |",
     ]
     pictures = []
-    for name in GLOSSY:
+    for name in SCENES:
         _logger.info("test views of %s", name)
         picture = out / f"texturing-{name}.jpg"
         f = glossy_figures(name, picture, threads)

@@ -10,12 +10,9 @@ from pathlib import Path
 
 from gaussian_wrapping_addon.core.errors import WrapError
 
-from .build import BuildSize, build_scene
-from .cache import ALL_KINDS, REPOSITORY, ensure_scene
+from .build import CUP_INSIDE, TORUS, BuildSize, build_cup_inside, build_scene, build_torus
+from .cache import ALL_KINDS, REPOSITORY, ensure_scene, write_contact_sheet
 from .catalogue import KINDS, scene_kind
-from .contact_sheet import write_contact_sheet
-from .looking_in import CUP_INSIDE, build_cup_inside
-from .torus_and_plate import TORUS, build_torus
 
 SHEET = REPOSITORY / "docs" / "images" / "scenes.jpg"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scenes are rendered on first use, each in a process of its own, and kept."""
+"""One picture of all scenes, two photos each."""
 
 from __future__ import annotations
 
@@ -11,29 +11,23 @@ import shutil
 import subprocess
 import sys
 import uuid
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from PIL import Image, ImageDraw
+
 from gaussian_wrapping_addon.core.errors import ResourceError, WorkerError
 
-from .build import BuildSize
+from .build import CUP_INSIDE, TORUS, BuildSize
 from .catalogue import KINDS, MESHES, SceneKind, scene_kind
-from .looking_in import CUP_INSIDE
 from .rendering import require_bpy
-from .torus_and_plate import TORUS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 CACHE = REPOSITORY / ".cache" / "scenes"
 
-_DECIDES_NOTHING = {"__init__.py", "__main__.py", "cache.py", "contact_sheet.py"}
-"""Files of this package that have no influence on a scene folder's content."""
-
-_OF_SOME_SCENES = {
-    "looking_in.py": {CUP_INSIDE.name},
-    "torus_and_plate.py": {TORUS.name},
-    "matte_thing.py": {CUP_INSIDE.name, TORUS.name},
-}
-"""Files of this package that have an influence on these scenes only."""
+DRAWN = 1
+"""Raised whenever a scene comes out otherwise."""
 
 ALL_KINDS = {**KINDS, CUP_INSIDE.name: CUP_INSIDE, TORUS.name: TORUS}
 """Every scene that can be rendered."""
@@ -52,19 +46,14 @@ def kind_named(name: str) -> SceneKind:
     return ALL_KINDS[name] if name in ALL_KINDS else scene_kind(name)
 
 
-def deciding_sources(name: str) -> list[Path]:
-    """Return the files of this package that a scene folder's content depends on."""
-    others = {file for file, scenes in _OF_SOME_SCENES.items() if name not in scenes}
-    ignored = _DECIDES_NOTHING | others
-    return sorted(p for p in Path(__file__).parent.glob("*.py") if p.name not in ignored)
-
-
 def scene_folder(name: str, size: BuildSize, root: Path | None = None) -> Path:
-    """Return where a scene of this size is kept; its hash covers sources, meshes and size."""
+    """Return where a scene of this size is kept; its hash covers description, meshes and size."""
     kind = kind_named(name)
-    digest = hashlib.sha256(json.dumps([asdict(kind), asdict(size)], sort_keys=True).encode())
+    digest = hashlib.sha256(
+        json.dumps([DRAWN, asdict(kind), asdict(size)], sort_keys=True).encode()
+    )
     meshes = sorted(p for p in MESHES.iterdir() if p.suffix != ".md")
-    for path in [*deciding_sources(name), *meshes]:
+    for path in meshes:
         # Line ends differ between checkouts and change nothing.
         digest.update(path.name.encode() + path.read_bytes().replace(b"\r\n", b"\n"))
     return (root or CACHE) / f"{name}-{digest.hexdigest()[:12]}"
@@ -154,3 +143,27 @@ def _build_in_child(name: str, size: BuildSize, folder: Path, base: Path | None)
             f"Rendering scene {name!r} failed with exit code {done.returncode}: {lines}",
             f"Run it alone to see more: python -m benchmarks.scenes {name}.",
         )
+
+
+_CELL = (320, 240)
+_CAPTION_PX = 16
+_SHARES = (0.26, 0.34)
+"""Which two of a scene's photos are shown: these shares of the way through them."""
+
+
+def write_contact_sheet(folders: Sequence[Path], path: Path) -> None:
+    """Write a JPEG with two scenes a row, captioned by the folders' scene names."""
+    width, height = _CELL[0], _CELL[1] + _CAPTION_PX
+    rows = -(-len(folders) // 2)
+    sheet = Image.new("RGB", (4 * width, rows * height), "white")
+    draw = ImageDraw.Draw(sheet)
+    for index, folder in enumerate(folders):
+        photos = sorted((folder / "images").iterdir())
+        x, y = (index % 2) * 2 * width, (index // 2) * height
+        draw.text((x + 4, y + 2), folder.name.rsplit("-", 1)[0], fill="black")
+        for k, share in enumerate(_SHARES):
+            with Image.open(photos[int(share * len(photos))]) as photo:
+                small = photo.convert("RGB").resize(_CELL, Image.Resampling.LANCZOS)
+            sheet.paste(small, (x + k * width, y + _CAPTION_PX))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    sheet.save(path, quality=82, optimize=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Triangle meshes that the scenes are made of: parts, an OBJ reader, and closed solids."""
+"""Shapes of scenes, what rays see of them, and where cameras stand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.errors import ParseError
+from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.errors import ParseError, ResourceError
 
 
 @dataclass(frozen=True)
@@ -154,3 +155,161 @@ def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
         )
     vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
     return vertices, triangles.astype(np.int32)
+
+
+START_SHARE = 2e-5
+"""Rays start this share of the geometry's diagonal off the surface: embree's rays are float32."""
+
+
+class RayScene:
+    """All surfaces of a scene; both sides stop rays."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        try:
+            import embreex  # noqa: F401 - trimesh uses it where it is installed
+            import trimesh
+        except ModuleNotFoundError:
+            raise ResourceError(
+                "The ground truth is found with rays; trimesh or embreex is missing.",
+                "Install them: pip install trimesh==5.2.0 embreex.",
+            ) from None
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        self._rays = mesh.ray
+        self.normals = np.asarray(mesh.face_normals, np.float64)  # (f, 3)
+        self.diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+
+    def first_hits(
+        self, origins: np.ndarray, directions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return distance (n,) in units of ``directions`` and face (n,); inf and -1: no hit."""
+        face = self._rays.intersects_first(origins, directions)
+        distance = np.full(len(origins), np.inf)
+        hit = np.flatnonzero(face >= 0)
+        normal = self.normals[face[hit]]
+        corner = self._rays.mesh.vertices[self._rays.mesh.faces[face[hit], 0]]
+        # From the face's plane in float64: embree's own distance is float32.
+        slope = np.einsum("ij,ij->i", normal, directions[hit])
+        above = np.einsum("ij,ij->i", normal, corner - origins[hit])
+        distance[hit] = above / np.where(np.abs(slope) > 1e-12, slope, 1e-12)
+        return distance, face
+
+    def sees(self, camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Tell which points the camera sees, from their front side and unobstructed.
+
+        Parameters
+        ----------
+        points : (n, 3) float64
+            On the surface.
+        normals : (n, 3) float64
+            Unit.
+
+        Returns
+        -------
+        (n,) bool
+        """
+        pixels, depth = camera.project(points)
+        inside = (depth > 0) & (pixels >= 0).all(1)
+        inside &= (pixels < [camera.width, camera.height]).all(1)
+        to_camera = camera.center - points
+        inside &= np.einsum("ij,ij->i", to_camera, normals) > 0
+        seen = np.zeros(len(points), bool)
+        index = np.flatnonzero(inside)
+        start = points[index] + START_SHARE * self.diagonal * normals[index]
+        way = camera.center - start  # distance 1 is the camera itself
+        distance, _ = self.first_hits(start, way)
+        seen[index] = ~(distance < 1.0)
+        return seen
+
+
+def count_views(
+    rays: RayScene, cameras: Sequence[Camera], points: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """Return how many cameras see each point, (n,) int32."""
+    count = np.zeros(len(points), np.int32)
+    for camera in cameras:
+        count += rays.sees(camera, points, normals)
+    return count
+
+
+PRINCIPAL_POINT = (0.507, 0.493)
+"""Shares of width and height: not quite the middle, as in real lenses."""
+
+RINGS = ((0.36, 33.0), (0.38, 6.0), (0.26, -17.0))
+"""Share of the photos and elevation in degrees of each ring around a thing."""
+
+_GOLDEN = 0.618034
+
+
+def look_at(center: np.ndarray, target: np.ndarray, roll_degrees: float) -> np.ndarray:
+    """Return (3, 4) cam_from_world of a camera that looks at a point; world z is up."""
+    forward = (target - center) / np.linalg.norm(target - center)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    c, s = np.cos(np.radians(roll_degrees)), np.sin(np.radians(roll_degrees))
+    rotation = np.stack([c * right + s * down, c * down - s * right, forward])
+    return np.concatenate([rotation, -(rotation @ center)[:, None]], 1)
+
+
+def _camera(name: str, pose: np.ndarray, width: int, height: int, focal_share: float) -> Camera:
+    focal = focal_share * width
+    cx, cy = PRINCIPAL_POINT[0] * width, PRINCIPAL_POINT[1] * height
+    return Camera(name, width, height, focal, focal, cx, cy, pose)
+
+
+def around_thing(
+    count: int, width: int, height: int, distance: float, random: np.random.Generator, prefix: str
+) -> list[Camera]:
+    """Return cameras on rings around 0, each with small errors of a hand.
+
+    Test views ("test" prefix) stand between the rings, elevations as the random numbers say.
+    """
+    cameras: list[Camera] = []
+    if prefix == "test":
+        rings = [(count, None)]
+    else:
+        counts = [round(share * count) for share, _ in RINGS[:-1]]
+        counts.append(count - sum(counts))
+        rings = [(n, elevation) for n, (_, elevation) in zip(counts, RINGS, strict=True)]
+    for ring, (number, elevation) in enumerate(rings):
+        for k in range(number):
+            angle = 2 * np.pi * (k + _GOLDEN * ring + random.uniform(-0.15, 0.15)) / number
+            lift = random.uniform(-8, 24) if elevation is None else elevation
+            lift = np.radians(lift + random.uniform(-4, 4))
+            direction = np.array(
+                [np.cos(lift) * np.cos(angle), np.cos(lift) * np.sin(angle), np.sin(lift)]
+            )
+            center = direction * distance * random.uniform(0.93, 1.08)
+            target = random.normal(size=3) * 0.04 * distance / 2.5
+            pose = look_at(center, target, random.uniform(-3, 3))
+            name = f"{prefix}_{len(cameras):03d}.png"
+            cameras.append(_camera(name, pose, width, height, 0.92))
+    return cameras
+
+
+def inside_room(
+    count: int,
+    width: int,
+    height: int,
+    low: np.ndarray,
+    high: np.ndarray,
+    random: np.random.Generator,
+    prefix: str,
+) -> list[Camera]:
+    """Return cameras on a walk around the room's middle that look across it, up and down."""
+    middle, half = (low + high) / 2, (high - low) / 2
+    cameras: list[Camera] = []
+    phase = 0.5 if prefix == "test" else 0.0
+    for k in range(count):
+        angle = 2 * np.pi * (k + phase + random.uniform(-0.2, 0.2)) / count
+        reach = (0.62, 0.45, 0.56)[k % 3]
+        center = np.array([np.cos(angle) * half[0] * reach, np.sin(angle) * half[1] * reach, 0.0])
+        center += [middle[0], middle[1], random.uniform(1.15, 1.75)]
+        pan = np.radians((0.0, 48.0, -48.0)[k % 3] + random.uniform(-8, 8))
+        pitch = np.radians((-15.0, -32.0, -4.0, -22.0, 14.0)[k % 5] + random.uniform(-4, 4))
+        # Across the room as the walls stand: the direction to the opposite point of the ellipse.
+        yaw = np.arctan2(np.sin(angle) * half[1], np.cos(angle) * half[0]) + np.pi + pan
+        direction = [np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)]
+        pose = look_at(center, center + np.array(direction), random.uniform(-3, 3))
+        cameras.append(_camera(f"{prefix}_{k:03d}.png", pose, width, height, 0.62))
+    return cameras

@@ -17,16 +17,20 @@ from pathlib import Path
 
 from gaussian_wrapping_addon.core.errors import UsageError, WrapError
 
-from ..study.command import DOCUMENTS
-from ..study.making import carry_out
-from ..study.record import read_records
-from .build import build_zoo_scene
-from .cache import ensure_zoo_scene
+from ..provenance import DOCUMENTS
+from ..study import carry_out, read_records
 from .catalogue import DEVELOPMENT, PARTS, SCENES, zoo_scene
-from .document import write_document
-from .runs import BASELINES, TAKEN, alpha_case, find_scene, is_made, make_one, run_case
-from .sheet import draw_sheet
-from .taken_photos import ensure_taken_scene
+from .scene import build_zoo_scene, draw_sheet, ensure_taken_scene, ensure_zoo_scene
+from .study import (
+    BASELINES,
+    TAKEN,
+    alpha_case,
+    find_scene,
+    is_made,
+    make_one,
+    run_case,
+    write_document,
+)
 
 _logger = logging.getLogger("benchmarks")
 

@@ -14,8 +14,8 @@ from gaussian_wrapping_addon.core.regions.convex_region import Region
 
 from ..scenes.rendering import Light
 from . import places, things
-from .content import Content, Photography, Subject
-from .paths import (
+from .looks import FAR, NEAR, OPEN, Content, Photography, Subject, around, sky
+from .places import (
     CLOSE_UP,
     DOME,
     FORWARD,
@@ -26,7 +26,6 @@ from .paths import (
     make_cameras,
     pixel_at_thing,
 )
-from .surroundings import FAR, NEAR, OPEN, around, sky
 
 DEVELOPMENT, TEST = "development", "test"
 PARTS = (DEVELOPMENT, TEST)
@@ -60,7 +59,7 @@ class ZooScene:
     part: str
     number: int
     path: str
-    """A way of :mod:`.paths`."""
+    """A way of :mod:`.places`."""
     surroundings: str = ""
     few: bool = False
     """Whether it has :data:`FEW` photos only."""

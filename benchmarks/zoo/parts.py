@@ -17,25 +17,29 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gaussian_wrapping_addon.core.errors import WrapError
-from gaussian_wrapping_addon.core.files import write_bytes
 from gaussian_wrapping_addon.core.settings import MODEL_SELECTION
 
-from ..speed_error.tables import AT, Row, table_of, three, two
-from ..study.case import Case
-from ..study.command import DOCUMENTS
-from ..study.figures import f1_middle, f1_seen, view_psnr
-from ..study.making import carry_out
-from ..study.origin import made_by, reading
-from ..study.record import RECORDS, Record, read_records
-from ..tables import Table
+from ..provenance import DOCUMENTS, RECORDS, write_page
+from ..study import (
+    Case,
+    Record,
+    carry_out,
+    commits,
+    f1_middle,
+    f1_seen,
+    made_by,
+    read_records,
+    reading,
+    view_psnr,
+)
+from ..tables import AT, Row, Table, table_of, three, two
 from .catalogue import SCENES
-from .document import floaters
-from .runs import find_scene, make_one, scene_photos
+from .study import find_scene, floaters, make_one, scene_photos
 
 _logger = logging.getLogger("benchmarks")
 
 STUDY = "zoo-parts"
-PAGE, READING = "zoo-parts.md", "zoo-parts-reading.md"
+PAGE = "zoo-parts.md"
 COMMAND = "python -m benchmarks.zoo.parts"
 PRESET = "draft"
 SEEDS = (0, 1, 2)
@@ -175,13 +179,12 @@ def write_document(folder: Path, root: Path = RECORDS) -> Path | None:
         return None
     begun = {(r.case.scene, r.case.name in PARTS, r.case.seed) for r in records}
     awaited = [c for c in cases.values() if (c.scene, c.name in PARTS, c.seed) in begun]
-    lines = ["# Parts of the method, and decisions", "", *reading(folder / READING)]
+    lines = reading("zoo-parts")
     lines += made_by(COMMAND, records, awaited)
     lines += ["", f"Preset {PRESET}.", ""]
     lines += [parts_table(records).markdown(), "", decisions_table(records).markdown()]
-    path = folder / PAGE
-    write_bytes(path, ("\n".join(lines).rstrip() + "\n").encode())
-    return path
+    title = "Parts of the method, and decisions"
+    return write_page(folder / PAGE, title, commits(records), lines)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,7 @@ import numpy as np
 
 from ..scenes.geometry import Part, box, cone, icosphere
 from . import shapes
-from .content import Subject
-from .looks import GLAZED, MATTE, MIRROR, Look, draw_look
+from .looks import GLAZED, MATTE, MIRROR, Look, Subject, draw_look
 from .shapes import Mesh, about, part
 
 DIAGONAL = 2.0

@@ -6,8 +6,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from benchmarks.study.case import Case
-from benchmarks.study.record import Code, Record
+from benchmarks.provenance import Code
+from benchmarks.study import Case, Record
 
 CODE = Code("0123456789", "aaaaaaaaaa", False, {"train": 6, "mesh": 9})
 

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.camera_solving.document import page
-from benchmarks.camera_solving.places import hall, town
-from benchmarks.camera_solving.ray_caster import render
-from benchmarks.camera_solving.retrieval import recall
+from benchmarks.camera_places import hall, render, town
+from benchmarks.camera_solving import page, recall
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from tests.synthetic import look_at
 
@@ -65,17 +63,18 @@ def test_recall_of_pairs() -> None:
 
 def test_the_page_has_what_records_say() -> None:
     run: dict[str, Any] = {
-        "photos": 400, "placed": 397, "threads": 2, "processor": "A processor", "seconds": 812.4,
-        "processor_seconds": 1204.6, "peak_bytes": 3 << 30, "date": "2026-11-26",
+        "photos": 400, "placed": 397, "threads": 2, "machine": "A processor", "seconds": 812.4,
+        "processor_seconds": 1204.6, "peak_bytes": 3 << 30, "date": "2026-11-26T10:00",
+        "code": {"commit": "0123456789"},
         "facts": {"mapper": "global", "pairs_matched": 5120, "pairs_contradicting_cameras": 2},
         "warnings": [{"code": "photos-not-placed", "text": "", "hint": ""}],
         "errors": {"rotation_degrees_median": 0.0432, "center_share_median": 0.0012},
     }  # fmt: skip
-    text = page({"town-400": run})
+    text = "\n".join(page({"town-400": run}))
     row = next(line for line in text.split("\n") if line.startswith("| town-400"))
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert cells == [
         "town-400", "397 / 400", "global", "5120", "1205", "812", "3.00", "0.043", "0.12", "", "",
-        "2", "photos-not-placed", "2026-11-26",
+        "2", "photos-not-placed", "2026-11-26", "0123456789",
     ]  # fmt: skip
     assert "Walls that repeat" not in text

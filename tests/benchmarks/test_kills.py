@@ -11,13 +11,30 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.kills import processes
-from benchmarks.kills.document import page, write_document
-from benchmarks.kills.interruptions import _limit, _without_places
-from benchmarks.kills.outcomes import LONGEST_END_S, Outcome, read_outcomes, write_outcomes
-from benchmarks.kills.small_job import BLOCK_BYTES, LEFT_OUT, Reference, room
-from benchmarks.kills.trials import CALLER, DISK, KILL, MEMORY, STAGES, WAYS, Trial, draw
-from benchmarks.speed_error.runs import ROOT
+from benchmarks import kills as processes
+from benchmarks.kills import (
+    BLOCK_BYTES,
+    CALLER,
+    DISK,
+    KILL,
+    LEFT_OUT,
+    LONGEST_END_S,
+    MEMORY,
+    STAGES,
+    WAYS,
+    Outcome,
+    Reference,
+    Trial,
+    _limit,
+    _without_places,
+    draw,
+    page,
+    read_outcomes,
+    room,
+    write_document,
+    write_outcomes,
+)
+from benchmarks.provenance import ROOT
 from tools.version_comparison.contents import Contents, differences, read_contents
 
 GOOD = Outcome(

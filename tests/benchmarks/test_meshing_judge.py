@@ -13,10 +13,10 @@ import pytest
 import torch
 import trimesh
 
-from benchmarks.meshing_parts.vacancy_scale import cameras_around
-from benchmarks.meshing_study import fusion
-from benchmarks.meshing_study.fusion import depth_in_region, require_open3d
-from benchmarks.meshing_study.judge import distances, inner, solidity
+from benchmarks import one_mesh as fusion
+from benchmarks.meshing_judge import distances, inner, solidity
+from benchmarks.one_mesh import depth_in_region, require_open3d
+from benchmarks.vacancy_scale import cameras_around
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ResourceError
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh

@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from benchmarks.meshing_parts.spacing import vertex_ratio
+from benchmarks.meshing_tables import vertex_ratio
 
 
 def mesh(spacing: str, vertices: int, error: float) -> dict[str, object]:

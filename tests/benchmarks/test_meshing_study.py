@@ -12,12 +12,9 @@ from xml.etree import ElementTree
 import pytest
 
 from benchmarks import meshing
-from benchmarks.meshing_study import carry_out
-from benchmarks.meshing_study.acceptance import checks
-from benchmarks.meshing_study.carry_out import Made, Outcome
-from benchmarks.meshing_study.document import write_document
-from benchmarks.meshing_study.figures import write_plots
-from benchmarks.meshing_study.plan import (
+from benchmarks import meshing_runs as carry_out
+from benchmarks.meshing import write_document
+from benchmarks.meshing_runs import (
     ADAPTIVE,
     FUSION,
     LARGE_POINTS,
@@ -26,20 +23,25 @@ from benchmarks.meshing_study.plan import (
     SPACING_SCENES,
     TETRAHEDRA,
     UNIFORM,
+    Made,
     Method,
+    Outcome,
     Plan,
     Subject,
     full_plan,
     quick_plan,
 )
-from benchmarks.meshing_study.tables import (
+from benchmarks.meshing_tables import (
+    checks,
     cost_table,
     isosurface_table,
     solid_table,
     truth_table,
+    write_plots,
 )
-from benchmarks.scenes import ALL_KINDS
-from benchmarks.speed_error.runs import Settings
+from benchmarks.provenance import code_of_tree
+from benchmarks.runs import Settings
+from benchmarks.scenes.cache import ALL_KINDS
 from benchmarks.tables import Table
 from gaussian_wrapping_addon.core.errors import WorkerError
 
@@ -242,12 +244,16 @@ def test_plots_show_every_method(tmp_path: Path) -> None:
     assert not (tmp_path / "none.svg").exists()
 
 
-def test_page_holds_targets_plots_tables_and_reading(tmp_path: Path) -> None:
-    (tmp_path / "meshing-reading.md").write_text("2026-01-02\n\n## Reading\n\nSober words.\n")
-    facts = {"command": "the command", "date": "2026-01-02", "threads": 2}
-    text = write_document(tmp_path, outcome_of(PLANS["full"]), facts).read_text(encoding="utf-8")
+FACTS = {
+    "command": "the command", "date": "2026-01-02", "threads": 2, "machine": "a processor",
+    "versions": "Python 3",
+}  # fmt: skip
+
+
+def test_page_holds_targets_plots_and_tables(tmp_path: Path) -> None:
+    text = write_document(tmp_path, outcome_of(PLANS["full"]), FACTS).read_text(encoding="utf-8")
     for words in ("the command", "2026-01-02", "2 threads", "0123456789", "abc0123456",
-                  "Sober words.", "### Targets", "![Plots](meshing.svg)", "40 photos of",
+                  "a processor", "### Targets", "![Plots](meshing.svg)", "40 photos of",
                   "Real photos", "not begun within 40 minutes", "### Trainings",
                   "27.25"):  # fmt: skip
         assert words in text
@@ -256,10 +262,21 @@ def test_page_holds_targets_plots_tables_and_reading(tmp_path: Path) -> None:
 
 
 def test_page_of_a_part_alone(tmp_path: Path) -> None:
-    facts = {"command": "the command", "date": "2026-01-02", "threads": 2}
-    text = write_document(tmp_path, Outcome([], {}, VACANCY, [], False), facts).read_text()
+    text = write_document(tmp_path, Outcome([], {}, VACANCY, [], False), FACTS).read_text()
     assert "vacancy of 1000000 points" in text
     assert "![Plots]" not in text
+
+
+def test_the_page_can_be_written_again_from_the_record(tmp_path: Path) -> None:
+    plan = PLANS["full"]
+    outcome = outcome_of(plan)
+    meshing.keep(tmp_path / "a.json", outcome, FACTS, code_of_tree())
+    found, facts = meshing.kept(tmp_path / "a.json", plan)
+    assert (found.made, found.trainings, found.vacancy) == (
+        outcome.made, outcome.trainings, outcome.vacancy,
+    )  # fmt: skip
+    assert found.missing == outcome.missing
+    assert (facts["command"], facts["threads"]) == ("the command", 2)
 
 
 def test_time_missing_photos_and_failures_are_told(
@@ -280,7 +297,7 @@ def test_time_missing_photos_and_failures_are_told(
             if arguments[4] == FUSION:
                 raise WorkerError("failed: x\nResourceError: Open3D is missing\n")
             return example.made[0].figures
-        return VACANCY if module.endswith("vacancy_line") else example.made[0].scores
+        return VACANCY if module.endswith("vacancy_scale") else example.made[0].scores
 
     trained = itertools.count()
     monkeypatch.setattr(carry_out, "judged_by", judged_by)
@@ -298,9 +315,9 @@ def test_time_missing_photos_and_failures_are_told(
     assert sum("--data" in reason for reason in reasons.values()) == 3
     assert len(outcome.made) == meshes
     assert next(trained) == len(rendered)
-    assert asked.count("vacancy_line") == 1
+    assert asked.count("vacancy_scale") == 1
     # Each method once to compile, a reference a scene, and the meshes themselves.
-    assert asked.count("judge") == meshes
+    assert asked.count("meshing_judge") == meshes
     only = carry_out.carry_out(plan, settings, None, ["uniform-6000"])
     assert {(m.method.name, m.method.size) for m in only.made} == {(UNIFORM, 6000)}
     assert len(only.made) == len(SPACING_SCENES)

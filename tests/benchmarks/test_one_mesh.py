@@ -10,9 +10,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from benchmarks.meshing_study.one_mesh import MEASURED, MESH, measure
-from benchmarks.meshing_study.plan import ADAPTIVE, TETRAHEDRA, UNIFORM, Method
-from benchmarks.meshing_study.trained import Trained
+from benchmarks.meshing_runs import ADAPTIVE, MEASURED, MESH, TETRAHEDRA, UNIFORM, Method
+from benchmarks.one_mesh import Trained, measure
 from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians

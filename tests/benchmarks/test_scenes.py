@@ -19,21 +19,24 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.scenes.build import BuildSize, build_scene
-from benchmarks.scenes.cache import ALL_KINDS, deciding_sources, kind_named
-from benchmarks.scenes.catalogue import KINDS, scene_content, scene_kind
-from benchmarks.scenes.geometry import joined
-from benchmarks.scenes.ground_truth import truth_samples
-from benchmarks.scenes.looking_in import CUP_INSIDE, build_cup_inside, cup_inside_content
-from benchmarks.scenes.rendering import Light, render_photos
-from benchmarks.scenes.torus_and_plate import (
+from benchmarks.scenes.build import (
+    CUP_INSIDE,
     PLATE_HEIGHT,
     PLATE_SHARE,
     PLATE_WIDTH,
     RING_RADIUS,
     TUBE_RADIUS,
+    BuildSize,
+    build_cup_inside,
+    build_scene,
+    cup_inside_content,
     torus_content,
-)  # fmt: skip
+    truth_samples,
+)
+from benchmarks.scenes.cache import kind_named
+from benchmarks.scenes.catalogue import KINDS, scene_content, scene_kind
+from benchmarks.scenes.geometry import joined
+from benchmarks.scenes.rendering import Light, render_photos
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.errors import UsageError
@@ -262,8 +265,7 @@ def test_truth_is_the_same_every_time(folders: dict[str, Path], tmp_path: Path) 
 
 
 def test_thickness_and_views_of_a_plate() -> None:
-    from benchmarks.scenes.geometry import box
-    from benchmarks.scenes.viewpoints import look_at
+    from benchmarks.scenes.geometry import box, look_at
     from gaussian_wrapping_addon.core.regions.convex_region import Region
 
     plate = box("plate", (-1, -1, 0), (1, 1, 0.1), "oak")
@@ -325,14 +327,6 @@ def test_a_scene_of_its_own_module_is_built_like_the_others(
     assert files == wanted
     described = json.loads((folder / "scene.json").read_text())
     assert (described["name"], described["role"]) == ("cup_inside", "test")
-
-
-def test_sources_of_one_scene_do_not_make_others_stale() -> None:
-    own = {name: {path.name for path in deciding_sources(name)} for name in ALL_KINDS}
-    assert own["cup_inside"] - own["cup"] == {"looking_in.py", "matte_thing.py"}
-    assert own["torus"] - own["cup"] == {"torus_and_plate.py", "matte_thing.py"}
-    assert own["cup"] < own["cup_inside"]
-    assert {"build.py", "catalogue.py", "viewpoints.py"} <= own["cup"]
 
 
 def test_unknown_scenes_are_named() -> None:

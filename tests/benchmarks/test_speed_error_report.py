@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from benchmarks import speed_vs_error
-from benchmarks.scenes import ALL_KINDS
-from benchmarks.speed_error import document
-from benchmarks.speed_error.alpha_shape import alpha_shape
-from benchmarks.speed_error.cases import (
+from benchmarks import speed_vs_error as document
+from benchmarks.alpha_shape import alpha_shape
+from benchmarks.runs import PRESETS
+from benchmarks.scenes.cache import ALL_KINDS
+from benchmarks.speed_vs_error import (
     ALPHA,
     LABELS,
     MESHED_PRESETS,
@@ -25,14 +26,14 @@ from benchmarks.speed_error.cases import (
     SCENES,
     alpha_case,
     mesher_case,
+    mesher_table,
     preset_case,
+    preset_table,
+    spent_s,
     study_plan,
+    write_plot,
 )
-from benchmarks.speed_error.plan import PRESETS
-from benchmarks.speed_error.plots import write_plot
-from benchmarks.speed_error.preset_tables import mesher_table, preset_table, spent_s
-from benchmarks.study.case import Case, options
-from benchmarks.study.record import Record
+from benchmarks.study import Case, Record, options
 from benchmarks.tables import Table
 from tests.benchmarks.invented_records import invented
 
@@ -172,13 +173,12 @@ def test_the_plot_shows_all_scenes_presets_and_meshers(tmp_path: Path) -> None:
 
 
 def test_the_page_is_written_from_records_alone(tmp_path: Path) -> None:
-    (tmp_path / document.READING).write_text("## Reading\n\nSober words.\n")
     (tmp_path / document.picture("spot")).write_bytes(b"")
     found = {n: r for n, r in all_records().items() if r.case.scene == "spot"}
     text = document.write_document(tmp_path, found, CASES).read_text(encoding="utf-8")
     for words in (
-        "Sober words.", "a processor, 1 thread a run", "2026-01-02", "are not made yet", "OpenMVS",
-        "not in this repository",
+        "How to read this", "a processor, 1 thread a run", "2026-01-02", "are not made yet",
+        "## Protocol", "measured at 0123456789",
     ):  # fmt: skip
         assert words in text
     assert re.findall(r"!\[[^]]*\]\(([^)]+)\)", text) == [document.PLOT, "scene-spot.jpg"]

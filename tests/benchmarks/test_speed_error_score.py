@@ -12,8 +12,8 @@ import torch
 import trimesh
 from PIL import Image
 
-from benchmarks.speed_error.pictures import write_comparison
-from benchmarks.speed_error.score import judge, judge_truth
+from benchmarks.score import judge, judge_truth
+from benchmarks.speed_vs_error import write_comparison
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
 from gaussian_wrapping_addon.core.files import write_json

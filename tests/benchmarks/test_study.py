@@ -12,23 +12,24 @@ from typing import Any
 
 import pytest
 
-from benchmarks.speed_error import runs as speed_error_runs
-from benchmarks.speed_error.plan import Photos, Run
-from benchmarks.speed_error.runs import Settings, warm_up
-from benchmarks.study import command, making, mesh_based, record
-from benchmarks.study.case import Case, named, options
-from benchmarks.study.making import carry_out, kept_scores
-from benchmarks.study.origin import made_by
-from benchmarks.study.record import (
+from benchmarks import runs, study
+from benchmarks.provenance import ROOT, STAGE_VERSIONS, code_of_tree
+from benchmarks.runs import Photos, Run, Settings, warm_up
+from benchmarks.study import (
+    Case,
     Record,
-    code_of_tree,
+    carry_out,
+    kept_scores,
+    made_by,
+    named,
+    options,
     read_record,
     read_records,
     record_path,
     said_versions,
     write_record,
 )
-from benchmarks.study.spread import Spread, shown
+from benchmarks.tables import Spread, shown
 from gaussian_wrapping_addon.core.errors import ParseError, UsageError, WorkerError
 from tests.benchmarks.invented_records import CODE, invented, surface
 
@@ -43,10 +44,10 @@ PLAN = [
 @pytest.fixture
 def records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of records instead of the repository's."""
-    for module in (making, command):
-        for name, of_record in (("record_path", record_path), ("read_records", read_records)):
-            if hasattr(module, name):
-                monkeypatch.setattr(module, name, lambda x, f=of_record: f(x, tmp_path))
+    for function in (record_path, read_records):
+        monkeypatch.setattr(
+            study, function.__name__, lambda x, root=tmp_path, f=function: f(x, root)
+        )
     return tmp_path
 
 
@@ -67,7 +68,7 @@ class Maker:
 
 @pytest.fixture(autouse=True)
 def _cold(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(making, "warm_up", lambda *_: None)
+    monkeypatch.setattr(study, "warm_up", lambda *_: None)
 
 
 def test_records_come_back_as_they_were(tmp_path: Path) -> None:
@@ -149,11 +150,11 @@ def test_the_document_alone_makes_no_run(records: Path, tmp_path: Path) -> None:
         return out
 
     arguments = ["--document", "--out", str(tmp_path)]
-    assert command.run_study(arguments, "", PLAN, write, maker) == 1  # no record yet
+    assert study.run_study(arguments, "", PLAN, write, maker) == 1  # no record yet
     write_record(invented(PLAN[2]), records)
-    assert command.run_study(arguments, "", PLAN, write, maker) == 0
+    assert study.run_study(arguments, "", PLAN, write, maker) == 0
     assert (maker.made, written) == ([], [[PLAN[2].identity]])
-    assert command.run_study(["--only", "spot", "seed1"], "", PLAN, write, maker) == 0
+    assert study.run_study(["--only", "spot", "seed1"], "", PLAN, write, maker) == 0
     assert maker.made == ["spot-one-seed1", "spot-two-seed1"]
     assert written[-1] == ["spot-one-seed0", "spot-one-seed1", "spot-two-seed1"]
 
@@ -207,7 +208,7 @@ def test_mixed_versions_are_said() -> None:
     said = said_versions([*one, other])
     assert "2 versions of the code are mixed" in said
     assert "3 of 0123456789, 1 of 7777777777" in said
-    assert "did not change on purpose" in said
+    assert "does not say that their results are the same" in said
     raised = dataclasses.replace(other.code, stages={"train": 6, "mesh": 10})
     said = said_versions([*one, dataclasses.replace(other, code=raised)])
     assert "the result of mesh was changed on purpose" in said
@@ -225,11 +226,11 @@ def test_the_origin_says_what_is_missing() -> None:
 
 def test_the_code_of_the_tree_is_found() -> None:
     code = code_of_tree()
-    if (record.ROOT / ".git").exists():
+    if (ROOT / ".git").exists():
         assert len(code.commit) == len(code.core) == 10
     else:
         assert code.commit == code.core == "unknown"
-    assert code.stages == record.STAGE_VERSIONS
+    assert code.stages == STAGE_VERSIONS
 
 
 def test_lengths_are_kept_as_shares_of_the_diagonal() -> None:
@@ -256,18 +257,18 @@ def test_mesh_based_rendering_is_filled_into_records_of_kept_meshes(
     for made in (known, invented(PLAN[1]), invented(PLAN[2])):
         write_record(made, root)
     for case in PLAN[:2]:
-        (making.run_folder(case, kept) / "mesh").mkdir(parents=True)  # of the third none is kept
+        (study.run_folder(case, kept) / "mesh").mkdir(parents=True)  # of the third none is kept
     asked: list[list[str]] = []
 
     def judged(module: str, arguments: list[str], path: Path, settings: Any) -> dict[str, Any]:
         asked.append([module, *arguments])
         return {"psnr": 21.123456789, "uncovered": 0.25, "views": [1, 2], "settings": {}}
 
-    monkeypatch.setattr(mesh_based, "judged_by", judged)
-    monkeypatch.setattr(mesh_based, "ensure_scene", lambda name, **_: tmp_path / name)
-    assert mesh_based.fill_in(PLAN, threads=1, kept=kept, root=root) == 0
-    folder = making.run_folder(PLAN[1], kept)
-    assert [a[0] for a in asked] == ["mesh_based"]
+    monkeypatch.setattr(study, "judged_by", judged)
+    monkeypatch.setattr(study, "ensure_scene", lambda name, **_: tmp_path / name)
+    assert study.fill_in(PLAN, threads=1, kept=kept, root=root) == 0
+    folder = study.run_folder(PLAN[1], kept)
+    assert [a[0] for a in asked] == ["benchmarks.mesh_based"]
     assert {str(folder / "mesh"), str(folder / "out")} < set(asked[0])
     found = read_records(PLAN, root)
     assert found[PLAN[0].identity] == known
@@ -278,9 +279,9 @@ def test_mesh_based_rendering_is_filled_into_records_of_kept_meshes(
     assert "views" not in filled.mbr
     assert dataclasses.replace(filled, mbr=None) == invented(PLAN[1])
     # Nothing is left to do but what is asked for again.
-    mesh_based.fill_in(PLAN, threads=1, kept=kept, root=root)
+    study.fill_in(PLAN, threads=1, kept=kept, root=root)
     assert len(asked) == 1
-    mesh_based.fill_in(PLAN, threads=1, again=True, runs=1, kept=kept, root=root)
+    study.fill_in(PLAN, threads=1, again=True, runs=1, kept=kept, root=root)
     assert len(asked) == 2
 
 
@@ -296,7 +297,7 @@ def test_runs_that_warm_up_at_once_do_not_share_a_folder(
         assert settings.folder.is_dir()
         return scene
 
-    monkeypatch.setattr(speed_error_runs, "run_wrap", wrap)
+    monkeypatch.setattr(runs, "run_wrap", wrap)
     warm_up(tmp_path, Settings(tmp_path / "kept", 1, False))
     assert len(set(folders)) == 2
     assert list((tmp_path / "kept").iterdir()) == []

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.study.record import record_path, write_record
-from benchmarks.zoo import taken_photos
-from benchmarks.zoo.cache import scene_folder
-from benchmarks.zoo.runs import FIGURES, TAKEN, find_scene, is_made, run_case
-from benchmarks.zoo.taken_photos import compressed, ensure_taken_scene, taken, taken_folder
+from benchmarks.study import record_path, write_record
+from benchmarks.zoo import scene as taken_photos
+from benchmarks.zoo.scene import compressed, ensure_taken_scene, scene_folder, taken, taken_folder
+from benchmarks.zoo.study import FIGURES, TAKEN, find_scene, is_made, run_case
 from tests.benchmarks.invented_records import invented
 
 NAME = "thin-d1"
@@ -81,12 +80,14 @@ def same(one: Path, other: Path) -> bool:
 def test_labels_say_which_photos_a_run_is_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("benchmarks.zoo.cache.CACHE", tmp_path)
+    monkeypatch.setattr("benchmarks.zoo.scene.CACHE", tmp_path)
     scene_in(tmp_path)
     clean, camera = (run_case(NAME, label, "draft", ()) for label in ("draft", "draft" + TAKEN))
     assert find_scene(clean) == scene_folder(NAME)
     assert find_scene(camera) == taken_folder(NAME)
-    monkeypatch.setattr("benchmarks.zoo.runs.record_path", lambda case: record_path(case, tmp_path))
+    monkeypatch.setattr(
+        "benchmarks.zoo.study.record_path", lambda case: record_path(case, tmp_path)
+    )
     for folder, made in ((scene_folder(NAME), False), (taken_folder(NAME), True)):
         record = invented(camera)
         record.scores[FIGURES] = {"scene": folder.name}

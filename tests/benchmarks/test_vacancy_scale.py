@@ -8,7 +8,7 @@ import logging
 import numpy as np
 import pytest
 
-from benchmarks.meshing_parts.vacancy_scale import cameras_around, main, measure
+from benchmarks.vacancy_scale import cameras_around, main, measure
 
 
 def test_small_task_agrees_with_the_definition() -> None:

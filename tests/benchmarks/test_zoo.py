@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.scenes.build import SparsePoints
 from benchmarks.scenes.geometry import joined
-from benchmarks.scenes.sparse_points import SparsePoints
-from benchmarks.speed_error.tables import three
-from benchmarks.study.record import read_records, record_path, write_record
+from benchmarks.study import read_records, record_path, write_record
+from benchmarks.tables import three
 from benchmarks.zoo import __main__ as command
 from benchmarks.zoo import shapes
-from benchmarks.zoo.cache import scene_folder
 from benchmarks.zoo.catalogue import (
     DEVELOPMENT,
     FAMILIES,
@@ -26,18 +25,19 @@ from benchmarks.zoo.catalogue import (
     draw_photography,
     zoo_scene,
 )
-from benchmarks.zoo.content import Content
-from benchmarks.zoo.document import floaters, read_labels, write_document
-from benchmarks.zoo.points import disturbed_poses, found_points
-from benchmarks.zoo.runs import (
+from benchmarks.zoo.looks import SKY_NAME, Content
+from benchmarks.zoo.scene import disturbed_poses, found_points, scene_folder
+from benchmarks.zoo.study import (
     BASELINES,
     FIGURES,
     alpha_case,
+    floaters,
     is_made,
     open_share,
+    read_labels,
     run_case,
+    write_document,
 )
-from benchmarks.zoo.surroundings import SKY_NAME
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ParseError, UsageError
 from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
@@ -279,7 +279,9 @@ def test_a_run_on_an_earlier_version_of_its_scene_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     case = run_case("thin-d1", "x", "draft", ())
-    monkeypatch.setattr("benchmarks.zoo.runs.record_path", lambda case: record_path(case, tmp_path))
+    monkeypatch.setattr(
+        "benchmarks.zoo.study.record_path", lambda case: record_path(case, tmp_path)
+    )
     assert not is_made(case)
     for scene, made in (("zoo-thin-d1-before", False), (scene_folder("thin-d1").name, True)):
         record = invented(case)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.study.record import write_record
+from benchmarks.study import write_record
 from benchmarks.zoo.parts import (
     DECISIONS,
     FULLEST,

@@ -13,14 +13,16 @@ import trimesh
 
 pytest.importorskip("embreex")
 
-from benchmarks.texturing_parts.judge import photos_that_see, psnr, true_albedo
-from benchmarks.texturing_parts.photographed import (
+from benchmarks.known_texture import (
     RenderedPhotos,
+    SolidTexture,
     cameras_around,
     photograph,
+    photos_that_see,
+    psnr,
     spot,
+    true_albedo,
 )
-from benchmarks.texturing_parts.solid_texture import SolidTexture
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import EXIT_RESOURCES, ResourceError

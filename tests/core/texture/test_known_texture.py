@@ -10,22 +10,20 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from benchmarks.texturing_parts.judge import (
+from benchmarks.known_texture import (
+    RenderedPhotos,
+    SolidTexture,
     all_steps,
+    cameras_around,
+    photograph,
     photos_that_see,
     psnr,
     seams,
+    spot,
     steps_between_texels,
     true_albedo,
-)
-from benchmarks.texturing_parts.photographed import (
-    RenderedPhotos,
-    cameras_around,
-    photograph,
-    spot,
     uneven,
 )
-from benchmarks.texturing_parts.solid_texture import SolidTexture
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings

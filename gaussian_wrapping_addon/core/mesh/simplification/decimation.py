@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Decimate a mesh by edge collapses that preserve a closed manifold, in order of quadric error.
 
-Libraries that do the same break thin parts (their collapses join sheets) or fold faces over:
-``benchmarks/meshing_parts/decimation.py`` measures both.
+Libraries that do the same break thin parts (their collapses join sheets) or fold faces over.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ POINT_BYTES = 3_500
 tetrahedra, candidates, repair (145 000 points of a sphere took 3 100 each)."""
 JOINED_VERTEX_BYTES = 1_200
 """Peak per vertex of the simplified mesh while tiles are joined
-(benchmarks/meshing_parts/joining.py: 1 000)."""
+(measured: 1 000)."""
 GATHERED_POINT_BYTES = 300
 """Peak per dense point while the points of all tiles are thinned together (measured: 210)."""
 SURROUNDINGS = 2.0

@@ -32,7 +32,7 @@ DENSE_POINTS, LEAST_DENSE_FACTOR = 200_000, 2.0
 
 VERTICES_PER_UNIFORM = 0.5
 """Vertices of an adaptive mesh, as a share of the uniform mesh with the requested edge length; both
-have the same distance to the surface (benchmarks/meshing_parts/spacing.py)."""
+have the same distance to the surface (benchmarks/meshing_tables.py)."""
 
 FINEST_SHARE = 1e-6
 """Edges shorter than this share of the diagonal are refused outright."""

@@ -27,7 +27,7 @@ view replaced another: flakes along the rim of a pot whose photos differ in expo
 SHARPNESS_AGREEING, SHARPNESS_DISAGREEING = 6.0, 1.0
 """Exponents of the weights, how far the best views dominate: where views agree, or are one or two,
 and where they do not. A high one keeps gradients, noise and highlights of single photos where they
-disagree, a low one blurs where they agree (docs/benchmarks/texturing.md)."""
+disagree, a low one blurs where they agree (benchmarks/texturing.py)."""
 DISAGREEMENT = 10.0
 """Median distance of the views from their median, of 255 levels, half way between the two."""
 OUTLIER_FLOOR = 20.0

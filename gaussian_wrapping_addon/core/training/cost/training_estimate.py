@@ -44,7 +44,7 @@ and the figures below, 3000 iterations on 40 photos of 640 x 480 px are estimate
 took 335 s on two cores with a little other load (benchmarks/scenes wheel, preset standard)."""
 
 WITHOUT_DEPTH = 0.45
-"""Share of :data:`PIXEL_S` before depth is rendered (docs/benchmarks/kernels.md: depth adds 105 to
+"""Share of :data:`PIXEL_S` before depth is rendered (benchmarks/kernels.py: depth adds 105 to
 141 % to rendering 50 000 Gaussians forward at up to 800 x 600 px, and the normal losses come with
 it)."""
 
@@ -71,7 +71,7 @@ TRIAL_S = 6.0
 MATCHING_PIXEL_S = 6e-6
 """Per pixel of all photos at the size at which they are matched for a dense start: 7.6 us of one
 thread (35 photos of 320 x 240 px, benchmarks/scenes wheel) on two threads, and 2 us for planes
-through plain parts (0.8 to 5.1 us on the 15 scenes of docs/benchmarks/stereo-depths.md)."""
+through plain parts (0.8 to 5.1 us on 15 scenes of the zoo)."""
 
 MATCHING_PIXEL_BYTES = 200
 """Per such pixel: planes, costs, and the points that are fused."""
@@ -80,8 +80,8 @@ LOW, HIGH = 0.75, 1.95
 """The reported range is the model's time times these: it covers every measured training."""
 
 MESH_AND_TEXTURE_SHARE = (0.2, 0.9)
-"""Time of meshing and texture, as a share of the training before them: from 17 to 94 % in the jobs
-of docs/figures.md and of benchmarks/scenes, with one region of about 50 thousand faces. Long
+"""Time of meshing and texture, as a share of the training before them: from 17 to 94 % in jobs
+on real photos and on benchmarks/scenes, with one region of about 50 thousand faces. Long
 trainings have the small shares."""
 
 ROUND_GROWTH = 1.8

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.camera_solving.tracks import Tracks, hall_tracks, write_database
+from benchmarks.camera_places import Tracks, hall_tracks, write_database
 from gaussian_wrapping_addon.core.dataset.matching import feature_steps, pair_choice
 from gaussian_wrapping_addon.core.dataset.matching.feature_steps import match_chosen
 from gaussian_wrapping_addon.core.dataset.poses.mapping import place_one_by_one

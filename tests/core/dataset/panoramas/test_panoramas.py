@@ -13,8 +13,6 @@ import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from benchmarks.camera_files import writers
-from benchmarks.camera_files.writers import Shots
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.loading import load as load_module
 from gaussian_wrapping_addon.core.dataset.loading.check import check_input
@@ -43,6 +41,8 @@ from gaussian_wrapping_addon.core.jobs.commands.estimate_command import input_fa
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.dataset.panoramas.room import HALF, color_of, poses, write_panoramas
+from tests.core.dataset.readers.programs import writers
+from tests.core.dataset.readers.programs.writers import Shots
 
 WIDTH = 400
 

@@ -6,14 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.scenes.visibility import RayScene
-from benchmarks.turntable.photos import Turntable, turntable
+from benchmarks.scenes.geometry import RayScene
 from gaussian_wrapping_addon.core.dataset.poses.turntable_masks import (
     masks_of_turning,
     steady_colors,
     whole_parts,
     without_holes,
 )
+from tests.core.dataset.poses.turntable_photos import Turntable, turntable
 
 COUNT, WIDTH, HEIGHT = 24, 240, 180
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.turntable.photos import Turntable, turntable, write_photos
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
 from gaussian_wrapping_addon.core.dataset.scene import Scene
@@ -17,6 +16,7 @@ from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene, sa
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.evaluation.alignment.pose_error import pose_errors
 from gaussian_wrapping_addon.core.progress import Progress
+from tests.core.dataset.poses.turntable_photos import Turntable, turntable, write_photos
 
 COUNT, WIDTH, HEIGHT = 20, 400, 300
 

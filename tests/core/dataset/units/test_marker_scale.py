@@ -8,15 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.units.marker_scene import (
-    DICTIONARY,
-    SIDE_M,
-    UNITS_PER_METRE,
-    photograph,
-    ring_cameras,
-    table_scene,
-    write_photos,
-)
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.loading import load
 from gaussian_wrapping_addon.core.dataset.loading.real_world import UnitsRequest
@@ -29,6 +20,15 @@ from gaussian_wrapping_addon.core.dataset.units.marker_scale import (
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings.markers import MarkerSpec
+from tests.core.dataset.units.marker_scene import (
+    DICTIONARY,
+    SIDE_M,
+    UNITS_PER_METRE,
+    photograph,
+    ring_cameras,
+    table_scene,
+    write_photos,
+)
 
 cv2 = pytest.importorskip("cv2")
 

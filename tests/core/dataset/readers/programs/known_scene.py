@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from benchmarks.camera_files.writers import Shots
 from gaussian_wrapping_addon.core.dataset.lenses.lens_fit import fit_lens
 from gaussian_wrapping_addon.core.dataset.lenses.undistort import project
 from gaussian_wrapping_addon.core.dataset.loading.source_kind import read_poses, source_kind
@@ -17,6 +16,7 @@ from gaussian_wrapping_addon.core.dataset.readers.source_model import (
     SourceModel,
     counts_stored_pixels,
 )
+from tests.core.dataset.readers.programs.writers import Shots
 from tests.poses import look_at_pose
 
 WIDTH, HEIGHT = 96, 64

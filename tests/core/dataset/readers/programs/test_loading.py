@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.camera_files import writers
-from benchmarks.camera_files.writers import Shots
 from gaussian_wrapping_addon.core.dataset.frames.scene_grid import POINT_STEP
 from gaussian_wrapping_addon.core.dataset.loading.check import check_input
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
@@ -22,7 +20,9 @@ from gaussian_wrapping_addon.core.jobs.commands.estimate_command import input_fa
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
 from gaussian_wrapping_addon.core.progress import Progress
 from tests.core.dataset.poses.test_pose_solver import textured_plane
+from tests.core.dataset.readers.programs import writers
 from tests.core.dataset.readers.programs.known_scene import NAMES, shots, write_photos
+from tests.core.dataset.readers.programs.writers import Shots
 
 OSFM = {"focal_x": 0.9, "focal_y": 0.9, "k1": -0.05}
 

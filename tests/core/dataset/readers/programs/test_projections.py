@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from benchmarks.camera_files import writers
+from tests.core.dataset.readers.programs import writers
 from tests.core.dataset.readers.programs.known_scene import (
     HEIGHT,
     WIDTH,

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.camera_files import writers
 from gaussian_wrapping_addon.core.dataset.readers.programs.photo_list import relative_names
 from gaussian_wrapping_addon.core.dataset.readers.source_model import SourceModel
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
+from tests.core.dataset.readers.programs import writers
 from tests.core.dataset.readers.programs.known_scene import NAMES, read, shots, write_photos
 
 LENSES = {
