@@ -15,14 +15,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import Delaunay
 
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.evaluation.command import read_cameras
-from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
-from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
+from gaussian_wrapping_addon.core.evaluation.surface_scores import read_truth, score_protocols
 from gaussian_wrapping_addon.core.files import read_json
+from gaussian_wrapping_addon.core.loading.load import load_scene
 from gaussian_wrapping_addon.core.machine import processor_name
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.region import read_region
+from gaussian_wrapping_addon.core.regions.scene_regions import read_region
 
 from .provenance import code_of_tree, versions
 from .runs import THRESHOLD_SHARES

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.pycolmap_import import import_pycolmap
-from gaussian_wrapping_addon.core.kernels.compiled import kernel, part
-from gaussian_wrapping_addon.core.kernels.parallel import even_bounds, run_chunks
+from gaussian_wrapping_addon.core.compiled import kernel, part
+from gaussian_wrapping_addon.core.parallel import even_bounds, run_chunks
+from gaussian_wrapping_addon.core.readers.lenses import import_pycolmap
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .scenes.build import SparsePoints, write_colmap
 from .scenes.cache import CACHE

@@ -23,23 +23,24 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.frames.similarity_fit import umeyama
-from gaussian_wrapping_addon.core.dataset.matching.match_pairs import nearest_pairs
-from gaussian_wrapping_addon.core.dataset.matching.pair_choice import VERIFIED_MATCHES
-from gaussian_wrapping_addon.core.dataset.matching.resemblance import resemblances
-from gaussian_wrapping_addon.core.dataset.photos.gps_exif import read_gps_exif
-from gaussian_wrapping_addon.core.dataset.photos.photo_finder import list_photos
-from gaussian_wrapping_addon.core.dataset.poses.mapping import joined, place_one_by_one
-from gaussian_wrapping_addon.core.dataset.poses.mending import mended
-from gaussian_wrapping_addon.core.dataset.poses.pose_solver import solve_poses
-from gaussian_wrapping_addon.core.dataset.poses.solution_check import check_solution
-from gaussian_wrapping_addon.core.dataset.pycolmap_import import import_pycolmap
-from gaussian_wrapping_addon.core.dataset.readers.source_model import SourceModel
-from gaussian_wrapping_addon.core.evaluation.alignment.pose_error import pose_errors
+from gaussian_wrapping_addon.core.evaluation.alignment import pose_errors
 from gaussian_wrapping_addon.core.files import read_json
-from gaussian_wrapping_addon.core.processes.peak_memory import largest_helper_bytes
+from gaussian_wrapping_addon.core.photos.exif import read_gps_exif
+from gaussian_wrapping_addon.core.photos.finder import list_photos
+from gaussian_wrapping_addon.core.poses.checks import check_solution
+from gaussian_wrapping_addon.core.poses.matching import (
+    VERIFIED_MATCHES,
+    nearest_pairs,
+    resemblances,
+)
+from gaussian_wrapping_addon.core.poses.solver import solve_poses
+from gaussian_wrapping_addon.core.poses.solver_helper import joined, mended, place_one_by_one
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.readers.lenses import import_pycolmap
+from gaussian_wrapping_addon.core.readers.source_model import SourceModel
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.scene.placement import umeyama
+from gaussian_wrapping_addon.core.worker.helper_process import largest_helper_bytes
 
 from . import provenance
 from .camera_places import PLACES, ensure_photos, hall_tracks, write_database

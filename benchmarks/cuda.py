@@ -23,10 +23,9 @@ from torch import Tensor
 if __package__ in (None, ""):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
-from gaussian_wrapping_addon.core.kernels.parallel import default_threads
-from gaussian_wrapping_addon.core.render.cuda.cuda_render import render_with
+from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.render.cuda.device_renderer import render_with
 from gaussian_wrapping_addon.core.render.cuda.kernels import (
     Argument,
     Kernels,
@@ -34,8 +33,8 @@ from gaussian_wrapping_addon.core.render.cuda.kernels import (
     device_kernels,
 )
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.images import Render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .workload import surface_gaussians, view
 

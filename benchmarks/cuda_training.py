@@ -28,19 +28,16 @@ import torch
 if __package__ in (None, ""):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
-from gaussian_wrapping_addon.core.kernels.parallel import default_threads
+from gaussian_wrapping_addon.core.parallel import default_threads
 from gaussian_wrapping_addon.core.render.cuda.kernels import cuda_available
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
-from gaussian_wrapping_addon.core.training.devices.backend import Backend, Shown, counts_of
-from gaussian_wrapping_addon.core.training.devices.chosen import chosen_backend
-from gaussian_wrapping_addon.core.training.losses.device_losses import device_color_loss
-from gaussian_wrapping_addon.core.training.losses.multi_view import (
-    MultiViewOptions,
-    add_image_gradients,
-)
-from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.training.adam import Adam, add_image_gradients
+from gaussian_wrapping_addon.core.training.backend import Backend, Shown, counts_of
+from gaussian_wrapping_addon.core.training.device_backend import chosen_backend
+from gaussian_wrapping_addon.core.training.device_losses import device_color_loss
+from gaussian_wrapping_addon.core.training.multi_view import MultiViewOptions
 
 from .workload import surface_gaussians, view
 

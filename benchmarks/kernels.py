@@ -24,18 +24,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.gaussians.mip_filter import mip_filter
-from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
-from gaussian_wrapping_addon.core.kernels.array_store import ArrayStore
-from gaussian_wrapping_addon.core.kernels.parallel import default_threads
-from gaussian_wrapping_addon.core.render.projection.projection import (
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians, mip_filter
+from gaussian_wrapping_addon.core.parallel import ArrayStore, default_threads
+from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     RawGradients,
     project_backward,
     project_gaussians,
 )
-from gaussian_wrapping_addon.core.render.raster.blend import (
+from gaussian_wrapping_addon.core.render.raster import (
     Images,
     RenderBuffers,
     blend,
@@ -43,14 +40,14 @@ from gaussian_wrapping_addon.core.render.raster.blend import (
     write_intersection_gradients,
 )
 from gaussian_wrapping_addon.core.render.render import project_view
-from gaussian_wrapping_addon.core.render.simd.raster_math import ROW_VALUES, vector_lanes
-from gaussian_wrapping_addon.core.render.tiling.tiles import bin_gaussians
-from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.simd import ROW_VALUES, vector_lanes
+from gaussian_wrapping_addon.core.render.tiles import bin_gaussians
+from gaussian_wrapping_addon.core.render.types import ImageGradients, RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewPass, ViewRenderer
-from gaussian_wrapping_addon.core.training.density.density_control import DensityStatistics
-from gaussian_wrapping_addon.core.training.losses.losses import color_loss, normal_losses
-from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.training.adam import Adam
+from gaussian_wrapping_addon.core.training.density import DensityStatistics
+from gaussian_wrapping_addon.core.training.losses import color_loss, normal_losses
 
 from .provenance import (
     DOCUMENTS,

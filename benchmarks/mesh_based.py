@@ -19,20 +19,19 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.evaluation.command import read_cameras
-from gaussian_wrapping_addon.core.evaluation.layouts.mesh_input import read_mesh
-from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth, read_truth
-from gaussian_wrapping_addon.core.evaluation.views.mesh_based_rendering import (
+from gaussian_wrapping_addon.core.evaluation.layouts import read_mesh
+from gaussian_wrapping_addon.core.evaluation.mesh_based_rendering import (
     MeshBasedSettings,
     PhotoView,
     mesh_based_rendering,
 )
+from gaussian_wrapping_addon.core.evaluation.surface_scores import Truth, read_truth
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.imaging.lpips import lpips_if_ready
+from gaussian_wrapping_addon.core.image_metrics import lpips_if_ready
 from gaussian_wrapping_addon.core.machine import describe_machine
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.scene.scene import load_saved_scene
 
 from .score import stage_folder, test_views, true_mask
 

@@ -20,7 +20,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from gaussian_wrapping_addon.core.kernels.parallel import default_threads
+from gaussian_wrapping_addon.core.parallel import default_threads
 
 from .meshing_runs import Made, Outcome, Plan, carry_out, full_plan, quick_plan
 from .meshing_tables import (

@@ -17,18 +17,15 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
-from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.field.isosurface_residual import isosurface_residuals
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
+from gaussian_wrapping_addon.core.evaluation.surface_scores import read_truth, score_protocols
+from gaussian_wrapping_addon.core.field.isosurface_projection import isosurface_residuals
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.files import finite_json, read_json, write_json
-from gaussian_wrapping_addon.core.kernels.parallel import default_threads
-from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
-from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
-from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.mesh.sampling import distances_to_mesh, sample_triangles
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh, load_mesh
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
+from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.regions.shapes import Region
 
 from .one_mesh import Trained, open_trained
 from .runs import THRESHOLD_SHARES

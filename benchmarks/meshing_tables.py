@@ -16,27 +16,27 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.evaluation.report.plot import Panel, Series, write_svg
-from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
-from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth, read_truth
-from gaussian_wrapping_addon.core.field.depth_samples import sample_depth_maps
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
+from gaussian_wrapping_addon.core.evaluation.report.pictures import Panel, Series, write_svg
+from gaussian_wrapping_addon.core.evaluation.surface_scores import (
+    Truth,
+    read_truth,
+    score_protocols,
+)
+from gaussian_wrapping_addon.core.field.samples import sample_depth_maps
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.files import read_json, write_json
-from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
+from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.mesh.sampling import distances_to_mesh, sample_triangles
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles
-from gaussian_wrapping_addon.core.meshing.checks.mesh_statistics import mesh_statistics
+from gaussian_wrapping_addon.core.meshing.checks import mesh_statistics
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.automatic_region import automatic_region
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.region import parse_region
+from gaussian_wrapping_addon.core.regions.scene_regions import automatic_region, parse_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
 from gaussian_wrapping_addon.core.settings import SPACINGS, MeshingSettings
 
 from .meshing_runs import (

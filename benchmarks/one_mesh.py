@@ -13,31 +13,28 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.scene import Scene
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.errors import MeshingError, ResourceError
-from gaussian_wrapping_addon.core.field.depth_samples import sample_depth_maps
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.samples import sample_depth_maps
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
+from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.kernels.parallel import default_threads
-from gaussian_wrapping_addon.core.mesh.mesh_file import save_mesh
-from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.cleanup.clean_up import clean_up
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh, save_mesh
+from gaussian_wrapping_addon.core.meshing.clean_up import clean_up
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import mesh_by_pivots
-from gaussian_wrapping_addon.core.meshing.points.candidate_surface import MARGIN_SHARE
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
-from gaussian_wrapping_addon.core.processes.peak_memory import largest_helper_bytes, own_peak_bytes
+from gaussian_wrapping_addon.core.meshing.surface_points import MARGIN_SHARE
+from gaussian_wrapping_addon.core.parallel import default_threads
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.automatic_region import automatic_region
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.region import read_region
+from gaussian_wrapping_addon.core.regions.scene_regions import automatic_region, read_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.scene.scene import Scene, load_saved_scene
 from gaussian_wrapping_addon.core.settings import MeshingSettings
+from gaussian_wrapping_addon.core.worker.helper_process import largest_helper_bytes, own_peak_bytes
 
 from .meshing_runs import FUSION, MEASURED, MESH, METHODS, PAM, TETRAHEDRA, Method
 from .score import mesh_scene, stage_folder

@@ -20,33 +20,30 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
-from gaussian_wrapping_addon.core.dataset.scene import Scene
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.evaluation.command import read_cameras
-from gaussian_wrapping_addon.core.evaluation.surface.field_errors import (
-    depth_errors,
-    vacancy_errors,
+from gaussian_wrapping_addon.core.evaluation.field_errors import depth_errors, vacancy_errors
+from gaussian_wrapping_addon.core.evaluation.mesh_rendering import render_views
+from gaussian_wrapping_addon.core.evaluation.surface_scores import (
+    Truth,
+    read_truth,
+    score_protocols,
 )
-from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
-from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth, read_truth
-from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.files import finite_json, read_json, write_json
-from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
+from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.imaging.lpips import lpips_if_ready
-from gaussian_wrapping_addon.core.imaging.view_metrics import score_images
-from gaussian_wrapping_addon.core.jobs.stages.region_field import field_views
+from gaussian_wrapping_addon.core.image_metrics import lpips_if_ready, score_images
+from gaussian_wrapping_addon.core.jobs.stages.meshing import field_views
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import AtlasMaps, TexturedMesh
+from gaussian_wrapping_addon.core.photos.store import PhotoStore
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
-from gaussian_wrapping_addon.core.texture.files.file_checks import atlas_file
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, load_saved_scene
+from gaussian_wrapping_addon.core.texture.file_checks import atlas_file
 
 from .runs import THRESHOLD_SHARES
 

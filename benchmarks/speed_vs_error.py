@@ -18,17 +18,14 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
-from gaussian_wrapping_addon.core.evaluation.report.plot import Panel, Series, write_svg
-from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import (
-    BACKGROUND,
-    TexturedRenderer,
-)
+from gaussian_wrapping_addon.core.evaluation.mesh_rendering import BACKGROUND, TexturedRenderer
+from gaussian_wrapping_addon.core.evaluation.report.pictures import Panel, Series, write_svg
+from gaussian_wrapping_addon.core.evaluation.surface_scores import read_truth
 from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
-from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
+from gaussian_wrapping_addon.core.mesh.sampling import distances_to_mesh
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.scene.scene import load_saved_scene
 
 from .alpha_shape import make_alpha
 from .provenance import write_page

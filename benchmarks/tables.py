@@ -12,7 +12,7 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
-from gaussian_wrapping_addon.core.evaluation.surface.scores import MIN_THIN_SHARE
+from gaussian_wrapping_addon.core.evaluation.surface_scores import MIN_THIN_SHARE
 
 from .runs import THRESHOLD_SHARES
 

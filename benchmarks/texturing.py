@@ -23,23 +23,21 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
-from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.evaluation.views.held_out_texture import bake_held_out_texture
-from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
-from gaussian_wrapping_addon.core.evaluation.views.side_by_side import write_side_by_side
-from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import TexturedRenderer
+from gaussian_wrapping_addon.core.evaluation.mesh_based_rendering import bake_held_out_texture
+from gaussian_wrapping_addon.core.evaluation.mesh_rendering import TexturedRenderer, render_views
+from gaussian_wrapping_addon.core.evaluation.photo_views import write_side_by_side
+from gaussian_wrapping_addon.core.evaluation.surface_scores import read_truth
 from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.limits import MAX_IMAGE_SIDE_PX
-from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
-from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh, load_mesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
+from gaussian_wrapping_addon.core.photos.store import PhotoStore
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.scene.scene import load_saved_scene
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.atlas import raster_atlas
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 
 from .known_texture import (
@@ -338,7 +336,7 @@ def _grey(points: np.ndarray) -> np.ndarray:
 
 
 def _uneven(threads: int) -> list[str]:
-    from gaussian_wrapping_addon.core.texture.bake import bake
+    from gaussian_wrapping_addon.core.texture import bake
 
     _logger.info("uneven photos")
     lines = [

@@ -17,13 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.field.vacancy.brute_force import brute_force_vacancy
-from gaussian_wrapping_addon.core.field.vacancy.cuda_vacancy import CudaVacancyField
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import SETTLED, VacancyField
+from gaussian_wrapping_addon.core.field.cuda_vacancy import CudaVacancyField
+from gaussian_wrapping_addon.core.field.vacancy import SETTLED, VacancyField, brute_force_vacancy
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
-from gaussian_wrapping_addon.core.kernels.parallel import default_threads
+from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .workload import DISTANCE, surface_gaussians
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .core.log_lines import TerminalHandler
+    from .core.progress import TerminalHandler
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -47,7 +47,7 @@ def _run(arguments: list[str], program: str) -> int:
     from .command_line.options.option_names import with_option_name
     from .command_line.parser import build_parser
     from .core.errors import EXIT_OTHER, SettingError, WrapError, known_error
-    from .core.processes.worker_environment import interpreter_of, ready_worker
+    from .core.worker.environment import interpreter_of, ready_worker
 
     try:
         options = build_parser(program).parse_args(arguments)
@@ -82,7 +82,7 @@ def console_entry() -> int:
 @contextlib.contextmanager
 def _shown_in_terminal() -> Iterator[TerminalHandler]:
     """Write what the commands log to stdout, and nowhere else, while the block runs."""
-    from .core.log_lines import LineFormatter, TerminalHandler
+    from .core.progress import LineFormatter, TerminalHandler
 
     handler = TerminalHandler(sys.stdout)
     handler.setFormatter(LineFormatter("%(message)s"))

@@ -10,86 +10,90 @@ from typing import Any, Final
 import bpy
 
 from . import batch
-from .ops import cli_command
-from .ops.cameras import camera_operators
-from .ops.common import background
-from .ops.computers import computers_operators, farm_calls, part_watch
-from .ops.dataset import input_operators
-from .ops.export import export_operators
-from .ops.jobs import job_attach, job_operators, job_timer, live_points, live_preview
-from .ops.masks import mask_operators, mask_review
-from .ops.meshing import bake_operators, region_estimate, region_list_operators
-from .ops.placement import placement, placement_operators
-from .ops.presets import preset_operators
-from .ops.regions import region_operators, region_watch
-from .ops.results import import_operators, report_operators
-from .ops.training import training_estimate, training_operators
-from .ops.worker import worker_check_operators, worker_setup, worker_setup_operators
-from .ui import preferences, properties
-from .ui.baking import bake_panel, bake_properties
-from .ui.computers import computers_panel, computers_properties
-from .ui.dataset import dataset_panel
-from .ui.jobs import points_drawing, status_bar
-from .ui.meshing import mesh_panel, texture_panel
-from .ui.placement import scene_panel
-from .ui.presets import preset_menu
-from .ui.regions import region_drawing, region_gizmo, region_panel, region_properties
-from .ui.results import report_panel, result_panel
-from .ui.training import train_advanced_panel, train_panel, training_properties
+from .ops import (
+    background,
+    baking,
+    cameras,
+    cli_command,
+    computers,
+    dataset,
+    export,
+    job_timer,
+    jobs,
+    masks,
+    meshing,
+    placement,
+    presets,
+    region_operators,
+    results,
+    training,
+    worker_setup,
+)
+from .ui import (
+    computers_panel,
+    dataset_panel,
+    job_view,
+    mesh_panel,
+    preferences,
+    properties,
+    region_panel,
+    result_panel,
+    training_panel,
+)
 from .ui.translations import table
 
 _logger = logging.getLogger(__name__)
 
 CLASSES: Final[tuple[type, ...]] = (
-    *training_properties.CLASSES,
-    *bake_properties.CLASSES,
-    *computers_properties.CLASSES,
+    *training_panel.TRAINING_PROPERTIES_CLASSES,
+    *mesh_panel.BAKE_PROPERTIES_CLASSES,
+    *computers_panel.COMPUTERS_PROPERTIES_CLASSES,
     *properties.CLASSES,
-    *region_properties.CLASSES,
+    *region_panel.REGION_PROPERTIES_CLASSES,
     *preferences.CLASSES,
-    *input_operators.CLASSES,
-    *worker_setup_operators.CLASSES,
-    *job_operators.CLASSES,
-    *worker_check_operators.CLASSES,
+    *dataset.CLASSES,
+    *worker_setup.WORKER_SETUP_OPERATORS_CLASSES,
+    *jobs.CLASSES,
+    *worker_setup.WORKER_CHECK_OPERATORS_CLASSES,
     *region_operators.CLASSES,
-    *region_list_operators.CLASSES,
-    *mask_operators.CLASSES,
-    *bake_operators.CLASSES,
-    *computers_operators.CLASSES,
-    *import_operators.CLASSES,
-    *export_operators.CLASSES,
-    *camera_operators.CLASSES,
-    *placement_operators.CLASSES,
-    *report_operators.CLASSES,
-    *training_operators.CLASSES,
-    *preset_operators.CLASSES,
-    *preset_menu.CLASSES,
+    *meshing.CLASSES,
+    *masks.CLASSES,
+    *baking.CLASSES,
+    *computers.CLASSES,
+    *results.IMPORT_OPERATORS_CLASSES,
+    *export.CLASSES,
+    *cameras.CLASSES,
+    *placement.CLASSES,
+    *results.REPORT_OPERATORS_CLASSES,
+    *training.CLASSES,
+    *presets.CLASSES,
+    *training_panel.PRESET_MENU_CLASSES,
     *dataset_panel.CLASSES,
-    *train_panel.CLASSES,
-    *train_advanced_panel.CLASSES,
-    *computers_panel.CLASSES,
-    *region_panel.CLASSES,
-    *mesh_panel.CLASSES,
-    *texture_panel.CLASSES,
-    *bake_panel.CLASSES,
-    *result_panel.CLASSES,
-    *region_gizmo.CLASSES,
-    *report_panel.CLASSES,
-    *scene_panel.CLASSES,
+    *training_panel.TRAIN_PANEL_CLASSES,
+    *training_panel.TRAIN_ADVANCED_PANEL_CLASSES,
+    *computers_panel.COMPUTERS_PANEL_CLASSES,
+    *region_panel.REGION_PANEL_CLASSES,
+    *mesh_panel.MESH_PANEL_CLASSES,
+    *mesh_panel.TEXTURE_PANEL_CLASSES,
+    *mesh_panel.BAKE_PANEL_CLASSES,
+    *result_panel.RESULT_PANEL_CLASSES,
+    *region_panel.REGION_GIZMO_CLASSES,
+    *result_panel.REPORT_PANEL_CLASSES,
+    *result_panel.SCENE_PANEL_CLASSES,
 )
 
 HANDLERS: Final[tuple[tuple[str, Callable[..., None]], ...]] = (
     ("load_pre", background.before_load),
-    ("load_post", job_attach.after_load),
+    ("load_post", jobs.after_load),
     ("load_post", placement.after_load),
-    ("load_post", region_watch.after_load),
-    ("undo_post", job_attach.after_undo),
-    ("redo_post", job_attach.after_undo),
+    ("load_post", region_operators.after_load),
+    ("undo_post", jobs.after_undo),
+    ("redo_post", jobs.after_undo),
     ("undo_post", placement.after_undo),
     ("redo_post", placement.after_undo),
-    ("undo_post", region_watch.after_load),
-    ("redo_post", region_watch.after_load),
-    ("depsgraph_update_post", region_watch.after_update),
+    ("undo_post", region_operators.after_load),
+    ("redo_post", region_operators.after_load),
+    ("depsgraph_update_post", region_operators.after_update),
 )
 
 
@@ -104,12 +108,12 @@ def register() -> None:
         for name, handler in HANDLERS:
             getattr(bpy.app.handlers, name).append(handler)
         table.register()
-        region_drawing.VIEW.start()
-        points_drawing.VIEW.start()
-        status_bar.start()
+        region_panel.VIEW.start()
+        job_view.VIEW.start()
+        job_view.start()
         cli_command.register(batch.main)
         # While Blender starts, scripts may not see the open file yet.
-        background.watch(job_attach.attach_later)
+        background.watch(jobs.attach_later)
     except Exception:
         unregister()
         raise
@@ -117,20 +121,20 @@ def register() -> None:
 
 def unregister() -> None:
     """Unregister everything that is registered; workers continue and are found again."""
-    worker_setup.stop()
-    training_estimate.forget()
-    region_estimate.stop()
-    region_drawing.VIEW.stop()
-    points_drawing.VIEW.stop()
-    status_bar.stop()
-    region_gizmo.stop()
-    region_watch.forget()
-    job_timer.forget_all()
-    live_preview.stop()
-    mask_review.stop()
-    live_points.stop()
-    part_watch.stop()
-    farm_calls.stop()
+    worker_setup.stop_setup()
+    training.forget()
+    meshing.stop()
+    region_panel.VIEW.stop()
+    job_view.VIEW.stop()
+    job_view.stop()
+    region_panel.stop()
+    region_operators.forget()
+    job_timer.forget_all_jobs()
+    job_timer.stop()
+    masks.stop()
+    job_timer.stop_points()
+    computers.stop_watching()
+    computers.stop()
     background.stop()  # last of these: what they end is ended by its threads
     cli_command.unregister()
     table.unregister()

@@ -23,7 +23,7 @@ _DATA = "GAUSSIAN_WRAPPING_DATA"
 
 _folder = tempfile.mkdtemp(prefix="gwrap-data-")
 os.environ[_DATA] = _folder
-# As in workers (core/processes/spawn.py), before anything imports numpy.
+# As in workers (core/worker/spawn.py), before anything imports numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 atexit.register(shutil.rmtree, _folder, ignore_errors=True)
 

@@ -29,7 +29,7 @@ from gaussian_wrapping_addon.core.settings import (
     preset,
     to_json,
 )
-from gaussian_wrapping_addon.core.settings.saved_settings import write_saved_settings
+from gaussian_wrapping_addon.core.settings.job import write_saved_settings
 
 BATCH = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon" / "batch.py"
 

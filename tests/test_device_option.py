@@ -21,12 +21,16 @@ from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.jobs import runner
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.commands import device_check
-from gaussian_wrapping_addon.core.jobs.parts import part_runner
-from gaussian_wrapping_addon.core.jobs.stages.mesh_keys import mesh_key
-from gaussian_wrapping_addon.core.jobs.store.bake_request import BakeRequest
-from gaussian_wrapping_addon.core.jobs.store.job_file import make_bake_job, make_job, read_job
+from gaussian_wrapping_addon.core.jobs.parts import runner as part_runner
+from gaussian_wrapping_addon.core.jobs.stages.meshing import mesh_key
+from gaussian_wrapping_addon.core.jobs.store.job_file import (
+    BakeRequest,
+    make_bake_job,
+    make_job,
+    read_job,
+    training_keys,
+)
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
 from gaussian_wrapping_addon.core.jobs.worker import _log_to
 from gaussian_wrapping_addon.core.settings import JobSettings, declared
 from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere

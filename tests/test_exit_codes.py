@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon import batch
-from gaussian_wrapping_addon.core.dataset.loading import check
 from gaussian_wrapping_addon.core.errors import (
     EXIT_BAD_DATA,
     EXIT_RESOURCES,
@@ -22,6 +21,7 @@ from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.loading import check
 from gaussian_wrapping_addon.core.names import JOB_MARKER
 from gaussian_wrapping_addon.core.settings import JobSettings
 

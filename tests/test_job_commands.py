@@ -20,13 +20,9 @@ from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs import client as client_module
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
-    JobFolder,
-    JobStatus,
-    process_start_ticks,
-)
-from gaussian_wrapping_addon.core.processes.process_identity import process_alive
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
 from gaussian_wrapping_addon.core.settings import JobSettings
+from gaussian_wrapping_addon.core.worker.spawn import process_alive, process_start_ticks
 
 # A worker that works until it is told to stop, and then for ``deaf_s``.
 WORKER = """

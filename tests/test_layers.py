@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The map of docs/architecture.md: imports of the same or earlier folders only, no circles."""
+"""The map of docs/architecture.md: imports of the same or earlier groups only, no circles."""
 
 from __future__ import annotations
 
@@ -14,42 +14,14 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon"
 CORE = PACKAGE / "core"
 
-# A file imports its own folder and folders listed earlier in FOLDERS, never later ones.
-FOLDERS = (
-    "core",
-    "core/settings", "core/ply", "core/kernels", "core/processes", "core/imaging",
-    "core/dataset", "core/dataset/frames", "core/dataset/photos", "core/dataset/video",
-    "core/dataset/readers", "core/dataset/readers/programs", "core/dataset/lenses",
-    "core/dataset/matching", "core/dataset/poses", "core/dataset/panoramas", "core/dataset/units",
-    "core/dataset/loading", "core/dataset/quality",
-    "core/mesh", "core/mesh/exchange", "core/stereo", "core/stereo/plain", "core/gaussians",
-    "core/regions", "core/mesh/simplification",
-    "core/render/types", "core/render/simd", "core/render/projection", "core/render/tiling",
-    "core/render/isosurface", "core/render/raster", "core/render/query", "core/render/reference",
-    "core/render/cuda", "core/render", "core/devices",
-    "core/field/vacancy", "core/field",
-    "core/training/optimizer", "core/training/losses", "core/training/density",
-    "core/training/appearance", "core/training/poses", "core/training/selection",
-    "core/training/initialisation", "core/training/devices",
-    "core/training", "core/training/blocks", "core/training/cost", "core/masks",
-    "core/meshing/tetrahedra", "core/meshing/points", "core/meshing/cleanup",
-    "core/meshing/checks", "core/meshing", "core/meshing/tiles", "core/meshing/cost",
-    "core/texture/atlas", "core/texture/unwrap", "core/texture/bake", "core/texture/cost",
-    "core/texture/files", "core/texture/detail", "core/texture",
-    "core/evaluation/surface", "core/evaluation/alignment", "core/evaluation/layouts",
-    "core/evaluation/color_field", "core/evaluation/views", "core/evaluation/report",
-    "core/evaluation",
-    "core/cluster", "core/jobs/store", "core/jobs/video", "core/jobs/stages", "core/jobs/masking",
-    "core/jobs/training", "core/jobs/baking", "core/jobs/parts", "core/jobs",
-    "core/jobs/commands", "core/jobs/commands/farm", "core/setup", "core/farm",
-    "ops/common", "ops/cameras", "ops/regions", "ops/placement", "ops/results", "ops/baking",
-    "ops/export",
-    "ops/worker", "ops/jobs", "ops/computers", "ops/presets", "ops/training", "ops/dataset",
-    "ops/meshing", "ops/masks", "ops",
-    "ui/translations", "ui/common", "ui/worker", "ui/jobs", "ui/presets", "ui/dataset",
-    "ui/training", "ui/computers", "ui/masks", "ui/regions", "ui/meshing", "ui/baking",
-    "ui/results", "ui/placement", "ui",
-    "command_line/options", "command_line/farm", "command_line", "",
+# A file imports its own group and groups listed earlier, never later ones. A group is a folder of
+# the package or of ``core`` with all below it; within a group no modules import each other.
+GROUPS = (
+    "core", "core/settings", "core/worker", "core/scene", "core/photos", "core/readers",
+    "core/gaussians", "core/render", "core/regions", "core/stereo", "core/devices", "core/poses",
+    "core/units", "core/loading", "core/mesh", "core/field", "core/training", "core/masks",
+    "core/meshing", "core/texture", "core/evaluation", "core/farm", "core/jobs", "ops", "ui",
+    "command_line", "",
 )  # fmt: skip
 
 # What a part may not import although it is listed earlier: part -> parts.
@@ -58,17 +30,16 @@ KEPT_APART = {
     "evaluation": {"training"},
 }  # fmt: skip
 
-MOST_MODULES = 12
-"""Modules of a folder, ``__init__.py`` not counted."""
+MOST_FOLDERS = 45
+MOST_LEVELS = 3
+"""Folders below the package, one in another."""
 
 # Blender's own process has only the standard library and numpy: what it loads may import no more.
 BLENDER_SIDE = (
-    "core.jobs.client", "core.jobs.commands.run_in_worker",
-    "core.jobs.commands.evaluate_command", "core.jobs.store.job_file",
-    "core.dataset.loading.check", "core.settings", "core.setup.install",
-    "core.processes.worker_environment", "core.regions.box", "core.regions.region_file",
-    "core.names", "core.gaussians.preview_points",
-    "core.jobs.parts.planning", "core.farm.part_states",
+    "core.jobs.client", "core.jobs.commands.run_in_worker", "core.jobs.commands.evaluate_command",
+    "core.jobs.store.job_file", "core.loading.check", "core.settings", "core.jobs.install",
+    "core.worker.environment", "core.regions.box", "core.regions.files", "core.names",
+    "core.gaussians.preview_points", "core.jobs.parts.graph", "core.jobs.parts.states",
 )  # fmt: skip
 HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl", "av")
 
@@ -108,28 +79,24 @@ def modules_named(package: Path, path: Path) -> list[str]:
     return found
 
 
-def folder_of(module: str) -> str:
-    """Return the folder of a module's path, ``""`` for the package's own files.
-
-    A package's ``__init__`` stands for the folder it opens.
-    """
-    parent = str(PurePosixPath(module).parent)
-    return "" if parent == "." else parent
+def group_of(module: str) -> str:
+    """Return the group of a module's path, ``""`` for the package's own files."""
+    parts = PurePosixPath(module).parent.parts
+    return "/".join(parts[: 2 if parts[:1] == ("core",) else 1])
 
 
 def upward(package: Path, order: Iterable[str]) -> list[str]:
-    """Return the imports of later folders, and those of or from folders that have no place."""
-    place = {folder: k for k, folder in enumerate(order)}
+    """Return the imports of later groups, and those of or from folders that have no place."""
+    place = {group: k for k, group in enumerate(order)}
     wrong = []
     for path in python_files(package):
         me = path.relative_to(package).with_suffix("").as_posix()
-        mine = folder_of(me)
+        mine = group_of(me)
         if mine not in place:
-            wrong.append(f"{mine} has no place in FOLDERS")
+            wrong.append(f"{mine} has no place in GROUPS")
             continue
         for module in modules_named(package, path):
-            other = folder_of(module)
-            if place.get(other, len(place)) > place[mine]:
+            if place.get(group_of(module), len(place)) > place[mine]:
                 wrong.append(f"{me} imports {module}")
     return wrong
 
@@ -167,11 +134,11 @@ def circles(package: Path) -> list[list[str]]:
 
 
 def test_imports_run_down() -> None:
-    assert upward(PACKAGE, FOLDERS) == []
+    assert upward(PACKAGE, GROUPS) == []
 
 
-def test_every_folder_of_the_plan_exists() -> None:
-    assert [folder for folder in FOLDERS if not (PACKAGE / folder / "__init__.py").is_file()] == []
+def test_every_group_exists() -> None:
+    assert [group for group in GROUPS if not (PACKAGE / group / "__init__.py").is_file()] == []
 
 
 def test_no_circles() -> None:
@@ -189,12 +156,13 @@ def test_parts_that_are_kept_apart() -> None:
     assert wrong == []
 
 
-def test_folders_are_small_and_say_what_they_are_for() -> None:
+def test_folders_are_few_and_say_what_they_are_for() -> None:
+    folders = {path.parent for path in python_files(PACKAGE)}
+    assert len(folders) <= MOST_FOLDERS
     wrong = []
-    for folder in {path.parent for path in python_files(PACKAGE)}:
-        count = sum(path.name != "__init__.py" for path in folder.glob("*.py"))
-        if count > MOST_MODULES:
-            wrong.append(f"{folder.name} has {count} modules")
+    for folder in folders:
+        if len(folder.relative_to(PACKAGE).parts) > MOST_LEVELS:
+            wrong.append(f"{folder.relative_to(PACKAGE)} is too deep")
         first = folder / "__init__.py"
         if not first.is_file() or not ast.get_docstring(ast.parse(first.read_text("utf-8"))):
             wrong.append(f"{folder.name} does not say what lives there")
@@ -225,8 +193,8 @@ def test_arrows_and_circles_are_found(tmp_path: Path) -> None:
     ]
     assert circles(package) == [["high/b", "low/a"]]
     assert upward(package, ("low", "")) == [
-        "high has no place in FOLDERS",
-        "high has no place in FOLDERS",
+        "high has no place in GROUPS",
+        "high has no place in GROUPS",
         "low/a imports high/b",
     ]
 

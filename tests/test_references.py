@@ -250,7 +250,7 @@ def test_the_map_is_the_longest_list_of_folders() -> None:
     ("text", "wrong"),
     [
         (":func:`walk`, :class:`Ray`, :meth:`.Ray.at`, :attr:`Ray.t`", 0),
-        (":mod:`.ray` :mod:`..render.ray` :class:`~.ray.Ray` :data:`~.ray.LIMIT`", 0),
+        (":mod:`.ray` :mod:`.render.ray` :class:`~.ray.Ray` :data:`~.ray.LIMIT`", 0),
         (":func:`pkg.trace.walk` :mod:`numpy.linalg`", 0),
         (":func:`the walk <walk>`", 0),
         (":func:`run`", 1),

@@ -4,7 +4,7 @@
     python -m tools.worker_hashes [--extras]
 
 Run it from the root of the repository after ``requirements-worker.txt`` was changed, or with
-``--extras`` after the table of extras (``core/processes/worker_extras.py``) was: then a list for
+``--extras`` after the table of extras (``core/worker/environment.py``) was: then a list for
 each extra is written, and the main list stays as it is. uv resolves
 the list for Python 3.11 to 3.13 on all systems at once and takes the hashes from the package index.
 torch is left out, with what its builds for CUDA bring: the build for the processor comes from
@@ -20,7 +20,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from gaussian_wrapping_addon.core.processes.worker_extras import EXTRA_HASHES_NAME, EXTRAS
+from gaussian_wrapping_addon.core.worker.environment import EXTRA_HASHES_NAME, EXTRAS
 
 ROOT = Path(__file__).resolve().parents[1]
 WANTED = ROOT / "requirements-worker.txt"

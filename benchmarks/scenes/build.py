@@ -12,11 +12,10 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.region import write_region
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
 
 from .catalogue import THIN_SHARE, SceneContent, SceneKind, scene_content, scene_kind
 from .geometry import (

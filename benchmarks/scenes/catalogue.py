@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .geometry import Part, around_thing, box, cone, icosphere, inside_room, read_obj, scaled_to
 from .rendering import Light, union_of

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ParseError, ResourceError
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ResourceError, UsageError
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .geometry import SHARP_DEGREES, Part
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 
 from ..scenes.rendering import Light
 from . import places, things

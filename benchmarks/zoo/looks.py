@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from ..scenes.geometry import Part, icosphere
 from ..scenes.rendering import (

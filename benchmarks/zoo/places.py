@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from ..scenes.geometry import PRINCIPAL_POINT, Part, box, cone, icosphere, inside_room, look_at
 from . import shapes

@@ -20,10 +20,10 @@ from scipy import ndimage
 from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ResourceError, WorkerError
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.regions.region import write_region
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from ..scenes.build import (
     MIN_TRACK,

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import binary_erosion, binary_fill_holes
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
-from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
+from gaussian_wrapping_addon.core.evaluation.surface_scores import read_truth
 from gaussian_wrapping_addon.core.files import finite_json, read_json
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.scene.scene import load_saved_scene
 
 from ..alpha_shape import make_alpha
 from ..provenance import RECORDS, write_page

@@ -31,7 +31,7 @@ def _texture_options() -> list[Declaration]:
 
 def add_bake(commands: Commands) -> None:
     """Add ``bake``."""
-    from ..core.export_formats import RESULT_FORMATS
+    from ..core.names import RESULT_FORMATS
     from ..core.settings import UP_AXES, UV_CHOICES
 
     parser = commands.add_parser(
@@ -93,12 +93,9 @@ def _bake(options: Namespace) -> int:
 
     from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
-    from ..core.jobs.store.bake_request import BakeRequest
-    from ..core.jobs.store.continue_training import no_finished_training
-    from ..core.jobs.store.job_file import make_bake_job
-    from ..core.jobs.store.job_folder import JobFolder
-    from ..core.jobs.store.rollback import finished_job
-    from ..core.jobs.store.stage_folder import read_done
+    from ..core.jobs.store.job_file import BakeRequest, make_bake_job
+    from ..core.jobs.store.job_folder import JobFolder, read_done
+    from ..core.jobs.store.rollback import finished_job, no_finished_training
     from ..core.settings import JobSettings, TextureSettings
 
     texture = TextureSettings(**_texture(options))

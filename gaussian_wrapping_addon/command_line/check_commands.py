@@ -27,10 +27,10 @@ def add_check(commands: Commands) -> None:
 
 
 def _check(options: Namespace) -> int:
-    from ..core.dataset.loading.check import check_input
-    from ..core.dataset.loading.source_kind import WITHOUT_PHOTOS
     from ..core.errors import EXIT_BAD_DATA, EXIT_DONE
     from ..core.jobs.client import worker_if_any
+    from ..core.loading.check import check_input
+    from ..core.loading.source_kind import WITHOUT_PHOTOS
 
     findings = check_input(options.input, worker=worker_if_any())
     for finding in findings:

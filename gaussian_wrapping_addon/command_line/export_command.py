@@ -15,7 +15,7 @@ _logger = logging.getLogger("gaussian_wrapping")
 
 def add_export(commands: Commands) -> None:
     """Add ``export``."""
-    from ..core.export_formats import BLENDER_FORMATS, EXPORT_FORMATS, SHADINGS
+    from ..core.names import BLENDER_FORMATS, EXPORT_FORMATS, SHADINGS
 
     parser = commands.add_parser(
         "export", help="export meshes of a finished job for other programs"
@@ -48,11 +48,11 @@ def add_export(commands: Commands) -> None:
 
 def _export(options: Namespace) -> int:
     from ..core.errors import UsageError
-    from ..core.export_formats import BLENDER_FORMATS, EXPORT_FORMATS
     from ..core.files import real_path
     from ..core.jobs.client import worker_python
     from ..core.jobs.commands.export_files import result_of
     from ..core.jobs.commands.run_in_worker import run_in_worker
+    from ..core.names import BLENDER_FORMATS, EXPORT_FORMATS
 
     formats = list(dict.fromkeys(f for f in options.format.split(",") if f))
     wrong = [f for f in formats if f not in EXPORT_FORMATS]
@@ -83,8 +83,7 @@ def _export(options: Namespace) -> int:
         if code:
             return code
     if by_blender:
-        from ..ops.export.export_objects import ObjectExport
-        from ..ops.export.export_result import export_result
+        from ..ops.export import ObjectExport, export_result
 
         requests = [ObjectExport(f, out, options.placed, options.pack) for f in by_blender]
         paths = export_result(
@@ -108,8 +107,7 @@ def add_convert_region(commands: Commands) -> None:
 
 def _convert_region(options: Namespace) -> int:
     from ..core.errors import EXIT_DONE, UsageError
-    from ..core.regions.region_file import read_region_file, write_region_file
-    from ..core.regions.rsbox import SUFFIXES
+    from ..core.regions.files import SUFFIXES, read_region_file, write_region_file
 
     output: Path = options.output
     if output.suffix.lower() not in (".json", *SUFFIXES):

@@ -30,7 +30,7 @@ def has_bpy() -> bool:
 def require_bpy(job: JobFile, options: Namespace) -> None:
     """Raise before the job starts if its Blender files could not be written without bpy."""
     from ..core.errors import UsageError
-    from ..core.export_formats import BLENDER_FORMATS
+    from ..core.names import BLENDER_FORMATS
 
     wants = not options.no_blend or bool(set(job.settings.export) & set(BLENDER_FORMATS))
     if wants and not has_bpy():
@@ -43,7 +43,7 @@ def require_bpy(job: JobFile, options: Namespace) -> None:
 def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
     """Show progress until the worker ends; then write the Blender files. Return the exit code."""
     from ..core.errors import EXIT_DONE
-    from ..core.jobs.store.blend_file import result_state
+    from ..core.jobs.store.job_folder import result_state
 
     before = result_state(client.folder.result)  # the worker replaces it at its end
     code = watch(client)
@@ -55,7 +55,7 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
 def watch(client: JobClient) -> int:
     """Show progress until the worker ends; return the exit code."""
     from ..core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER
-    from ..core.jobs.store.blend_file import result_state
+    from ..core.jobs.store.job_folder import result_state
 
     before = result_state(client.folder.result)
     shown_s, shown, interrupted_s = 0.0, ("", ""), 0.0
@@ -98,12 +98,12 @@ def watch(client: JobClient) -> int:
 
 def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Namespace) -> int:
     """Write the Blender files; a ``scene.blend`` of the result ``before`` is renamed."""
-    from ..core.jobs.store.blend_file import NAME, back_up_stale_blend
+    from ..core.jobs.store.job_folder import NAME, back_up_stale_blend
 
     if options.no_blend:
         back_up_stale_blend(result, before)
     else:
-        from ..ops.results.blend_writer import write_blend
+        from ..ops.scene_objects import write_blend
 
         try:
             write_blend(result, result / NAME)
@@ -111,7 +111,7 @@ def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Names
             back_up_stale_blend(result, before)
             raise
     if "usd" in job.settings.export:
-        from ..ops.results.blend_writer import export_usd
+        from ..ops.scene_objects import export_usd
 
         export_usd(result)
     from ..core.evaluation.report.report import headline

@@ -112,9 +112,7 @@ def add_parts(commands: Commands) -> None:
 def _parts(options: Namespace) -> int:
     from ..core.errors import EXIT_DONE, ParseError
     from ..core.files import real_path
-    from ..core.jobs.parts.graph import PARTS_NAME
-    from ..core.jobs.parts.part_state import read_state
-    from ..core.jobs.parts.planning import plan_if_missing
+    from ..core.jobs.parts.graph import PARTS_NAME, plan_if_missing, read_state
     from ..core.jobs.store.job_folder import JobFolder
 
     root = real_path(options.out)

@@ -34,11 +34,9 @@ def _mesh(options: Namespace) -> int:
     from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
     from ..core.jobs.commands.device_check import require_device
-    from ..core.jobs.store.continue_training import no_finished_training
     from ..core.jobs.store.job_file import make_job
-    from ..core.jobs.store.job_folder import JobFolder
-    from ..core.jobs.store.rollback import finished_job
-    from ..core.jobs.store.stage_folder import read_done
+    from ..core.jobs.store.job_folder import JobFolder, read_done
+    from ..core.jobs.store.rollback import finished_job, no_finished_training
 
     folder = JobFolder(real_path(options.out))
     earlier = finished_job(folder)

@@ -15,13 +15,7 @@ from .farm_commands import add_farm
 from .job_commands import add_cancel, add_parts, add_run_part, add_status
 from .meshing_commands import add_estimate_mesh, add_mesh
 from .setup_command import add_set_up_worker
-from .training_commands import (
-    add_continue_training,
-    add_estimate,
-    add_queue,
-    add_resume,
-    add_wrap,
-)
+from .training_commands import add_continue_training, add_estimate, add_queue, add_resume, add_wrap
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -72,7 +66,7 @@ class Parser(ArgumentParser):
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """Write help as the commands write: ``argparse`` fails on ASCII and hides full disks."""
-        from ..core.log_lines import TerminalHandler
+        from ..core.progress import TerminalHandler
 
         for handler in _logger.handlers:
             if isinstance(handler, TerminalHandler):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from .common import Commands
 
 if TYPE_CHECKING:
-    from ..core.setup.commands import SetupRequest
+    from ..core.jobs.install import SetupRequest
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -61,21 +61,14 @@ def add_set_up_worker(commands: Commands) -> None:
 
 
 def _extras_help() -> str:
-    from ..core.processes.worker_extras import EXTRAS
+    from ..core.worker.environment import EXTRAS
 
     return "; ".join(f"{extra.name}: {extra.purpose}" for extra in EXTRAS)
 
 
 def _set_up_worker(options: Namespace) -> int:
     from ..core.errors import EXIT_DONE, UsageError
-    from ..core.processes.worker_environment import (
-        WorkerEnvironment,
-        default_root,
-        known_environments,
-    )
-    from ..core.processes.worker_extras import read_extra_names
-    from ..core.processes.worker_requirements import read_requirements, requirements_file
-    from ..core.setup.commands import (
+    from ..core.jobs.install import (
         CPU,
         CUDA_BRINGS,
         SetupRequest,
@@ -83,9 +76,18 @@ def _set_up_worker(options: Namespace) -> int:
         as_line,
         check_folders,
         cuda_present,
+        find_pythons,
+        probe,
+        remove,
     )
-    from ..core.setup.install import remove
-    from ..core.setup.pythons import find_pythons, probe
+    from ..core.worker.environment import (
+        WorkerEnvironment,
+        default_root,
+        known_environments,
+        read_extra_names,
+        read_requirements,
+        requirements_file,
+    )
 
     known = [e.root for e in known_environments() if e.is_ours()]
     change = options.repair or options.remove or options.add
@@ -123,7 +125,7 @@ def _set_up_worker(options: Namespace) -> int:
 def _follow(request: SetupRequest) -> int:
     """Run the set-up and show its progress; return the exit code."""
     from ..core.errors import EXIT_OTHER
-    from ..core.setup.install import SetupTask
+    from ..core.jobs.install import SetupTask
 
     task = SetupTask(request)
     task.start()

@@ -51,7 +51,7 @@ def _wrap(options: Namespace) -> int:
     if not options.plan_only:
         require_bpy(job, options)
         return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
-    from ..core.jobs.parts.planning import plan_if_missing
+    from ..core.jobs.parts.graph import plan_if_missing
 
     folder = prepare_job(options.out, job)
     graph = plan_if_missing(folder)
@@ -67,11 +67,11 @@ def checked_job(photos: Path, options: Namespace) -> JobFile:
     DatasetError, UsageError, DeviceError
         The photos, an option or the device cannot be used.
     """
-    from ..core.dataset.loading.check import check_input
     from ..core.errors import DatasetError
     from ..core.jobs.client import worker_if_any
     from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import make_job
+    from ..core.loading.check import check_input
 
     settings = training_settings(options)
     # Presets of the program have no settings of textures; those of users have.
@@ -90,7 +90,7 @@ def checked_job(photos: Path, options: Namespace) -> JobFile:
 def _reject_frames_of_photos(job: JobFile) -> None:
     """Raise for options of videos where the input is none: they would do nothing."""
     from ..core.errors import UsageError
-    from ..core.jobs.video.frames_stage import frames_request
+    from ..core.jobs.stages.cameras import frames_request
 
     for path in ("video_frames", "video_fps"):
         if getattr(job.settings, path) and frames_request(job) is None:
@@ -117,9 +117,8 @@ def _continue_training(options: Namespace) -> int:
     from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
     from ..core.jobs.commands.device_check import require_device
-    from ..core.jobs.store.continue_training import continue_training_job
     from ..core.jobs.store.job_folder import JobFolder
-    from ..core.jobs.store.rollback import finished_job
+    from ..core.jobs.store.rollback import continue_training_job, finished_job
 
     folder = JobFolder(real_path(options.out))
     job = continue_training_job(folder, finished_job(folder), options.iterations)
@@ -268,7 +267,7 @@ def _folders(root: Path) -> list[Path]:
 def _is_same(folder: Path, job: JobFile) -> bool:
     """Return whether a folder holds this job already, begun or finished, and run the same way."""
     from ..core.errors import WrapError
-    from ..core.jobs.parts.planning import plan_hash
+    from ..core.jobs.parts.graph import plan_hash
     from ..core.jobs.store.job_file import read_job
     from ..core.jobs.store.job_folder import JobFolder
 

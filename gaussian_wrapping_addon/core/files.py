@@ -1,22 +1,224 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Atomic file writing, JSON with size limits, and safe relative paths."""
+"""Files and folders: atomic writes, reads of folders one does not trust, array files."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
 import re
+import stat
 import time
+import tokenize
 import uuid
+import zipfile
+import zlib
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import IO, Any
+
+import numpy as np
 
 from . import limits
-from .errors import ParseError
+from .errors import DatasetError, ParseError
 from .names import is_reserved_name
-from .regular_files import open_regular, read_bounded
+
+# -- Open files of folders that may come from elsewhere: regular files, no links, bounded reads
+#
+# A job folder can be sent by anybody. A link in it leads writes and deletions out of it; a named
+# pipe or a device stops a reader or fills the memory. The path *to* the folder is the user's own
+# and may contain links.
+
+
+_LINK_ERRNOS = (errno.ELOOP, getattr(errno, "EMLINK", errno.ELOOP))
+"""Error numbers of ``open`` with ``O_NOFOLLOW`` on a link: EMLINK on some BSDs."""
+
+_FLAGS = {
+    "rb": os.O_RDONLY,
+    "wb": os.O_WRONLY | os.O_CREAT,
+    "ab": os.O_WRONLY | os.O_CREAT | os.O_APPEND,
+    "r+b": os.O_RDWR,
+}
+
+_HINT = "Remove it, or put the file that it stands for in its place."
+
+
+def open_regular(path: Path, mode: str = "rb", *, follow_links: bool = False) -> IO[bytes]:
+    """Open a regular file and nothing else; never waits for the other end of a pipe.
+
+    Parameters
+    ----------
+    path : Path
+        The file. Only its last part is checked for links, see :func:`reject_foreign_entries`.
+    mode : str
+        ``"rb"``, ``"r+b"``, or ``"wb"`` and ``"ab"``, which create the file if it is missing.
+    follow_links : bool
+        Whether the path may be a link, as for files that the user has named.
+
+    Raises
+    ------
+    ParseError
+        It is a link, a folder, a named pipe, a socket or a device.
+    OSError
+        It does not exist, or the system refuses.
+    """
+    if not follow_links:
+        # Where O_NOFOLLOW is missing (Windows), this look is all there is.
+        _refuse_link(path)
+    flags = _FLAGS[mode] | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
+    # Without O_NONBLOCK, opening a named pipe waits until somebody opens its other end.
+    flags |= getattr(os, "O_NONBLOCK", 0) | (0 if follow_links else getattr(os, "O_NOFOLLOW", 0))
+    try:
+        number = os.open(path, flags, 0o666)
+    except OSError as error:
+        if error.errno in _LINK_ERRNOS and not follow_links:
+            raise _not_regular(path, "a link") from None
+        if error.errno == errno.ENXIO:  # a pipe that nobody reads, a socket, or no such device
+            raise _not_regular(path, "a named pipe, a socket or a device") from None
+        raise
+    try:
+        found = os.fstat(number).st_mode
+        if not stat.S_ISREG(found):
+            raise _not_regular(path, _kind(found))
+        if mode == "wb":
+            os.ftruncate(number, 0)  # not O_TRUNC, which acts before the check
+        return os.fdopen(number, mode)
+    except BaseException:
+        os.close(number)
+        raise
+
+
+def read_bounded(path: Path, most_bytes: int, *, follow_links: bool = False) -> bytes:
+    """Return the content of a regular file of at most ``most_bytes``.
+
+    The size that the system states is not relied on: some files state 0 and have no end.
+
+    Raises
+    ------
+    ParseError
+        It is not a regular file, or larger.
+    OSError
+        It cannot be read.
+    """
+    with open_regular(path, follow_links=follow_links) as stream:
+        data = stream.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise ParseError(
+            path, "whole file", f"more than {most_bytes} bytes are too many.",
+            "Check that it is the right file.",
+        )  # fmt: skip
+    return data
+
+
+def touch_regular(path: Path) -> None:
+    """Create an empty file, or set the times of an existing regular file to now.
+
+    Raises
+    ------
+    ParseError, OSError
+        As :func:`open_regular`.
+    """
+    open_regular(path, "ab").close()
+    os.utime(path)
+
+
+def is_link(path: Path) -> bool:
+    """Return whether a path itself is a symbolic link, or a junction of Windows."""
+    try:
+        return _is_link(os.lstat(path))
+    except OSError:
+        return False
+
+
+def is_real_folder(path: Path) -> bool:
+    """Return whether a path is a folder and not a link to one."""
+    try:
+        found = os.lstat(path)
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and not _is_link(found)
+
+
+def reject_foreign_entries(root: Path, *, but: frozenset[str] = frozenset()) -> None:
+    """Raise if a folder holds, at any depth, anything but regular files and folders.
+
+    The folder itself may be reached through links. What disappears meanwhile is no error: a job
+    may be running.
+
+    Parameters
+    ----------
+    but : frozenset of str
+        Names of folders that are not looked into.
+
+    Raises
+    ------
+    DatasetError
+        Names the first such entry, or a folder that cannot be read.
+    """
+    waiting = [Path(root)]
+    while waiting:
+        folder = waiting.pop()
+        try:
+            with os.scandir(folder) as entries:
+                for entry in sorted(entries, key=lambda one: one.name):
+                    _check_entry(entry, waiting, but)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise DatasetError(
+                f"{folder} cannot be read: {error.strerror or error}.", "Check its permissions."
+            ) from None
+
+
+def _check_entry(
+    entry: os.DirEntry[str], folders: list[Path], but: frozenset[str] = frozenset()
+) -> None:
+    try:
+        found = entry.stat(follow_symlinks=False)
+    except FileNotFoundError:
+        return
+    link = _is_link(found)
+    if stat.S_ISDIR(found.st_mode) and not link:
+        if entry.name not in but:
+            folders.append(Path(entry.path))
+    elif link or not stat.S_ISREG(found.st_mode):
+        kind = "a link" if link else _kind(found.st_mode)
+        raise DatasetError(
+            f"{entry.path} is {kind}. Job folders hold regular files and folders only: anything "
+            "else could lead out of them.",
+            "Remove it, or put what it stands for in its place.",
+        )
+
+
+def _refuse_link(path: Path) -> None:
+    if is_link(path):
+        raise _not_regular(path, "a link")
+
+
+def _is_link(found: os.stat_result) -> bool:
+    # On Windows a junction is a folder whose reparse tag is that of a mount point.
+    junction = getattr(stat, "IO_REPARSE_TAG_MOUNT_POINT", -1)
+    return stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == junction
+
+
+def _kind(mode: int) -> str:
+    for is_kind, name in (
+        (stat.S_ISLNK, "a link"), (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a named pipe"),
+        (stat.S_ISSOCK, "a socket"),
+    ):  # fmt: skip
+        if is_kind(mode):
+            return name
+    return "a device"
+
+
+def _not_regular(path: Path, kind: str) -> ParseError:
+    return ParseError(path, "whole file", f"it is {kind}, not a regular file.", _HINT)
+
+
+# -- Atomic file writing, JSON with size limits, and safe relative paths --------------------------
+
 
 _PARTIAL = ".writing."
 """In the names of files that are being written: the target's name, this, and eight hex digits."""
@@ -192,3 +394,123 @@ def resolve_inside(root: Path, name: str) -> Path | None:
     if not real_path(path).is_relative_to(real_path(root)):
         return None
     return path
+
+
+# -- Read the npz files that stages hand to each other: whole, and of bounded size ----------------
+#
+# A file may be cut by a full disk or changed by another program, and a job folder may come from
+# elsewhere: what a header states is compared with what the file holds before memory is taken.
+
+
+DAMAGES = (
+    ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError,
+    SyntaxError, tokenize.TokenError,
+)  # fmt: skip
+"""What zipfile and numpy raise on files that are cut, changed or not theirs. RuntimeError holds
+NotImplementedError: an unknown compression, or an encrypted entry. numpy reads the header of an
+array as Python text."""
+
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def read_arrays(
+    path: Path,
+    names: Iterable[str] | None = None,
+    *,
+    optional: Iterable[str] = (),
+    most_bytes: int | None = None,
+    hint: str = "",
+) -> dict[str, np.ndarray]:
+    """Read arrays of a file written by ``numpy.savez``.
+
+    Parameters
+    ----------
+    path : Path
+        The file itself, not a link to it.
+    names : iterable of str, optional
+        Arrays that it must hold; ``None`` reads all that it holds.
+    optional : iterable of str
+        Arrays that it may hold; the others are not read.
+    most_bytes : int, optional
+        Largest size of those that are read when unpacked; without it compressed entries are
+        refused.
+    hint : str
+        The next step for the user, for the error.
+
+    Raises
+    ------
+    ParseError
+        It is missing, cut, changed, or not of this kind.
+    """
+    try:
+        with open_regular(path) as stream, zipfile.ZipFile(stream) as archive:
+            held = [entry.removesuffix(".npy") for entry in archive.namelist()]
+            wanted = held if names is None else [*names, *(n for n in optional if n in held)]
+            entries = [archive.getinfo(f"{name}.npy") for name in wanted]
+            _check_entries(entries, stream, most_bytes)
+            return {name: _array(archive, f"{name}.npy") for name in wanted}
+    except OSError as error:
+        raise ParseError(
+            path, "whole file", f"cannot be read ({error.strerror or error}).", hint
+        ) from error
+    except DAMAGES as error:
+        raise ParseError(path, "whole file", f"damaged ({error}).", hint) from None
+
+
+def is_whole(path: Path, most_bytes: int | None = None) -> bool:
+    """Return whether a file of ``numpy.savez`` is there and its checksums are right.
+
+    Reads the whole file, with little memory; ``most_bytes`` as in :func:`read_arrays`.
+
+    Raises
+    ------
+    ParseError
+        It cannot be read, which says nothing about its content; or it is no regular file.
+    """
+    try:
+        with open_regular(path) as stream, zipfile.ZipFile(stream) as archive:
+            _check_entries(archive.infolist(), stream, most_bytes)
+            return archive.testzip() is None
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise ParseError(
+            path, "whole file", f"cannot be read ({error.strerror or error}).",
+            "Check the disk and the permissions.",
+        ) from error  # fmt: skip
+    except DAMAGES:
+        return False
+
+
+def _check_entries(
+    entries: Sequence[zipfile.ZipInfo], stream: IO[bytes], most_bytes: int | None
+) -> None:
+    """Raise ValueError where reading these could take more memory or time than allowed."""
+    if most_bytes is None:
+        most_bytes = os.fstat(stream.fileno()).st_size
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            raise ValueError("compressed by another program")
+    if sum(entry.file_size for entry in entries) > most_bytes:
+        raise ValueError(f"its entries are larger than {most_bytes} bytes")
+
+
+def _array(archive: zipfile.ZipFile, entry: str) -> np.ndarray:
+    size_bytes = archive.getinfo(entry).file_size
+    with archive.open(entry) as stream:
+        _check_header(stream, size_bytes)
+    with archive.open(entry) as stream:
+        array: np.ndarray = np.lib.format.read_array(stream, allow_pickle=False)
+        stream.read()  # the checksum is compared at the end
+    return array
+
+
+def _check_header(stream: IO[bytes], size_bytes: int) -> None:
+    read_header = _HEADERS.get(np.lib.format.read_magic(stream))
+    if read_header is None:
+        raise ValueError("unknown version of the array format")
+    shape, _, dtype = read_header(stream)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize > size_bytes:
+        raise ValueError("an array is larger than its entry")

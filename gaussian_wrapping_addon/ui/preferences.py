@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The add-on's preferences: the worker's Python and its options."""
 
+from __future__ import annotations
+
 from typing import Final
 
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ..core.settings import declared
-from .common.setting_properties import property_of
-from .worker.worker_setup_view import draw_doctor, draw_setup
+from .panel_base import property_of
+from .worker_setup_view import draw_doctor, draw_setup
 
 
 class GWRAP_preferences(bpy.types.AddonPreferences):

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Properties edited by the panels: ``Scene.gwrap``.
 
-Settings of a job come from their declarations (``setting_properties.py``). Regions have
-``Object.gwrap`` (``region_properties.py``). All other tags of objects are plain custom properties
-(``ops/common/tags.py``), which also exist where the add-on is not enabled. No property has a
+Settings of a job come from their declarations (``panel_base.py``). Regions have
+``Object.gwrap`` (``region_panel.py``). All other tags of objects are plain custom properties
+(``ops/addon.py``), which also exist where the add-on is not enabled. No property has a
 callback: in Blender 4.2 one that ever had crashes the process at exit.
 """
+
+from __future__ import annotations
 
 from typing import Final
 
@@ -18,11 +20,11 @@ from bpy.props import (
     StringProperty,
 )
 
-from .baking.bake_properties import GWRAP_PG_bake
-from .common.setting_properties import with_settings
-from .computers.computers_properties import GWRAP_PG_computers
-from .regions.region_properties import GWRAP_PG_region
-from .training.training_properties import GWRAP_PG_training
+from .computers_panel import GWRAP_PG_computers
+from .mesh_panel import GWRAP_PG_bake
+from .panel_base import with_settings
+from .region_panel import GWRAP_PG_region
+from .training_panel import GWRAP_PG_training
 
 _RESOLUTIONS: Final = (
     ("AUTOMATIC", "Automatic", "As fine as the photos allow within the preset"),

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.camera_places import hall, render, town
 from benchmarks.camera_solving import page, recall
-from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.synthetic import look_at
 
 

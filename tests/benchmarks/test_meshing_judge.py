@@ -17,12 +17,12 @@ from benchmarks import one_mesh as fusion
 from benchmarks.meshing_judge import distances, inner, solidity
 from benchmarks.one_mesh import depth_in_region, require_open3d
 from benchmarks.vacancy_scale import cameras_around
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ResourceError
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
-from gaussian_wrapping_addon.core.meshing.points.candidate_surface import MARGIN_SHARE
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
+from gaussian_wrapping_addon.core.meshing.surface_points import MARGIN_SHARE
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 
 def sphere(radius: float) -> SurfaceMesh:

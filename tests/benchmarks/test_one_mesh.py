@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.meshing_runs import ADAPTIVE, MEASURED, MESH, TETRAHEDRA, UNIFORM, Method
 from benchmarks.one_mesh import Trained, measure
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
+from gaussian_wrapping_addon.core.mesh.surface_mesh import load_mesh
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from tests.core.field.field_scenes import cameras_around, shell_arrays
 from tests.core.meshing.meshing_scenes import cube
 

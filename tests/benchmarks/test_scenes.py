@@ -37,13 +37,13 @@ from benchmarks.scenes.cache import kind_named
 from benchmarks.scenes.catalogue import KINDS, scene_content, scene_kind
 from benchmarks.scenes.geometry import joined
 from benchmarks.scenes.rendering import Light, render_photos
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.loading.load import load_scene
 from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.region import read_region
+from gaussian_wrapping_addon.core.regions.scene_regions import read_region
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 for _module in ("bpy", "embreex"):
     if importlib.util.find_spec(_module) is None:
@@ -266,7 +266,7 @@ def test_truth_is_the_same_every_time(folders: dict[str, Path], tmp_path: Path) 
 
 def test_thickness_and_views_of_a_plate() -> None:
     from benchmarks.scenes.geometry import box, look_at
-    from gaussian_wrapping_addon.core.regions.convex_region import Region
+    from gaussian_wrapping_addon.core.regions.shapes import Region
 
     plate = box("plate", (-1, -1, 0), (1, 1, 0.1), "oak")
     mesh = (plate.vertices, plate.faces)

@@ -14,15 +14,15 @@ from PIL import Image
 
 from benchmarks.score import judge, judge_truth
 from benchmarks.speed_vs_error import write_comparison
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.gaussians.gaussian_file import save_gaussians
+from gaussian_wrapping_addon.core.gaussians.files import save_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
+from gaussian_wrapping_addon.core.loading.load import load_scene
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.region import write_region
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.scene import save_scene
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.field.field_scenes import unit_sphere
 from tests.synthetic import write_ball_scene

@@ -38,9 +38,9 @@ from benchmarks.zoo.study import (
     run_case,
     write_document,
 )
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ParseError, UsageError
 from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.benchmarks.invented_records import invented
 
 ONE_OF_EACH = [f"{family}-d1" for family in FAMILIES]

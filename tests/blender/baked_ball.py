@@ -9,10 +9,10 @@ from typing import Any
 import bpy
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.placement.placement import place
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.ops import addon
+from gaussian_wrapping_addon.ops.placement import place
 from tests.blender.synthetic_result import rotation_about
 from tests.core.training.small_scene import surface_color
 
@@ -23,7 +23,7 @@ BLENDER_FROM_SCENE = Similarity(1.7, rotation_about((1, 1, 2), 0.9), np.array([3
 def import_ball(folder: JobFolder) -> bpy.types.Object:
     """Import the result and place it; return its frame."""
     assert bpy.ops.gwrap.import_result(directory=str(folder.result)) == {"FINISHED"}
-    frame = next(tags.objects_of_kind(bpy.context.scene, "frame"))
+    frame = next(addon.objects_of_kind(bpy.context.scene, "frame"))
     place(frame, BLENDER_FROM_SCENE)
     bpy.context.view_layer.update()
     return frame

@@ -6,9 +6,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene, save_scene
-from gaussian_wrapping_addon.core.jobs.stages.scene_summary import write_scene_summary
+from gaussian_wrapping_addon.core.jobs.stages.cameras import write_scene_summary
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.scene.scene import load_saved_scene, save_scene
 from tests.blender.synthetic_result import WORLD_FROM_SCENE, write_region_result
 from tests.core.jobs.finished_sphere import write_finished_sphere
 

@@ -59,7 +59,7 @@ def _clean_file() -> Iterator[None]:
 def addon(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     """The add-on, registered for one test; leaving classes behind hangs some Blenders at exit."""
     import gaussian_wrapping_addon
-    from gaussian_wrapping_addon.ops.jobs import job_timer
+    from gaussian_wrapping_addon.ops import job_timer
 
     # One look at a job is enough, however busy the machine is.
     monkeypatch.setattr(job_timer, "POLL_WAIT_S", 30.0)
@@ -73,8 +73,9 @@ def addon(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
 @pytest.fixture
 def ended_workers(addon: object, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """No job of a test is known to others; its workers end before ``addon`` forgets them."""
-    from gaussian_wrapping_addon.ops.common import known_jobs
-    from gaussian_wrapping_addon.ops.jobs import job_timer, watched_jobs
+    from gaussian_wrapping_addon.ops import addon as known_jobs
+    from gaussian_wrapping_addon.ops import job_timer
+    from gaussian_wrapping_addon.ops import job_timer as watched_jobs
 
     monkeypatch.setattr(known_jobs, "_session", [])
     yield
@@ -82,7 +83,7 @@ def ended_workers(addon: object, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
         if job.client.poll().active:
             job.client.kill()
             assert not job.client.poll().active, "a worker outlived its test"
-    job_timer.forget_all()
+    job_timer.forget_all_jobs()
 
 
 @pytest.fixture

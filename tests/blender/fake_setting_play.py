@@ -16,15 +16,14 @@ os.environ["BLENDER_USER_RESOURCES"] = str(Path("profile").resolve())
 import bpy
 
 import gaussian_wrapping_addon
-from gaussian_wrapping_addon.ops.jobs.panel_settings import job_settings, meshing_choices
-from gaussian_wrapping_addon.ui.meshing import mesh_panel, texture_panel
-from gaussian_wrapping_addon.ui.training import train_advanced_panel
+from gaussian_wrapping_addon.ops.panel_settings import job_settings, meshing_choices
+from gaussian_wrapping_addon.ui import mesh_panel, training_panel
 from tests.blender.fake_layout import draw
 
 PANELS = {
-    "training": train_advanced_panel.GWRAP_PT_train_advanced,
+    "training": training_panel.GWRAP_PT_train_advanced,
     "meshing": mesh_panel.GWRAP_PT_mesh_advanced,
-    "texture": texture_panel.GWRAP_PT_texture,
+    "texture": mesh_panel.GWRAP_PT_texture,
 }
 
 

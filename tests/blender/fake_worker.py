@@ -20,12 +20,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from gaussian_wrapping_addon.core.gaussians.preview_points import POINT, POINTS_FILE, points_file
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
-    JobFolder,
-    JobStatus,
-    process_start_ticks,
-)
-from gaussian_wrapping_addon.core.processes.process_identity import Caller
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.worker.spawn import Caller, process_start_ticks
 from tests.blender.synthetic_result import npy_bytes, write_region_result, write_result
 
 LIVE = {

@@ -14,8 +14,7 @@ import bpy
 import pytest
 
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.jobs import job_timer, watched_jobs
+from gaussian_wrapping_addon.ops import addon, job_timer
 
 WAIT_S = float(os.environ.get("GW_WAIT_S", "40"))
 """Longest wait for a state; more where the real worker is at work."""
@@ -40,7 +39,7 @@ def start_wrap(photos: Path, scene: bpy.types.Scene | None = None) -> Path:
 
 def status_of(folder: Path) -> JobStatus:
     """Return what the panel would show of a job."""
-    found = watched_jobs.status_of(str(folder))
+    found = job_timer.status_of(str(folder))
     assert found is not None, f"no job is watched in {folder}"
     return found
 
@@ -53,7 +52,7 @@ def play_until(holds: Callable[[], bool], what: str) -> None:
         if holds():
             return
         time.sleep(0.02)
-    raise AssertionError(f"{what}: {[(f, j.status) for f, j in watched_jobs.jobs.items()]}")
+    raise AssertionError(f"{what}: {[(f, j.status) for f, j in job_timer.jobs.items()]}")
 
 
 def play_to(folder: Path, *states: str) -> JobStatus:
@@ -69,12 +68,12 @@ def play_to_stage(folder: Path, stage: str) -> None:
 
 def meshes() -> int:
     """Count the meshes that were imported into the open scene."""
-    return len(list(tags.objects_of_kind(bpy.context.scene, "mesh")))
+    return len(list(addon.objects_of_kind(bpy.context.scene, "mesh")))
 
 
 def status() -> object:
     """Return what the panel would show of the open scene's job."""
-    return watched_jobs.status_of(bpy.context.scene.gwrap.job_folder)
+    return job_timer.status_of(bpy.context.scene.gwrap.job_folder)
 
 
 def wait_for(*states: str, clock: Callable[[], float] = time.monotonic) -> None:

@@ -18,10 +18,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import bpy
 
 import gaussian_wrapping_addon
-from gaussian_wrapping_addon.ops.common import known_jobs
-from gaussian_wrapping_addon.ops.jobs import job_attach, watched_jobs
-from gaussian_wrapping_addon.ops.worker import preferred_worker
-from gaussian_wrapping_addon.ui.training import train_panel
+from gaussian_wrapping_addon.ops import addon, job_timer, jobs, worker_setup
+from gaussian_wrapping_addon.ui import training_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import meshes, play_to, play_until, start_wrap, status_of
 
@@ -34,8 +32,8 @@ def say(**values: object) -> None:
 
 def start(blend: Path, photos: Path, keep: bool) -> Path:
     """Start a job and save the file."""
-    choice = preferred_worker.worker_choice(bpy.context)
-    preferred_worker.worker_choice = lambda _context: preferred_worker.WorkerChoice(
+    choice = worker_setup.worker_choice(bpy.context)
+    worker_setup.worker_choice = lambda _context: worker_setup.WorkerChoice(
         choice.python, choice.threads, keep
     )
     properties = bpy.context.scene.gwrap
@@ -53,25 +51,25 @@ def start(blend: Path, photos: Path, keep: bool) -> Path:
 def reopen(blend: Path) -> None:
     """Open the file and bring its job to an end."""
     bpy.ops.wm.open_mainfile(filepath=str(blend))
-    job_attach.attach_later()
+    jobs.attach_later()
     folder = Path(bpy.context.scene.gwrap.job_folder)
     found = status_of(folder).state
-    offered = draw(train_panel.GWRAP_PT_train).operators
+    offered = draw(training_panel.GWRAP_PT_train).operators
     if "gwrap.resume_job" in offered:
         os.environ["GW_FAKE"] = "quick"
         bpy.ops.gwrap.resume_job()
     (folder / "finish").touch()
     play_to(folder, "DONE", "FAILED", "LOST")
     final = status_of(folder)
-    if not meshes() and watched_jobs.result_to_import(bpy.context.scene):
-        bpy.ops.gwrap.import_result(directory=watched_jobs.result_to_import(bpy.context.scene))
+    if not meshes() and job_timer.result_to_import(bpy.context.scene):
+        bpy.ops.gwrap.import_result(directory=job_timer.result_to_import(bpy.context.scene))
     say(found=found, offered=offered, state=final.state, error=final.error, meshes=meshes())
 
 
 def main() -> int:
     deed, blend, photos = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
     # An installed extension keeps this list in a folder of its own; the wheel has none.
-    known_jobs._list_path = lambda: blend.with_name("known_jobs.json")
+    addon._list_path = lambda: blend.with_name("known_jobs.json")
     gaussian_wrapping_addon.register()
     try:
         if deed == "reopen":

@@ -11,12 +11,11 @@ import numpy as np
 
 from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
-from gaussian_wrapping_addon.ops.dataset import photo_check
-from gaussian_wrapping_addon.ops.jobs import job_timer, watched_jobs
-from gaussian_wrapping_addon.ops.jobs.panel_settings import choices_key
-from gaussian_wrapping_addon.ops.results.scene_objects import import_result
-from gaussian_wrapping_addon.ops.training import training_estimate
-from gaussian_wrapping_addon.ops.training.training_estimate import Estimate
+from gaussian_wrapping_addon.ops import dataset, job_timer
+from gaussian_wrapping_addon.ops import training as training_estimate
+from gaussian_wrapping_addon.ops.panel_settings import choices_key
+from gaussian_wrapping_addon.ops.scene_objects import import_result
+from gaussian_wrapping_addon.ops.training import Estimate
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.fake_worker import LIVE
 from tests.blender.synthetic_result import png_bytes, write_result
@@ -87,7 +86,7 @@ def not_checked(folder: Path) -> None:
 
 def checking(folder: Path) -> None:
     choose_photos(folder)
-    photo_check._checks.submit(lambda: time.sleep(1.0), lambda _: None)
+    dataset._checks.submit(lambda: time.sleep(1.0), lambda _: None)
 
 
 def checked(folder: Path) -> None:
@@ -137,7 +136,7 @@ def not_open(folder: Path) -> None:
 
 def gone(folder: Path) -> None:
     not_open(folder)
-    watched_jobs.gone.add(str(folder / "job"))
+    job_timer.gone.add(str(folder / "job"))
 
 
 def to_import(folder: Path) -> None:
@@ -149,7 +148,7 @@ def in_edit_mode(folder: Path) -> None:
     to_import(folder)
     bpy.ops.mesh.primitive_cube_add()
     bpy.ops.object.mode_set(mode="EDIT")
-    watched_jobs.jobs[str(folder / "job")].waits_for_mode = True
+    job_timer.jobs[str(folder / "job")].waits_for_mode = True
 
 
 def done(folder: Path) -> None:

@@ -7,15 +7,11 @@ import bmesh
 import bpy
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.frames.placement_file import FILE_NAME, read_placement
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.placement import placement
-from gaussian_wrapping_addon.ops.regions.region_objects import (
-    matrix_of,
-    transformed,
-)
-from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.placement import FILE_NAME, read_placement
+from gaussian_wrapping_addon.ops import addon, placement
+from gaussian_wrapping_addon.ops.region_objects import matrix_of, transformed
+from gaussian_wrapping_addon.ops.scene_objects import ImportedResult
 from tests.blender.synthetic_result import (
     WORLD_FROM_SCENE,
 )
@@ -37,7 +33,7 @@ def upright_cameras() -> list[dict]:
 
 
 def stored(imported: ImportedResult) -> Similarity | None:
-    path = tags.result_folder(imported.frame) / FILE_NAME
+    path = addon.result_folder(imported.frame) / FILE_NAME
     return read_placement(path, WORLD_FROM_SCENE) if path.exists() else None
 
 

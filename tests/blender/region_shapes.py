@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from gaussian_wrapping_addon.ops.regions.region_objects import region_body
+from gaussian_wrapping_addon.ops.region_objects import region_body
 
 
 def region_from_object(thing: bpy.types.Object) -> np.ndarray:

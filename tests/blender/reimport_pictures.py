@@ -18,13 +18,12 @@ os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="gwrap-p
 import bpy
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.frames.placement_file import FILE_NAME, write_placement
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.jobs.commands.export_files import ExportRequest, export_files
-from gaussian_wrapping_addon.core.texture.files.file_checks import atlas_file
-from gaussian_wrapping_addon.ops.export.export_objects import ObjectExport, export_objects
-from gaussian_wrapping_addon.ops.results.materials import set_shading
-from gaussian_wrapping_addon.ops.results.scene_objects import import_result
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.placement import FILE_NAME, write_placement
+from gaussian_wrapping_addon.core.texture.file_checks import atlas_file
+from gaussian_wrapping_addon.ops.export import ObjectExport, export_objects
+from gaussian_wrapping_addon.ops.scene_objects import import_result, set_shading
 from tests.blender.synthetic_result import (
     WORLD_FROM_SCENE,
     png_bytes,

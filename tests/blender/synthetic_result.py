@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS, CUBE_TRIANGLES
-from gaussian_wrapping_addon.core.regions.region_file import region_to_json
+from gaussian_wrapping_addon.core.regions.files import region_to_json
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
 
 
 def rotation_about(axis: tuple[float, float, float], angle: float) -> np.ndarray:

@@ -12,8 +12,8 @@ import bpy
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.ops.common import background
-from gaussian_wrapping_addon.ops.common.background import Lane
+from gaussian_wrapping_addon.ops import background
+from gaussian_wrapping_addon.ops.background import Lane
 
 WAIT_S = 20.0
 

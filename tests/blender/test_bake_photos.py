@@ -16,11 +16,10 @@ import pytest
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.ops.baking.triangulation import world_mesh
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.meshing import bake_actions
-from gaussian_wrapping_addon.ops.results.materials import shading_of
-from gaussian_wrapping_addon.ui.baking import bake_panel
+from gaussian_wrapping_addon.ops import addon, baking
+from gaussian_wrapping_addon.ops.bake_objects import world_mesh
+from gaussian_wrapping_addon.ops.scene_objects import shading_of
+from gaussian_wrapping_addon.ui import mesh_panel
 from tests.blender import job_play
 from tests.blender.baked_ball import add_ball, image_of, import_ball, psnr_of_textures
 from tests.blender.ball_job import write_ball_job
@@ -70,7 +69,7 @@ def test_a_foreign_mesh_without_uvs_gets_uvs_and_texture(
     """Its quads and the object stay; seams may only cut quads that the worker is not told of."""
     if not told:
         monkeypatch.setattr(
-            bake_actions, "world_mesh", lambda *a, **k: world_mesh(*a, **{**k, "with_polygons": 0})
+            baking, "world_mesh", lambda *a, **k: world_mesh(*a, **{**k, "with_polygons": 0})
         )
     import_ball(job)
     thing = add_ball()
@@ -94,7 +93,7 @@ def test_a_foreign_mesh_without_uvs_gets_uvs_and_texture(
     assert len(bpy.data.objects) == before[1]
     assert thing.data.validate() is False
     assert Path(image_of(thing).filepath) == job.baked / "Foreign" / "albedo.png"
-    assert "% seen by photos" in draw(bake_panel.GWRAP_PT_bake).texts
+    assert "% seen by photos" in draw(mesh_panel.GWRAP_PT_bake).texts
     assert job.read_status().state == "DONE"
 
 
@@ -174,7 +173,7 @@ def test_fewer_faces_become_a_lighter_object_with_a_normal_map(job: JobFolder) -
     assert press(job).state == "DONE"
     light = bpy.data.objects["Foreign light"]
     assert light.parent == frame
-    assert tags.kind_of(light) == "baked"
+    assert addon.kind_of(light) == "baked"
     assert abs(len(light.data.polygons) - 400) <= 8
     assert "Normal Map" in light.material_slots[0].material.node_tree.nodes
     assert (job.baked / "Foreign_light" / "normal.png").is_file()
@@ -194,7 +193,7 @@ def test_fewer_faces_become_a_lighter_object_with_a_normal_map(job: JobFolder) -
     select_alone(thing)
     bake.faces = 300
     assert press(job).state == "DONE"
-    assert [t.name for t in bpy.data.objects if tags.kind_of(t) == "baked"] == ["Foreign light"]
+    assert [t.name for t in bpy.data.objects if addon.kind_of(t) == "baked"] == ["Foreign light"]
     assert abs(len(bpy.data.objects["Foreign light"].data.polygons) - 300) <= 8
 
 
@@ -210,7 +209,7 @@ def test_quads_become_an_object_with_photos_and_maps(job: JobFolder) -> None:
     assert press(job).state == "DONE"
     made = bpy.data.objects["Foreign quads"]
     assert made.parent == frame
-    assert tags.kind_of(made) == "baked"
+    assert addon.kind_of(made) == "baked"
     assert {len(polygon.vertices) for polygon in made.data.polygons} == {4}
     assert 300 < len(made.data.polygons) < 440
     assert all(polygon.use_smooth for polygon in made.data.polygons)
@@ -233,7 +232,7 @@ def test_quads_become_an_object_with_photos_and_maps(job: JobFolder) -> None:
     made.hide_set(True)
     choose_quads(200)
     assert press(job).state == "DONE"
-    assert [t.name for t in bpy.data.objects if tags.kind_of(t) == "baked"] == ["Foreign quads"]
+    assert [t.name for t in bpy.data.objects if addon.kind_of(t) == "baked"] == ["Foreign quads"]
     made = bpy.data.objects["Foreign quads"]
     assert len(made.data.polygons) < 250
     assert not made.hide_get()
@@ -253,7 +252,7 @@ def choose_quads(count: int) -> None:
 
 
 def names_of_fields() -> set[str]:
-    return {field.name for field in draw(bake_panel.GWRAP_PT_bake).fields}
+    return {field.name for field in draw(mesh_panel.GWRAP_PT_bake).fields}
 
 
 def file_content() -> set[tuple[str, str]]:
@@ -322,7 +321,7 @@ def test_what_the_worker_refuses_changes_nothing(case: str, job: JobFolder) -> N
     status = press(job, "FAILED")
     words = "No photo sees the mesh" if case == "elsewhere" else "point inwards"
     assert words in status.error
-    assert words in draw(bake_panel.GWRAP_PT_bake).texts
+    assert words in draw(mesh_panel.GWRAP_PT_bake).texts
     assert job.job_path.read_bytes() == before
     assert not job.baked.exists()
     assert not list(job.stages.glob("bake-*"))
@@ -411,7 +410,7 @@ def test_a_mesh_edited_meanwhile_keeps_its_edits_and_says_so(job: JobFolder) -> 
 def test_a_result_mesh_that_is_made_anew_loses_its_bake(job: JobFolder) -> None:
     """The cube inside the ball, baked onto, then meshed again: the texture is the region's."""
     frame = import_ball(job)
-    (thing,) = (child for child in frame.children if tags.kind_of(child) == "mesh")
+    (thing,) = (child for child in frame.children if addon.kind_of(child) == "mesh")
     bpy.ops.object.select_all(action="DESELECT")
     bpy.context.view_layer.objects.active = thing
     thing.select_set(True)
@@ -420,7 +419,7 @@ def test_a_result_mesh_that_is_made_anew_loses_its_bake(job: JobFolder) -> None:
     write_region_result(job.result / "auto", half=0.7)
     assert bpy.ops.gwrap.import_result(directory=str(job.result)) == {"FINISHED"}
     assert Path(image_of(thing).filepath) == job.result / "auto" / "albedo.png"
-    assert tags.BAKE not in thing
+    assert addon.BAKE not in thing
 
 
 @pytest.mark.proof
@@ -429,11 +428,11 @@ def test_a_cancelled_bake_is_resumed_onto_its_object(job: JobFolder) -> None:
     thing = add_ball()
     assert bpy.ops.gwrap.bake_photos() == {"FINISHED"}
     job_play.play_to_stage(job.root, "bake")
-    assert "gwrap.cancel_job" in draw(bake_panel.GWRAP_PT_bake).operators
+    assert "gwrap.cancel_job" in draw(mesh_panel.GWRAP_PT_bake).operators
     assert bpy.ops.gwrap.cancel_job() == {"FINISHED"}
     job_play.play_to(job.root, "CANCELLED")
     assert not thing.data.uv_layers
-    assert "gwrap.resume_job" in draw(bake_panel.GWRAP_PT_bake).operators
+    assert "gwrap.resume_job" in draw(mesh_panel.GWRAP_PT_bake).operators
     assert bpy.ops.gwrap.resume_job() == {"FINISHED"}
     assert job_play.play_to(job.root, "DONE", "FAILED").state == "DONE"
     assert psnr_of_textures(bpy.data.objects["Foreign"]) > GOOD_DB

@@ -18,10 +18,8 @@ from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.settings import preset
-from gaussian_wrapping_addon.ops import cli_command
-from gaussian_wrapping_addon.ops.common import known_jobs
-from gaussian_wrapping_addon.ops.jobs import job_timer, watched_jobs
-from gaussian_wrapping_addon.ui.training import train_panel
+from gaussian_wrapping_addon.ops import addon, cli_command, job_timer
+from gaussian_wrapping_addon.ui import training_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import (
     meshes,
@@ -37,15 +35,15 @@ BATCH = Path(gaussian_wrapping_addon.__file__).with_name("batch.py")
 
 @pytest.fixture
 def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    monkeypatch.setattr(known_jobs, "_session", [])
+    monkeypatch.setattr(addon, "_session", [])
     monkeypatch.setenv(PYTHON_VARIABLE, str(write_fake_python(tmp_path)))
     monkeypatch.setenv("GW_FAKE", "quick")
     folder = tmp_path / "photos"
     folder.mkdir()
     yield folder
-    for job in watched_jobs.jobs.values():
+    for job in job_timer.jobs.values():
         job.client.kill()
-    job_timer.forget_all()
+    job_timer.forget_all_jobs()
 
 
 def batch(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -113,8 +111,8 @@ def test_a_job_of_batch_is_opened_by_the_button(addon: object, photos: Path) -> 
     done = batch("resume", str(folder), "--no-blend")
     assert done.returncode == 0, done.stdout + done.stderr
     bpy.ops.gwrap.find_job(directory=str(folder))
-    assert "Import Finished Result" in draw(train_panel.GWRAP_PT_train).texts
-    bpy.ops.gwrap.import_result(directory=watched_jobs.result_to_import(bpy.context.scene))
+    assert "Import Finished Result" in draw(training_panel.GWRAP_PT_train).texts
+    bpy.ops.gwrap.import_result(directory=job_timer.result_to_import(bpy.context.scene))
     assert meshes() == 1
     bpy.ops.gwrap.resume_job()  # and goes on from the button
     play_to(folder, "DONE")

@@ -15,14 +15,13 @@ import bpy
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.farm import part_states
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
+from gaussian_wrapping_addon.core.jobs.parts import states
 from gaussian_wrapping_addon.core.names import SHARED_VARIABLE
-from gaussian_wrapping_addon.core.processes.process_identity import process_alive
-from gaussian_wrapping_addon.ops.common import background, known_jobs
-from gaussian_wrapping_addon.ops.computers import dask_doctor, farm_calls, part_watch
-from gaussian_wrapping_addon.ops.jobs.panel_settings import job_settings
-from gaussian_wrapping_addon.ui.computers import computers_panel
+from gaussian_wrapping_addon.core.worker.spawn import process_alive
+from gaussian_wrapping_addon.ops import addon, background, computers
+from gaussian_wrapping_addon.ops.panel_settings import job_settings
+from gaussian_wrapping_addon.ui import computers_panel
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.panel_states import buttons, choose_photos, words
 from tests.core.farm.job_parts import graph, job_folder, write_state
@@ -34,7 +33,7 @@ PANEL = computers_panel.GWRAP_PT_computers
 
 @pytest.fixture(autouse=True)
 def _nothing_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(known_jobs, "_session", [])
+    monkeypatch.setattr(addon, "_session", [])
     monkeypatch.delenv(SHARED_VARIABLE, raising=False)
 
 
@@ -49,13 +48,13 @@ def wait_for(holds: Callable[[], bool], seconds: float = 20.0) -> None:
 
 def answered() -> FakeLayout:
     """Wait for the request that runs; return the panel."""
-    wait_for(lambda: not farm_calls.is_busy())
+    wait_for(lambda: not computers.is_busy())
     return draw(PANEL)
 
 
 def show(folder: Path) -> None:
     """Let the scene show a job folder that was used on this computer."""
-    known_jobs.remember(folder)
+    addon.remember(folder)
     properties = bpy.context.scene.gwrap
     properties.job_folder = str(folder)
 
@@ -63,9 +62,9 @@ def show(folder: Path) -> None:
 def shown(folder: Path) -> FakeLayout:
     """Show the parts of a folder as they are now."""
     show(folder)
-    part_watch.stop()
+    computers.stop_watching()
     draw(PANEL)
-    wait_for(lambda: part_watch._watched[str(folder)].read_s > 0.0)
+    wait_for(lambda: computers._watched[str(folder)].read_s > 0.0)
     return draw(PANEL)
 
 
@@ -146,11 +145,11 @@ def play_doctor(monkeypatch: pytest.MonkeyPatch, code: str) -> list[dict[str, ob
     asked: list[dict[str, object]] = []
 
     def command(module: str, request: str, *, python: str) -> list[str]:
-        assert module == "jobs.commands.farm.doctor"
+        assert module == "jobs.commands.farm_doctor"
         asked.append(json.loads(request))
         return [sys.executable, "-c", code]
 
-    monkeypatch.setattr(dask_doctor, "child_command", command)
+    monkeypatch.setattr(computers, "child_command", command)
     return asked
 
 
@@ -214,7 +213,7 @@ def test_the_process_of_a_test_ends_with_the_file(
     wait_for(lambda: pid.exists() and bool(pid.read_text()))
     background.before_load()
     wait_for(lambda: not process_alive(int(pid.read_text()), 0))
-    assert not farm_calls.is_busy()
+    assert not computers.is_busy()
 
 
 def test_a_real_doctor_where_nothing_listens(
@@ -225,7 +224,7 @@ def test_a_real_doctor_where_nothing_listens(
     monkeypatch.setenv(SHARED_VARIABLE, str(tmp_path))
     choose_dask("tcp://127.0.0.1:9")
     bpy.ops.gwrap.test_computers()
-    wait_for(lambda: not farm_calls.is_busy(), 120.0)
+    wait_for(lambda: not computers.is_busy(), 120.0)
     assert "Nothing accepts connections at tcp://127.0.0.1:9" in words(draw(PANEL))
     assert list(tmp_path.iterdir()) == []
 
@@ -271,7 +270,7 @@ def test_a_folder_from_elsewhere_is_not_touched(
 ) -> None:
     folder = job_folder(tmp_path / "job", graph({"a": 0})).root
     touched: list[str] = []
-    monkeypatch.setattr(part_watch, "_read", lambda reader: touched.append(str(reader.root)))
+    monkeypatch.setattr(computers, "_read", lambda reader: touched.append(str(reader.root)))
     for name in (str(folder), r"\\server\share\job"):
         bpy.context.scene.gwrap.job_folder = name
         draw(PANEL)
@@ -286,12 +285,12 @@ def test_the_timer_reads_nothing_itself_and_ends(
 ) -> None:
     folder = job_folder(tmp_path / "job", graph({"a": 0})).root
     shown(folder)
-    monkeypatch.setattr(part_watch, "EVERY_S", 0.3)
+    monkeypatch.setattr(computers, "EVERY_S", 0.3)
     main = threading.main_thread()
     read: list[bool] = []
-    inner = part_states.read_parts
+    inner = states.read_parts
     monkeypatch.setattr(
-        part_states,
+        states,
         "read_parts",
         lambda root: read.append(threading.current_thread() is main) or inner(root),
     )

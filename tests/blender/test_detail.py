@@ -11,19 +11,22 @@ import numpy as np
 import pytest
 from mathutils import Vector
 
-from gaussian_wrapping_addon.core.mesh.simplification.decimation import decimate
+from gaussian_wrapping_addon.core.mesh.simplification import decimate
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.tangent_frame import tangent_frames
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
-from gaussian_wrapping_addon.core.texture.detail.dense_surface import DenseSurface
-from gaussian_wrapping_addon.core.texture.detail.normal_map import bake_normal_map
-from gaussian_wrapping_addon.core.texture.files.glb import glb_bytes
+from gaussian_wrapping_addon.core.texture.atlas import raster_atlas
+from gaussian_wrapping_addon.core.texture.dense_detail import DenseSurface, bake_normal_map
+from gaussian_wrapping_addon.core.texture.files import glb_bytes
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.common.mesh_data import build_mesh
-from gaussian_wrapping_addon.ops.results.materials import create_material, load_texture, set_shading
-from gaussian_wrapping_addon.ops.results.scene_objects import import_result
+from gaussian_wrapping_addon.ops import addon
+from gaussian_wrapping_addon.ops.mesh_data import build_mesh
+from gaussian_wrapping_addon.ops.scene_objects import (
+    create_material,
+    import_result,
+    load_texture,
+    set_shading,
+)
 from tests.blender.synthetic_result import cube_mesh, png_bytes, write_region_result, write_result
 from tests.core.texture.detail_scenes import bumpy_ball, degrees_between
 
@@ -214,6 +217,6 @@ def test_a_mesh_made_anew_replaces_levels_and_loses_its_normal_map(tmp_path: Pat
     folder = imported.collection.children["auto LODs"]
     assert [o.name for o in folder.objects] == ["auto LOD0", "auto LOD1"]
     assert normal_links(thing.data.materials[0]) == []
-    levels = [o for o in bpy.data.objects if tags.kind_of(o) == "lod"]
-    assert [json.dumps(o[tags.LEVEL]) for o in levels] == ["1"]
+    levels = [o for o in bpy.data.objects if addon.kind_of(o) == "lod"]
+    assert [json.dumps(o[addon.LEVEL]) for o in levels] == ["1"]
     assert len(bpy.data.meshes) == 2

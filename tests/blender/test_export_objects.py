@@ -13,17 +13,21 @@ import bpy
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.frames.placement_file import FILE_NAME, write_placement
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import MeshingError, UsageError
-from gaussian_wrapping_addon.core.export_formats import MESH_FORMATS
 from gaussian_wrapping_addon.core.jobs.commands.export_files import ExportRequest, export_files
-from gaussian_wrapping_addon.core.jobs.store.sidecar import sidecar_path
-from gaussian_wrapping_addon.ops.export import export_objects as module
-from gaussian_wrapping_addon.ops.export.export_objects import ObjectExport, export_objects
-from gaussian_wrapping_addon.ops.export.export_result import export_result
-from gaussian_wrapping_addon.ops.results.materials import images_of, set_shading, shading_of
-from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult, import_result
+from gaussian_wrapping_addon.core.jobs.store.job_file import sidecar_path
+from gaussian_wrapping_addon.core.names import MESH_FORMATS
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.placement import FILE_NAME, write_placement
+from gaussian_wrapping_addon.ops import export as module
+from gaussian_wrapping_addon.ops.export import ObjectExport, export_objects, export_result
+from gaussian_wrapping_addon.ops.scene_objects import (
+    ImportedResult,
+    images_of,
+    import_result,
+    set_shading,
+    shading_of,
+)
 from tests.blender.synthetic_result import (
     WORLD_FROM_SCENE,
     cube_mesh,

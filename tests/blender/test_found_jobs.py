@@ -15,9 +15,9 @@ from types import ModuleType
 import bpy
 import pytest
 
-from gaussian_wrapping_addon.ops.common import known_jobs, tags
-from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer, watched_jobs
-from gaussian_wrapping_addon.ui.training import train_panel
+from gaussian_wrapping_addon.ops import addon, job_timer, jobs
+from gaussian_wrapping_addon.ops import addon as tags
+from gaussian_wrapping_addon.ui import training_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import (
     start_wrap,
@@ -41,7 +41,7 @@ def test_a_file_finds_its_running_job_again(
     bpy.ops.wm.read_homefile(use_empty=True)
     (folder / "finish").touch()
     end_s = time.monotonic() + 20
-    while watched_jobs.jobs[str(folder)].status.state != "DONE" and time.monotonic() < end_s:
+    while job_timer.jobs[str(folder)].status.state != "DONE" and time.monotonic() < end_s:
         job_timer.poll_jobs()
         time.sleep(0.02)
     assert len(bpy.data.objects) == 0, "another file gets nothing"
@@ -59,14 +59,14 @@ def test_another_blender_finds_the_job_and_offers_its_result(
     blend = tmp_path / "work.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
     wait_for("DONE")
-    job_timer.forget_all()  # as after a crash of Blender
+    job_timer.forget_all_jobs()  # as after a crash of Blender
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     assert status().state == "DONE"  # type: ignore[attr-defined]
     assert not job_timer.poll_jobs()
     assert len(bpy.data.objects) == 0, "opening a file imports nothing by itself"
-    assert "Import Finished Result" in draw(train_panel.GWRAP_PT_train).texts
-    bpy.ops.gwrap.import_result(directory=watched_jobs.result_to_import(bpy.context.scene))
-    assert "Import Finished Result" not in draw(train_panel.GWRAP_PT_train).texts
+    assert "Import Finished Result" in draw(training_panel.GWRAP_PT_train).texts
+    bpy.ops.gwrap.import_result(directory=job_timer.result_to_import(bpy.context.scene))
+    assert "Import Finished Result" not in draw(training_panel.GWRAP_PT_train).texts
 
 
 def test_a_project_folder_that_was_moved_asks_before_its_job_is_read(
@@ -77,14 +77,14 @@ def test_a_project_folder_that_was_moved_asks_before_its_job_is_read(
     start_wrap(photos)
     wait_for("DONE")
     bpy.ops.wm.save_as_mainfile(filepath=str(project / "work.blend"))
-    job_timer.forget_all()
+    job_timer.forget_all_jobs()
     os.rename(project, tmp_path / "moved")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "moved" / "work.blend"))
-    assert watched_jobs.jobs == {}, "a downloaded folder beside a file looks the same"
-    assert "gwrap.find_job" in draw(train_panel.GWRAP_PT_train).operators
+    assert job_timer.jobs == {}, "a downloaded folder beside a file looks the same"
+    assert "gwrap.find_job" in draw(training_panel.GWRAP_PT_train).operators
     bpy.ops.gwrap.find_job(directory=str(tmp_path / "moved" / "job"))
     assert status().state == "DONE"  # type: ignore[attr-defined]
-    job_timer.forget_all()
+    job_timer.forget_all_jobs()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "moved" / "work.blend"))
     assert status().state == "DONE"  # type: ignore[attr-defined]
     assert Path(bpy.context.scene.gwrap.job_folder) == tmp_path / "moved" / "job"
@@ -100,17 +100,17 @@ def test_opening_a_file_never_waits_for_a_pipe_in_the_folder_beside_it(
     start_wrap(photos)
     wait_for("DONE")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
-    job_timer.forget_all()
+    job_timer.forget_all_jobs()
     (tmp_path / "job" / name).unlink(missing_ok=True)
     os.mkfifo(tmp_path / "job" / name)
     if not asked:
-        known_jobs._session.clear()  # another person's machine
+        addon._session.clear()  # another person's machine
     begun_s = time.monotonic()
     with alarm(5):
         bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "work.blend"))
-        assert (watched_jobs.jobs != {}) == asked
+        assert (job_timer.jobs != {}) == asked
         job_timer.poll_jobs()
-        draw(train_panel.GWRAP_PT_train)
+        draw(training_panel.GWRAP_PT_train)
     assert time.monotonic() - begun_s < 4.0
 
 
@@ -121,10 +121,10 @@ def test_a_file_whose_folders_are_links_in_a_circle_opens(tmp_path: Path, addon:
     properties = bpy.context.scene.gwrap
     properties.source = properties.output = properties.job_folder = str(circle)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
-    job_timer.forget_all()
+    job_timer.forget_all_jobs()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "work.blend"))
-    assert watched_jobs.jobs == {}
-    draw(train_panel.GWRAP_PT_train)
+    assert job_timer.jobs == {}
+    draw(training_panel.GWRAP_PT_train)
     with pytest.raises(RuntimeError, match="circle") as refused:
         bpy.ops.gwrap.wrap_scene()
     assert "Traceback" not in str(refused.value)
@@ -146,15 +146,15 @@ def test_a_job_whose_folder_was_deleted_is_told_and_forgotten(
     start_wrap(photos)
     wait_for("DONE")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
-    job_timer.forget_all()
+    job_timer.forget_all_jobs()
     shutil.rmtree(bpy.context.scene.gwrap.job_folder)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "work.blend"))
-    assert "is gone" in draw(train_panel.GWRAP_PT_train).texts
+    assert "is gone" in draw(training_panel.GWRAP_PT_train).texts
     assert not bpy.ops.gwrap.resume_job.poll()
     assert bpy.ops.gwrap.wrap_scene.poll()
     start_wrap(photos)
     wait_for("DONE")
-    assert "is gone" not in draw(train_panel.GWRAP_PT_train).texts
+    assert "is gone" not in draw(training_panel.GWRAP_PT_train).texts
 
 
 @pytest.mark.parametrize("stored", ["{job}", "/", "//../../..", r"\\server\share\job", "//x\0y"])
@@ -168,12 +168,12 @@ def test_a_file_from_elsewhere_opens_no_job_unasked(
     elsewhere = tmp_path / "downloads"
     elsewhere.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(elsewhere / "work.blend"))
-    job_timer.forget_all()
-    monkeypatch.setattr(known_jobs, "_session", [])  # another person's machine
+    job_timer.forget_all_jobs()
+    monkeypatch.setattr(addon, "_session", [])  # another person's machine
     bpy.ops.wm.open_mainfile(filepath=str(elsewhere / "work.blend"))
-    assert watched_jobs.jobs == {}
+    assert job_timer.jobs == {}
     if bpy.context.scene.gwrap.job_folder:
-        assert "gwrap.find_job" in draw(train_panel.GWRAP_PT_train).operators
+        assert "gwrap.find_job" in draw(training_panel.GWRAP_PT_train).operators
     bpy.ops.gwrap.find_job(directory=folder)
     assert status().state == "DONE"  # type: ignore[attr-defined]
 
@@ -190,12 +190,12 @@ def test_disabling_the_addon_leaves_the_job_to_be_found(
     start_wrap(photos)
     wait_until_it_says_something(photos)
     folder = Path(bpy.context.scene.gwrap.job_folder)
-    client = watched_jobs.jobs[str(folder)].client
+    client = job_timer.jobs[str(folder)].client
     addon.unregister()
     assert client.poll().active, "the worker goes on"
     addon.register()
-    job_attach.attach_later()
-    assert watched_jobs.is_running(bpy.context.scene.gwrap.job_folder)
+    jobs.attach_later()
+    assert job_timer.is_running(bpy.context.scene.gwrap.job_folder)
     (folder / "finish").touch()
     wait_for("DONE")
     assert len(list(tags.objects_of_kind(bpy.context.scene, "mesh"))) == 1

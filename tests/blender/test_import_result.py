@@ -15,11 +15,16 @@ from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, WrapError
-from gaussian_wrapping_addon.ops.cameras.camera_objects import look_through
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.results.blend_writer import export_usd, write_blend
-from gaussian_wrapping_addon.ops.results.materials import set_shading, shading_of, texture_of
-from gaussian_wrapping_addon.ops.results.scene_objects import import_result
+from gaussian_wrapping_addon.ops import addon
+from gaussian_wrapping_addon.ops.cameras import look_through
+from gaussian_wrapping_addon.ops.scene_objects import (
+    export_usd,
+    import_result,
+    set_shading,
+    shading_of,
+    texture_of,
+    write_blend,
+)
 from tests.blender.region_shapes import region_from_object
 from tests.blender.synthetic_result import (
     BOX_SCENE,
@@ -63,7 +68,7 @@ def test_mesh_has_geometry_uvs_texture_and_material(tmp_path: Path) -> None:
     assert shading_of(mesh.materials[0]) == "LIT"
     assert thing.parent == imported.frame
     assert imported.frame.matrix_world == imported.frame.matrix_world.Identity(4)
-    assert tags.world_from_scene(imported.frame).translation.tolist() == [500000.25, 4000000.5, 30]
+    assert addon.world_from_scene(imported.frame).translation.tolist() == [500000.25, 4000000.5, 30]
 
 
 def test_cameras_project_as_the_photos(tmp_path: Path) -> None:
@@ -159,7 +164,7 @@ def test_deleted_objects_come_back_and_a_moved_folder_is_found(tmp_path: Path) -
     assert again.frame == first.frame
     assert len(again.meshes) == 1
     assert len(again.cameras) == len(CAMERAS)
-    assert tags.result_folder(again.frame) == tmp_path / "moved" / "result"
+    assert addon.result_folder(again.frame) == tmp_path / "moved" / "result"
 
 
 def break_npz(result: Path, **changes: np.ndarray) -> None:
@@ -228,16 +233,16 @@ def test_write_blend_then_open_from_another_place(tmp_path: Path) -> None:
     write_blend(result, result / "scene.blend")
     os.rename(tmp_path / "job", tmp_path / "elsewhere")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "elsewhere" / "result" / "scene.blend"))
-    meshes = [o for o in bpy.data.objects if tags.kind_of(o) == "mesh"]
-    assert {m[tags.REGION] for m in meshes} == {"auto", "leaf"}
+    meshes = [o for o in bpy.data.objects if addon.kind_of(o) == "mesh"]
+    assert {m[addon.REGION] for m in meshes} == {"auto", "leaf"}
     for mesh in meshes:
         assert len(mesh.data.polygons) == 12
         assert len(mesh.data.uv_layers) == 1
     for image in (i for i in bpy.data.images if i.source == "FILE"):
         assert image.filepath.startswith("//")
         assert tuple(image.size) == (16, 16), "the texture must be found beside the file"
-    (frame,) = tags.objects_of_kind(bpy.context.scene, "frame")
-    assert tags.result_folder(frame).resolve() == tmp_path / "elsewhere" / "result"
+    (frame,) = addon.objects_of_kind(bpy.context.scene, "frame")
+    assert addon.result_folder(frame).resolve() == tmp_path / "elsewhere" / "result"
     assert bpy.context.scene.camera is not None
     assert bpy.context.scene.render.resolution_x == 640
     again = import_result(tmp_path / "elsewhere" / "result", bpy.context.scene)

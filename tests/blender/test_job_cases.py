@@ -39,15 +39,11 @@ from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs import client as client_module
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
-    JobFolder,
-    JobStatus,
-    process_start_ticks,
-)
-from gaussian_wrapping_addon.ops.common import background
-from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer, live_preview, watched_jobs
-from gaussian_wrapping_addon.ops.results.result_files import read_result
-from gaussian_wrapping_addon.ui.training import train_panel
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.worker.spawn import process_start_ticks
+from gaussian_wrapping_addon.ops import background, job_timer, jobs
+from gaussian_wrapping_addon.ops.result_files import read_result
+from gaussian_wrapping_addon.ui import training_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import (
     meshes,
@@ -109,7 +105,7 @@ def job_in(stage: str, photos: Path, worker: Callable[[str, str], None]) -> Path
 
 def _undo(_blend: Path) -> None:
     bpy.context.scene.gwrap.job_folder = ""  # what undo does to a job started after the step
-    job_attach.after_undo(bpy.context.scene)
+    jobs.after_undo(bpy.context.scene)
 
 
 def _file_new(blend: Path) -> None:
@@ -144,7 +140,7 @@ def _disable(blend: Path) -> None:
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
     gaussian_wrapping_addon.unregister()
     gaussian_wrapping_addon.register()
-    job_attach.attach_later()
+    jobs.attach_later()
 
 
 def _reload(blend: Path) -> None:
@@ -153,7 +149,7 @@ def _reload(blend: Path) -> None:
     importlib.reload(job_timer)
     importlib.reload(registration)
     gaussian_wrapping_addon.register()
-    job_attach.attach_later()
+    jobs.attach_later()
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -179,8 +175,8 @@ def test_38_the_job_is_found_again(
     play_to(folder, "DONE")
     if stage == "import" and action in (_disable, _reload):
         assert meshes() == 0, "what was finished before is offered, not imported unasked"
-        assert "Import Finished Result" in draw(train_panel.GWRAP_PT_train).texts
-        bpy.ops.gwrap.import_result(directory=watched_jobs.result_to_import(bpy.context.scene))
+        assert "Import Finished Result" in draw(training_panel.GWRAP_PT_train).texts
+        bpy.ops.gwrap.import_result(directory=job_timer.result_to_import(bpy.context.scene))
     else:
         play_until(lambda: meshes() == 1, "never imported")
     assert meshes() == 1
@@ -220,7 +216,7 @@ def test_39_a_second_blender_is_refused_with_words(
             start()
     assert (folder / "job.json").read_bytes() == before
     assert status_of(folder).active
-    job_timer.forget_all()  # a Blender that did not start the job opens the same file
+    job_timer.forget_all_jobs()  # a Blender that did not start the job opens the same file
     bpy.ops.gwrap.find_job(directory=str(folder))
     assert not bpy.ops.gwrap.wrap_scene.poll()
     bpy.ops.gwrap.cancel_job()
@@ -257,7 +253,7 @@ def test_39_a_stale_lock_is_taken_over(
     target.write_status(old)
     bpy.ops.gwrap.find_job(directory=str(folder))
     assert status_of(folder).state == "LOST"
-    assert "gwrap.resume_job" in draw(train_panel.GWRAP_PT_train).operators
+    assert "gwrap.resume_job" in draw(training_panel.GWRAP_PT_train).operators
     assert (folder / "lock.json").is_file(), "it is the worker that takes over"
     worker("quick", "train")
     bpy.ops.gwrap.resume_job()
@@ -281,7 +277,7 @@ def test_41_cancelled_twice_in_each_stage(
         hold.set()
         assert not job_timer.poll_jobs()
         assert meshes() == 0
-        assert "Import Finished Result" in draw(train_panel.GWRAP_PT_train).texts
+        assert "Import Finished Result" in draw(training_panel.GWRAP_PT_train).texts
         return
     bpy.ops.gwrap.cancel_job()
     play_to(folder, "CANCELLED")
@@ -301,10 +297,10 @@ def test_41_a_worker_of_another_blender_that_does_not_listen_is_killed(
     worker("hang")
     folder = start_wrap(photos)
     play_until(lambda: status_of(folder).fraction == 0.25, "never at work")
-    process = watched_jobs.jobs[str(folder)].client._process
-    job_timer.forget_all()
+    process = job_timer.jobs[str(folder)].client._process
+    job_timer.forget_all_jobs()
     bpy.ops.gwrap.find_job(directory=str(folder))
-    watched_jobs.jobs[str(folder)].client.kill()
+    job_timer.jobs[str(folder)].client.kill()
     assert process is not None
     assert process.wait(5) == -9
     play_to(folder, "LOST")
@@ -320,7 +316,7 @@ def test_43_a_folder_deleted_while_the_job_runs(
     shutil.rmtree(folder)
     play_to(folder, "FAILED", "LOST")
     assert status_of(folder).error
-    draw(train_panel.GWRAP_PT_train)
+    draw(training_panel.GWRAP_PT_train)
     with pytest.raises(RuntimeError, match="holds no job"):
         bpy.ops.gwrap.resume_job()
 
@@ -364,10 +360,10 @@ def test_45_a_status_from_elsewhere_breaks_nothing(
     folder = start_wrap(photos)
     play_to(folder, "DONE")
     (folder / "status.json").write_text(json.dumps(values))
-    job_timer.forget_all()
+    job_timer.forget_all_jobs()
     bpy.ops.gwrap.find_job(directory=str(folder))
     job_timer.poll_jobs()
-    draw(train_panel.GWRAP_PT_train)
+    draw(training_panel.GWRAP_PT_train)
     shown = status_of(folder)
     assert shown.result in ("", str(folder / "result")), "nothing outside the folder is read"
 
@@ -382,10 +378,10 @@ def test_45_cancelling_a_job_from_elsewhere_ends_no_other_program(
         JobFolder(folder).write_status(
             JobStatus("RUNNING", pid=victim.pid, pid_started=process_start_ticks(victim.pid))
         )
-        job_timer.forget_all()
+        job_timer.forget_all_jobs()
         bpy.ops.gwrap.find_job(directory=str(folder))
         assert status_of(folder).active
-        watched_jobs.jobs[str(folder)].client.kill()
+        job_timer.jobs[str(folder)].client.kill()
         time.sleep(0.1)
         assert victim.poll() is None
     finally:
@@ -408,7 +404,7 @@ def _longest_s(folder: Path, rounds: int) -> float:
     """Return the longest time that Blender's thread spends in one tick or one drawing."""
     longest_s = 0.0
     for _ in range(rounds):
-        for work in (job_timer.poll_jobs, lambda: draw(train_panel.GWRAP_PT_train)):
+        for work in (job_timer.poll_jobs, lambda: draw(training_panel.GWRAP_PT_train)):
             begun_s = time.perf_counter() - _waited_s()
             work()
             longest_s = max(longest_s, time.perf_counter() - _waited_s() - begun_s)
@@ -422,19 +418,19 @@ def test_no_tick_blocks_blender(
 ) -> None:
     """With a long log and new pictures of the size that trainings write, at every look."""
     folder = job_in("train", photos, worker)
-    monkeypatch.setattr(live_preview, "EVERY_S", 0.0)
+    monkeypatch.setattr(job_timer, "EVERY_S", 0.0)
     monkeypatch.setattr(job_timer, "POLL_WAIT_S", POLL_WAIT_S)
     for name in ("log.txt", "worker-output.txt"):
         (folder / name).write_bytes(b"2026-01-01 12:00:00 INFO train 12.3 % a line\n" * 200_000)
     random = np.random.default_rng(0)
     noise = random.integers(0, 255, (240, PREVIEW_PX, 3)).astype(np.uint8)
-    path = folder / "stages" / "train-now" / live_preview.PICTURE
+    path = folder / "stages" / "train-now" / job_timer.PICTURE
     longest_s = []
     for attempt in range(3):
         path.write_bytes(npy_bytes(noise[:, :: -1 if attempt % 2 else 1]))
         longest_s.append(_longest_s(folder, 20))
     assert min(longest_s) < STALL_S, longest_s
-    assert len(live_preview.icons_of(str(folder))) == 2, "pictures were shown meanwhile"
+    assert len(job_timer.icons_of(str(folder))) == 2, "pictures were shown meanwhile"
 
 
 def test_bringing_in_a_typical_mesh_blocks_for_less_than_a_second(
@@ -447,7 +443,7 @@ def test_bringing_in_a_typical_mesh_blocks_for_less_than_a_second(
     _make_typical(result)
     reading = _HeldReading(result)
     hold.set()
-    watched_jobs.jobs[str(folder)].reading = reading
+    job_timer.jobs[str(folder)].reading = reading
     longest_s = 0.0
     while status_of(folder).stage == "import" and not meshes():
         begun_s = time.perf_counter() - _waited_s()

@@ -18,18 +18,13 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core import limits
-from gaussian_wrapping_addon.core.dataset.loading.check import Finding
 from gaussian_wrapping_addon.core.devices import choice
 from gaussian_wrapping_addon.core.errors import DeviceError
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
-from gaussian_wrapping_addon.ops.common import background, tags
-from gaussian_wrapping_addon.ops.jobs import job_actions, job_attach, job_timer, watched_jobs
-from gaussian_wrapping_addon.ops.worker import preferred_worker
-from gaussian_wrapping_addon.ui.dataset import dataset_panel
-from gaussian_wrapping_addon.ui.meshing import mesh_panel
-from gaussian_wrapping_addon.ui.results import report_panel
-from gaussian_wrapping_addon.ui.training import train_panel
+from gaussian_wrapping_addon.core.loading.check import Finding
+from gaussian_wrapping_addon.ops import addon, background, job_timer, jobs, worker_setup
+from gaussian_wrapping_addon.ui import dataset_panel, mesh_panel, result_panel, training_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import (
     start_wrap,
@@ -58,11 +53,11 @@ def test_wrap_scene_runs_and_imports(photos: Path, worker: object) -> None:
     assert job.settings.texture.source == "gaussians"
     assert job.settings.training.iterations == 800
     wait_for("DONE")
-    kinds = sorted(tags.kind_of(o) for o in bpy.context.scene.objects)
+    kinds = sorted(addon.kind_of(o) for o in bpy.context.scene.objects)
     assert kinds == ["camera"] * 4 + ["frame", "mesh", "region"]
     assert not job_timer.poll_jobs(), "the timer must stop when idle"
     assert background.poll() is None
-    layout = draw(report_panel.GWRAP_PT_report)
+    layout = draw(result_panel.GWRAP_PT_report)
     for text in ("27.2 dB", "4,321", "Faces\n12\n", "Closed\nYes\n", "87.5 %", "1 min 23 s"):
         assert text in layout.texts
     assert list(photos.iterdir()) == [], "nothing may be written into the photo folder"
@@ -72,7 +67,7 @@ def test_progress_cancel_and_resume(photos: Path, worker: Callable[[str], None])
     worker("slow")
     start_wrap(photos)
     wait_until_it_says_something(photos)
-    layout = draw(train_panel.GWRAP_PT_train)
+    layout = draw(training_panel.GWRAP_PT_train)
     assert "Train · 25 % · 1 min 08 s left" in layout.texts
     assert layout.header == "25 %"
     assert "gwrap.cancel_job" in layout.operators
@@ -84,14 +79,14 @@ def test_progress_cancel_and_resume(photos: Path, worker: Callable[[str], None])
     bpy.ops.gwrap.cancel_job()
     wait_for("CANCELLED")
     assert time.monotonic() - begun_s < 12.0
-    layout = draw(train_panel.GWRAP_PT_train)
+    layout = draw(training_panel.GWRAP_PT_train)
     assert "Cancelled at 25 %" in layout.texts
     assert {"gwrap.resume_job", "gwrap.wrap_scene"} <= set(layout.operators)
     assert not bpy.ops.gwrap.cancel_job.poll()
     worker("quick")
     assert bpy.ops.gwrap.resume_job() == {"FINISHED"}
     wait_for("DONE")
-    assert len(list(tags.objects_of_kind(bpy.context.scene, "mesh"))) == 1
+    assert len(list(addon.objects_of_kind(bpy.context.scene, "mesh"))) == 1
 
 
 @pytest.mark.parametrize(
@@ -107,11 +102,11 @@ def test_failures_are_shown_with_the_next_step(
     worker(mode)
     start_wrap(photos)
     wait_for("FAILED", "LOST")
-    job = watched_jobs.jobs[watched_jobs.key_of(bpy.context.scene.gwrap.job_folder)]
+    job = job_timer.jobs[job_timer.key_of(bpy.context.scene.gwrap.job_folder)]
     job.client._process.wait(10)  # type: ignore[union-attr]
     assert words in status().error  # type: ignore[attr-defined]
     assert status().state == state  # type: ignore[attr-defined]
-    layout = draw(train_panel.GWRAP_PT_train)
+    layout = draw(training_panel.GWRAP_PT_train)
     assert status().hint.split()[0] in layout.texts  # type: ignore[attr-defined]
     assert "gwrap.resume_job" in layout.operators
     worker("quick")
@@ -149,7 +144,7 @@ def finished_wrap(photos: Path) -> bpy.types.Object:
     """Wrap, and return the only region."""
     start_wrap(photos)
     wait_for("DONE")
-    (region,) = tags.objects_of_kind(bpy.context.scene, "region")
+    (region,) = addon.objects_of_kind(bpy.context.scene, "region")
     return region
 
 
@@ -163,7 +158,7 @@ def select(*things: bpy.types.Object) -> None:
 def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worker: object) -> None:
     region = finished_wrap(photos)
     folder = Path(bpy.context.scene.gwrap.job_folder)
-    frame = tags.frame_of(region)
+    frame = addon.frame_of(region)
     assert frame is not None
     frame.scale = (2, 2, 2)
     frame.rotation_euler = (0.3, -0.2, 1.0)
@@ -202,9 +197,9 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     distances = np.linalg.norm(np.array(body["vertices"])[:, None] - expected, axis=2)
     assert distances.min(0).max() < 1e-4
     wait_for("DONE")
-    meshes = {m[tags.REGION] for m in tags.objects_of_kind(bpy.context.scene, "mesh")}
+    meshes = {m[addon.REGION] for m in addon.objects_of_kind(bpy.context.scene, "mesh")}
     assert meshes == {"auto", "Front_Door"}
-    regions = list(tags.objects_of_kind(bpy.context.scene, "region"))
+    regions = list(addon.objects_of_kind(bpy.context.scene, "region"))
     assert len(regions) == 2, "the automatic box comes back, the edited one is not doubled"
 
 
@@ -294,11 +289,11 @@ def test_import_waits_for_object_mode(photos: Path, worker: Callable[[str], None
     (Path(bpy.context.scene.gwrap.job_folder) / "finish").touch()
     wait_for("DONE")
     assert job_timer.poll_jobs(), "the timer goes on"
-    assert not list(tags.objects_of_kind(bpy.context.scene, "mesh"))
-    assert "Leave Edit Mode" in draw(train_panel.GWRAP_PT_train).texts.replace("\n", " ")
+    assert not list(addon.objects_of_kind(bpy.context.scene, "mesh"))
+    assert "Leave Edit Mode" in draw(training_panel.GWRAP_PT_train).texts.replace("\n", " ")
     bpy.ops.object.mode_set(mode="OBJECT")
     assert not job_timer.poll_jobs()
-    assert len(list(tags.objects_of_kind(bpy.context.scene, "mesh"))) == 1
+    assert len(list(addon.objects_of_kind(bpy.context.scene, "mesh"))) == 1
 
 
 def test_undo_does_not_lose_a_running_job(photos: Path, worker: Callable[[str], None]) -> None:
@@ -306,8 +301,8 @@ def test_undo_does_not_lose_a_running_job(photos: Path, worker: Callable[[str], 
     start_wrap(photos)
     folder = bpy.context.scene.gwrap.job_folder
     bpy.context.scene.gwrap.job_folder = ""  # what undo does to a job started after the step
-    assert job_attach.after_undo in bpy.app.handlers.undo_post
-    job_attach.after_undo(bpy.context.scene)
+    assert jobs.after_undo in bpy.app.handlers.undo_post
+    jobs.after_undo(bpy.context.scene)
     assert bpy.context.scene.gwrap.job_folder == folder
 
 
@@ -317,7 +312,7 @@ def test_undo_of_an_import_keeps_the_job(photos: Path, worker: object) -> None:
     properties = bpy.context.scene.gwrap
     folder = properties.job_folder
     properties.job_folder, properties.job_command = "", "MESH"
-    job_attach.after_undo(bpy.context.scene)
+    jobs.after_undo(bpy.context.scene)
     assert (properties.job_folder, properties.job_command) == (folder, "WRAP")
 
 
@@ -329,7 +324,7 @@ def test_a_deleted_job_folder_is_survived(photos: Path, worker: Callable[[str], 
     pid = status().pid  # type: ignore[attr-defined]
     shutil.rmtree(bpy.context.scene.gwrap.job_folder)
     job_timer.poll_jobs()
-    draw(train_panel.GWRAP_PT_train)
+    draw(training_panel.GWRAP_PT_train)
     os.kill(pid, signal.SIGKILL)
     wait_for("FAILED", "LOST")
     with pytest.raises(RuntimeError, match="holds no job"):
@@ -343,7 +338,7 @@ def test_check_photos_lists_findings(photos: Path, monkeypatch: pytest.MonkeyPat
     ]
     check = ModuleType("check")
     check.check_input = lambda source, **_: found if source == photos else []  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "gaussian_wrapping_addon.core.dataset.loading.check", check)
+    monkeypatch.setitem(sys.modules, "gaussian_wrapping_addon.core.loading.check", check)
     assert not bpy.ops.gwrap.check_photos.poll()
     bpy.context.scene.gwrap.source = str(photos)
     bpy.ops.gwrap.check_photos()
@@ -376,11 +371,11 @@ def test_job_status_of_a_half_written_file_is_survived(
     assert job_timer.poll_jobs()
     (folder / "status.json").write_text(json.dumps([1, 2]))
     assert job_timer.poll_jobs()
-    draw(train_panel.GWRAP_PT_train)
+    draw(training_panel.GWRAP_PT_train)
 
 
 def test_worker_choice_without_preferences() -> None:
-    assert preferred_worker.worker_choice(bpy.context) == preferred_worker.WorkerChoice()
+    assert worker_setup.worker_choice(bpy.context) == worker_setup.WorkerChoice()
 
 
 def test_the_device_of_the_preferences_is_the_jobs(
@@ -390,14 +385,14 @@ def test_the_device_of_the_preferences_is_the_jobs(
     worker("refuse")
     scene = bpy.context.scene
     scene.gwrap.source = str(photos)
-    folder = job_actions.start_wrap(scene, preferred_worker.WorkerChoice(device="cuda"))
+    folder = jobs.start_wrap(scene, worker_setup.WorkerChoice(device="cuda"))
     assert read_job(folder / "job.json").settings.device == "cuda"
     wait_for("FAILED")
-    watched_jobs.jobs[watched_jobs.key_of(str(folder))].client._process.wait(10)  # type: ignore[union-attr]
-    job_actions.resume(scene, preferred_worker.WorkerChoice(device="cpu"))
+    job_timer.jobs[job_timer.key_of(str(folder))].client._process.wait(10)  # type: ignore[union-attr]
+    jobs.resume(scene, worker_setup.WorkerChoice(device="cpu"))
     assert read_job(folder / "job.json").settings.device == "cpu"
     wait_for("FAILED")
-    watched_jobs.jobs[watched_jobs.key_of(str(folder))].client._process.wait(10)  # type: ignore[union-attr]
+    job_timer.jobs[job_timer.key_of(str(folder))].client._process.wait(10)  # type: ignore[union-attr]
 
 
 def test_a_gpu_that_is_missing_starts_no_job(
@@ -411,5 +406,5 @@ def test_a_gpu_that_is_missing_starts_no_job(
     scene = bpy.context.scene
     scene.gwrap.source = str(photos)
     with pytest.raises(DeviceError, match="cuda cannot be used: There is no driver here"):
-        job_actions.start_wrap(scene, preferred_worker.WorkerChoice(device="cuda"))
+        jobs.start_wrap(scene, worker_setup.WorkerChoice(device="cuda"))
     assert not photos.with_name(photos.name + "_wrap").exists()

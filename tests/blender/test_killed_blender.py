@@ -15,7 +15,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.processes.process_identity import process_alive
+from gaussian_wrapping_addon.core.worker.spawn import process_alive
 from tests.blender.job_play import write_fake_python
 
 SCRIPT = Path(__file__).with_name("one_blender.py")

@@ -15,9 +15,9 @@ import pytest
 
 from gaussian_wrapping_addon.core.gaussians.preview_points import POINT, POINTS_FILE, points_file
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
-from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer, live_points, watched_jobs
-from gaussian_wrapping_addon.ops.results.scene_objects import import_result
-from gaussian_wrapping_addon.ui.jobs import points_drawing, status_bar
+from gaussian_wrapping_addon.ops import job_timer, jobs
+from gaussian_wrapping_addon.ops.scene_objects import import_result
+from gaussian_wrapping_addon.ui import job_view
 from tests.blender.fake_layout import FakeLayout
 from tests.blender.synthetic_result import write_result
 
@@ -55,16 +55,18 @@ def write_points(folder: Path, count: int = 5, data: bytes | None = None) -> Pat
 
 def look(folder: Path) -> None:
     """Let the timer search, wait for the reading, and let it take what was read."""
-    live_points._shown.setdefault(str(folder), live_points._Shown()).searched_s = float("-inf")
+    job_timer._live_points_shown.setdefault(
+        str(folder), job_timer._ShownPoints()
+    ).searched_s = float("-inf")
     job_timer.poll_jobs()
-    reading = live_points._shown[str(folder)].reading
+    reading = job_timer._live_points_shown[str(folder)].reading
     assert reading is not None
     assert reading.finished(20.0)
     job_timer.poll_jobs()
 
 
 def count() -> int | None:
-    points = live_points.points_of(bpy.context.scene)
+    points = job_timer.points_of(bpy.context.scene)
     return None if points is None else len(points.positions)
 
 
@@ -73,7 +75,7 @@ def test_points_follow_the_file_the_job_and_the_checkbox(tmp_path: Path) -> None
     assert count() is None
     path = write_points(tmp_path, 5)
     look(tmp_path)
-    points = live_points.points_of(bpy.context.scene)
+    points = job_timer.points_of(bpy.context.scene)
     assert points is not None
     assert points.positions[:, 0].tolist() == [0, 1, 2, 3, 4]
     np.testing.assert_allclose(points.colors, np.tile((1, 0, 0.2, 1), (5, 1)), atol=1e-6)
@@ -89,13 +91,13 @@ def test_points_follow_the_file_the_job_and_the_checkbox(tmp_path: Path) -> None
     bpy.context.scene.gwrap.show_points = True
     assert count() == 7
     other = bpy.data.scenes.new("other")
-    assert live_points.points_of(other) is None, "only where the job is"
+    assert job_timer.points_of(other) is None, "only where the job is"
     client.status = replace(RUNNING, stage="mesh")
     job_timer.poll_jobs()
     assert count() is None, "the training is over"
     client.status = replace(RUNNING, state="CANCELLED")
     job_timer.poll_jobs()
-    assert live_points._shown == {}
+    assert job_timer._live_points_shown == {}
     assert path.exists()
 
 
@@ -119,20 +121,20 @@ def test_another_file_shows_neither_points_nor_progress(tmp_path: Path) -> None:
     watch(tmp_path)
     look(tmp_path)
     assert count() == 5
-    assert len(status_bar.running_jobs()) == 1
+    assert len(job_view.running_jobs()) == 1
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    job_attach.attach_open_file()
+    jobs.attach_open_file()
     assert count() is None
-    assert status_bar.running_jobs() == []
+    assert job_view.running_jobs() == []
 
 
 def test_points_lie_where_the_result_will_be(tmp_path: Path) -> None:
     watch(tmp_path / "job")
-    assert live_points.frame_of_job(bpy.context.scene) is None
+    assert job_timer.frame_of_job(bpy.context.scene) is None
     import_result(write_result(tmp_path / "elsewhere"), bpy.context.scene)
-    assert live_points.frame_of_job(bpy.context.scene) is None, "another job's result"
+    assert job_timer.frame_of_job(bpy.context.scene) is None, "another job's result"
     imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
-    assert live_points.frame_of_job(bpy.context.scene) == imported.frame
+    assert job_timer.frame_of_job(bpy.context.scene) == imported.frame
 
 
 class Gpu:
@@ -186,31 +188,31 @@ def context(*, overlays: bool = True) -> Any:
     )
 
 
-@pytest.mark.parametrize("known", points_drawing.SHADERS)
+@pytest.mark.parametrize("known", job_view.SHADERS)
 def test_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known: str) -> None:
     gpu = Gpu(monkeypatch, known)
-    points_drawing._draw(context())
+    job_view._draw_points(context())
     assert gpu.drawn == []
     write_points(tmp_path / "job")
     watch(tmp_path / "job")
     look(tmp_path / "job")
-    points_drawing.VIEW.draw(context(overlays=False))
+    job_view.VIEW.draw(context(overlays=False))
     assert gpu.drawn == []
-    points_drawing._draw(context())
-    points_drawing._draw(context())
+    job_view._draw_points(context())
+    job_view._draw_points(context())
     assert gpu.made == 1, "one batch for as long as the points are the same"
     assert [matrix for _, matrix in gpu.drawn] == [None, None]
     imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
     imported.frame.location = (1, 2, 3)
     bpy.context.view_layer.update()
-    points_drawing._draw(context())
+    job_view._draw_points(context())
     matrix = gpu.drawn[-1][1]
     assert matrix is not None
     assert matrix[:3, 3].tolist() == [1, 2, 3]
     bpy.context.scene.gwrap.show_points = False
-    points_drawing._draw(context())
+    job_view._draw_points(context())
     assert len(gpu.drawn) == 3
-    assert points_drawing._drawing.batch is None, "the GPU's memory is given back"
+    assert job_view._drawing.batch is None, "the GPU's memory is given back"
 
 
 def test_an_error_while_drawing_is_logged_once(
@@ -219,12 +221,12 @@ def test_an_error_while_drawing_is_logged_once(
     def broken(*_arguments: object) -> None:
         raise RuntimeError("no context")
 
-    monkeypatch.setattr(points_drawing, "_draw", broken)
-    monkeypatch.setattr(status_bar, "_draw", broken)
+    monkeypatch.setattr(job_view, "_draw_points", broken)
+    monkeypatch.setattr(job_view, "_draw_status", broken)
     with caplog.at_level(logging.ERROR):
         for _ in range(3):
-            points_drawing.VIEW.draw(context())
-            status_bar.draw(SimpleNamespace(layout=None), bpy.context)
+            job_view.VIEW.draw(context())
+            job_view.draw(SimpleNamespace(layout=None), bpy.context)
     assert [r.message for r in caplog.records] == [
         "points cannot be drawn", "progress cannot be drawn",
     ]  # fmt: skip
@@ -232,7 +234,7 @@ def test_an_error_while_drawing_is_logged_once(
 
 def bar() -> FakeLayout:
     layout = FakeLayout()
-    status_bar.draw(SimpleNamespace(layout=layout), bpy.context)
+    job_view.draw(SimpleNamespace(layout=layout), bpy.context)
     return layout
 
 
@@ -246,7 +248,7 @@ def test_a_running_job_is_in_the_status_bar(tmp_path: Path, state: str) -> None:
     assert keywords["factor"] == 0.256
     for ended in ("DONE", "CANCELLED", "FAILED", "LOST"):
         client.status = replace(RUNNING, state=ended)
-        watched_jobs.jobs[str(tmp_path)].status = client.status
+        job_timer.jobs[str(tmp_path)].status = client.status
         assert bar().log == []
 
 
@@ -260,9 +262,9 @@ def test_the_newest_of_several_jobs_is_shown_and_the_others_are_counted(tmp_path
 
 def test_nothing_stays_in_the_status_bar(addon: Any) -> None:
     functions = bpy.types.STATUSBAR_HT_header._dyn_ui_initialize()
-    assert functions.count(status_bar.draw) == 1
+    assert functions.count(job_view.draw) == 1
     addon.register()
-    assert functions.count(status_bar.draw) == 1
+    assert functions.count(job_view.draw) == 1
     addon.unregister()
-    assert functions.count(status_bar.draw) == 0
-    assert points_drawing.VIEW.handle is None
+    assert functions.count(job_view.draw) == 0
+    assert job_view.VIEW.handle is None

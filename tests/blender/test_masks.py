@@ -11,15 +11,10 @@ import pytest
 from PIL import Image
 
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
-from gaussian_wrapping_addon.core.masks.mask_folder import (
-    MadeMask,
-    MaskList,
-    read_list,
-    write_list,
-)
-from gaussian_wrapping_addon.ops.common import known_jobs, tags
-from gaussian_wrapping_addon.ops.masks import mask_review
-from gaussian_wrapping_addon.ui.regions import region_panel
+from gaussian_wrapping_addon.core.masks.mask_folder import MadeMask, MaskList, read_list, write_list
+from gaussian_wrapping_addon.ops import addon, masks
+from gaussian_wrapping_addon.ops import addon as known_jobs
+from gaussian_wrapping_addon.ui import region_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import start_wrap, wait_for
 
@@ -48,7 +43,7 @@ def masked(tmp_path: Path, addon: object) -> Path:
 
 def picture() -> np.ndarray:
     """Return the picture under review, (h, w, 4), from the top down."""
-    image = bpy.data.images[mask_review.IMAGE_NAME]
+    image = bpy.data.images[masks.IMAGE_NAME]
     values = np.empty(len(image.pixels), np.float32)
     image.pixels.foreach_get(values)
     return values.reshape(image.size[1], image.size[0], 4)[::-1]
@@ -69,10 +64,10 @@ def test_photos_are_shown_under_their_masks(masked: Path) -> None:
     np.testing.assert_allclose(shown[1:, : WIDTH // 2, 0], red, atol=0.01)
     np.testing.assert_allclose(shown[0, :, 0], red, atol=0.01)
     np.testing.assert_allclose(
-        shown[1:, WIDTH // 2 :, 0], mask_review.DIMMED * red + mask_review.LEFT_OUT[0], atol=0.01
+        shown[1:, WIDTH // 2 :, 0], masks.DIMMED * red + masks.LEFT_OUT[0], atol=0.01
     )
-    np.testing.assert_allclose(shown[1:, WIDTH // 2 :, 2], mask_review.LEFT_OUT[2], atol=0.01)
-    assert set(bpy.data.images.keys()) - before == {mask_review.IMAGE_NAME}
+    np.testing.assert_allclose(shown[1:, WIDTH // 2 :, 2], masks.LEFT_OUT[2], atol=0.01)
+    assert set(bpy.data.images.keys()) - before == {masks.IMAGE_NAME}
     assert bpy.ops.gwrap.step_mask() == {"FINISHED"}
     np.testing.assert_allclose(picture()[1:, : WIDTH // 2, 0], 120 / 255, atol=0.01)
     bpy.ops.gwrap.step_mask(by=-1)
@@ -90,8 +85,8 @@ def test_decisions_are_written_at_once_and_can_be_taken_back(masked: Path) -> No
     bpy.ops.gwrap.decide_mask(accepted=True)
     bpy.ops.gwrap.decide_mask(accepted=False)
     assert rejected(masked) == {"a.png", "c.png"}
-    assert mask_review.shown()[0].photo == "a.png"  # after the last comes the first
-    assert mask_review.place() == (1, 3, 2)
+    assert masks.shown()[0].photo == "a.png"  # after the last comes the first
+    assert masks.place() == (1, 3, 2)
     words = draw(region_panel.GWRAP_PT_region).texts
     assert "a.png" in words
     assert "1 of 3, 2 rejected" in words
@@ -107,13 +102,13 @@ def test_other_masks_that_were_made_meanwhile_are_not_decided_on(masked: Path) -
     with pytest.raises(RuntimeError, match="Other masks were made meanwhile"):
         bpy.ops.gwrap.decide_mask(accepted=False)
     assert rejected(masked) == set()
-    assert not mask_review.is_open()
+    assert not masks.is_open()
 
 
 def test_a_deleted_mask_is_shown_as_left_out(masked: Path) -> None:
     (masked / "masks" / "a.png.png").unlink()
     bpy.ops.gwrap.review_masks()
-    np.testing.assert_allclose(picture()[..., 2], mask_review.LEFT_OUT[2], atol=0.01)
+    np.testing.assert_allclose(picture()[..., 2], masks.LEFT_OUT[2], atol=0.01)
 
 
 @pytest.mark.parametrize("damage", ["no list", "bad list", "no photo", "bad mask"])
@@ -138,7 +133,7 @@ def test_masks_from_a_region_train_the_same_photos_again(photos: Path, worker: o
     start_wrap(photos)
     wait_for("DONE")
     folder = Path(bpy.context.scene.gwrap.job_folder)
-    (region,) = tags.objects_of_kind(bpy.context.scene, "region")
+    (region,) = addon.objects_of_kind(bpy.context.scene, "region")
     region.select_set(True)
     bpy.context.view_layer.objects.active = region
     assert bpy.ops.gwrap.masks_from_region() == {"FINISHED"}

@@ -15,18 +15,20 @@ from pathlib import Path
 import bpy
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.loading import check
-from gaussian_wrapping_addon.core.dataset.video.probe import ProbedVideo
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
-from gaussian_wrapping_addon.ops.common import background, tags
-from gaussian_wrapping_addon.ops.dataset import photo_check
-from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer, panel_state
-from gaussian_wrapping_addon.ops.jobs.panel_settings import choices_key, job_settings
-from gaussian_wrapping_addon.ops.jobs.panel_state import PRIMARY, Stage
-from gaussian_wrapping_addon.ops.jobs.scene_folders import output_of
-from gaussian_wrapping_addon.ops.results.report_data import ReportData, report_of
-from gaussian_wrapping_addon.ops.training import training_estimate
+from gaussian_wrapping_addon.core.loading import check
+from gaussian_wrapping_addon.core.photos.video import ProbedVideo
+from gaussian_wrapping_addon.ops import addon, background, dataset, job_timer, jobs, panel_settings
+from gaussian_wrapping_addon.ops import training as training_estimate
+from gaussian_wrapping_addon.ops.panel_settings import (
+    PRIMARY,
+    Stage,
+    choices_key,
+    job_settings,
+    output_of,
+)
+from gaussian_wrapping_addon.ops.result_files import ReportData, report_of
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.job_play import write_fake_python
 from tests.blender.panel_states import (
@@ -66,8 +68,8 @@ pytestmark = pytest.mark.usefixtures("addon")
 
 @pytest.fixture(autouse=True)
 def _nothing_left() -> None:
-    job_timer.forget_all()
-    photo_check.stop()
+    job_timer.forget_all_jobs()
+    dataset.stop_check()
     training_estimate.forget()
 
 
@@ -90,7 +92,7 @@ def test_every_state_has_one_large_button_and_that_is_its_next_step(
     state: State, tmp_path: Path
 ) -> None:
     state(tmp_path)
-    assert panel_state.stage_of(bpy.context) is STATES[state]
+    assert panel_settings.stage_of(bpy.context) is STATES[state]
     panels = tab()
     assert [name for name in panels if "/" not in name] == ORDER
     large = [b for layout in panels.values() for b in layout.buttons if b.large]
@@ -132,7 +134,7 @@ def check_headers(state: State, panels: dict[str, FakeLayout]) -> None:
     found = tuple(panels[name].header for name in ("Dataset", "Train", "Mesh", "Result"))
     assert found == HEADERS[state]
     assert panels["Texture"].header == "Automatic, photos"
-    count = sum(1 for _ in tags.objects_of_kind(bpy.context.scene, "region"))
+    count = sum(1 for _ in addon.objects_of_kind(bpy.context.scene, "region"))
     words_of = {0: "No regions yet", 1: "1 region"}
     assert panels["Region"].header == words_of.get(count, f"{count} regions")
 
@@ -375,15 +377,15 @@ def test_other_photos_begin_anew_beside_the_earlier_result(tmp_path: Path) -> No
     other.mkdir()
     bpy.ops.gwrap.choose_input(filepath=str(other))
     assert (properties.job_folder, properties.output) == ("", "")
-    job_attach.after_undo(bpy.context.scene)
+    jobs.after_undo(bpy.context.scene)
     assert properties.job_folder == "", "undo does not bring the job of other photos back"
-    assert panel_state.stage_of(bpy.context) is Stage.READY
+    assert panel_settings.stage_of(bpy.context) is Stage.READY
     assert tab()["Result"].header == "1 mesh"
 
 
 def test_a_check_of_photos_that_are_no_longer_chosen_is_dropped(tmp_path: Path) -> None:
     choose_photos(tmp_path)
-    photo_check.start(bpy.context.scene)
+    dataset.start_check(bpy.context.scene)
     bpy.context.scene.gwrap.source = str(tmp_path)
     play(background.poll)
     assert tab()["Dataset"].header == "Not checked"
@@ -401,8 +403,8 @@ def test_copying_the_report(tmp_path: Path) -> None:
     assert not bpy.ops.gwrap.copy_report.poll()
     done(tmp_path)
     assert bpy.ops.gwrap.copy_report() == {"FINISHED"}
-    frame = tags.current_frame(bpy.context.scene, None)
-    report = report_of(tags.figures_of(frame))
+    frame = addon.current_frame(bpy.context.scene, None)
+    report = report_of(addon.figures_of(frame))
     text = report.as_text()
     for name, value in (*report.rows, *report.stages, *report.regions[0].rows):
         assert f"{name}: {value}" in text

@@ -12,16 +12,10 @@ import pytest
 from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.core.jobs.commands.doctor import Diagnosis
 from gaussian_wrapping_addon.core.jobs.store.job_folder import STATES, JobStatus
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.jobs import job_timer
-from gaussian_wrapping_addon.ops.results.scene_objects import import_result
-from gaussian_wrapping_addon.ops.worker import worker_check
-from gaussian_wrapping_addon.ui import preferences
-from gaussian_wrapping_addon.ui.common.text import progress_text, time_span
-from gaussian_wrapping_addon.ui.meshing import mesh_panel, texture_panel
-from gaussian_wrapping_addon.ui.placement import scene_panel
-from gaussian_wrapping_addon.ui.results import result_panel
-from gaussian_wrapping_addon.ui.training import train_panel
+from gaussian_wrapping_addon.ops import addon, job_timer, worker_setup
+from gaussian_wrapping_addon.ops.scene_objects import import_result
+from gaussian_wrapping_addon.ui import mesh_panel, preferences, result_panel, training_panel
+from gaussian_wrapping_addon.ui.panel_base import progress_text, time_span
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.synthetic_result import write_result
 
@@ -29,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("addon")
 
 PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel)]
 REGION = next(cls for cls in PANELS if cls.bl_label == "Region")
-TRAIN, MESH = train_panel.GWRAP_PT_train, mesh_panel.GWRAP_PT_mesh
+TRAIN, MESH = training_panel.GWRAP_PT_train, mesh_panel.GWRAP_PT_mesh
 
 
 class FakeClient:
@@ -44,7 +38,7 @@ class FakeClient:
 
 @pytest.fixture(autouse=True)
 def _no_jobs() -> None:
-    job_timer.forget_all()
+    job_timer.forget_all_jobs()
 
 
 def show(status: JobStatus, command: str = "WRAP") -> None:
@@ -113,7 +107,7 @@ def test_advanced_panel_asks_for_what_counts_by_the_method(method: str) -> None:
 
 
 def test_texture_panel_has_every_map() -> None:
-    names = [field.name for field in draw(texture_panel.GWRAP_PT_texture).fields]
+    names = [field.name for field in draw(mesh_panel.GWRAP_PT_texture).fields]
     assert names == [
         "texture_size",
         "max_atlases",
@@ -141,10 +135,10 @@ def test_region_and_result_panels_with_a_result(tmp_path: Path) -> None:
 
 
 def test_scene_tools_with_a_result(tmp_path: Path) -> None:
-    assert draw(scene_panel.GWRAP_PT_scene_tools).operators == []
+    assert draw(result_panel.GWRAP_PT_scene_tools).operators == []
     imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
     bpy.context.view_layer.update()
-    layout = draw(scene_panel.GWRAP_PT_scene_tools)
+    layout = draw(result_panel.GWRAP_PT_scene_tools)
     assert "Show Photo Cameras" in layout.texts
     assert "Scale 1" in layout.texts
     assert layout.operators == [
@@ -155,13 +149,13 @@ def test_scene_tools_with_a_result(tmp_path: Path) -> None:
     for x in (0.0, 0.25):
         bpy.context.scene.cursor.location = (x, 0, 0)
         bpy.ops.gwrap.add_point()
-    assert "2 points selected, 25 cm apart" in draw(scene_panel.GWRAP_PT_scene_tools).texts
+    assert "2 points selected, 25 cm apart" in draw(result_panel.GWRAP_PT_scene_tools).texts
     imported.frame.scale = (1, 2, 1)
     bpy.context.view_layer.update()
-    assert "scaled differently" in draw(scene_panel.GWRAP_PT_scene_tools).texts
+    assert "scaled differently" in draw(result_panel.GWRAP_PT_scene_tools).texts
     bpy.context.view_layer.objects.active = imported.meshes[0]
     bpy.ops.object.mode_set(mode="EDIT")
-    assert "Select vertices" in draw(scene_panel.GWRAP_PT_scene_tools).texts
+    assert "Select vertices" in draw(result_panel.GWRAP_PT_scene_tools).texts
 
 
 @pytest.mark.parametrize(
@@ -169,8 +163,8 @@ def test_scene_tools_with_a_result(tmp_path: Path) -> None:
 )
 def test_result_panel_survives_edited_properties(tmp_path: Path, text: str) -> None:
     imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
-    imported.frame[tags.FIGURES] = text
-    imported.frame[tags.RESULT] = 5
+    imported.frame[addon.FIGURES] = text
+    imported.frame[addon.RESULT] = 5
     imported.meshes[0].data.materials.clear()
     for panel in PANELS:
         draw(panel)
@@ -178,7 +172,7 @@ def test_result_panel_survives_edited_properties(tmp_path: Path, text: str) -> N
 
 def test_preferences_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [Diagnosis("torch", False, "cannot be imported", "pip install torch")]
-    monkeypatch.setattr(worker_check, "_findings", [*found, Diagnosis("numpy", True, "1.26.4")])
+    monkeypatch.setattr(worker_setup, "_findings", [*found, Diagnosis("numpy", True, "1.26.4")])
     layout = FakeLayout()
     names = preferences.GWRAP_preferences.__annotations__
     owner = SimpleNamespace(properties=set(names))
@@ -187,7 +181,7 @@ def test_preferences_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "pip install torch" in layout.texts
     assert "gwrap.set_up_worker" in layout.operators
     assert {a[1] for name, a, _ in layout.log if name == "prop"} == set(names)
-    assert worker_check.as_text().splitlines()[0].startswith("BAD  torch: cannot be imported")
+    assert worker_setup.as_text().splitlines()[0].startswith("BAD  torch: cannot be imported")
 
 
 @pytest.mark.parametrize(

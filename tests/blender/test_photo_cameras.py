@@ -11,18 +11,17 @@ import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.ops.cameras.camera_objects import (
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.ops import addon
+from gaussian_wrapping_addon.ops.cameras import (
     CLIP_END,
     CLIP_START,
     cameras_under,
     create_camera,
     look_through,
 )
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.placement.placement import place
-from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult, import_result
+from gaussian_wrapping_addon.ops.placement import place
+from gaussian_wrapping_addon.ops.scene_objects import ImportedResult, import_result
 from tests.blender.synthetic_result import CAMERAS, png_bytes, rotation_about, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
@@ -131,7 +130,7 @@ def test_photos_one_after_another(result: ImportedResult) -> None:
     bpy.context.view_layer.update()
     assert [c for c in order if c.visible_get()] == [order[-1]], "a hidden one shows no photo"
     assert all(len(c.users_collection) >= 1 for c in order)
-    import_result(tags.result_folder(result.frame), bpy.context.scene)
+    import_result(addon.result_folder(result.frame), bpy.context.scene)
     assert cameras_under(result.frame) == order
     bpy.ops.gwrap.view_photo()
     assert bpy.context.scene.camera == order[-1], "without a selected camera it stays"
@@ -159,7 +158,7 @@ def test_a_straightened_photo_is_found_in_a_job_that_was_moved(tmp_path: Path, m
     images = job / "stages" / "cameras-1" / "images"
     images.mkdir(parents=True)
     (images / "0.png").write_bytes(png_bytes(np.full((480, 640, 3), 9, np.uint8)))
-    thing[tags.PHOTO] = str(images / "0.png")
+    thing[addon.PHOTO] = str(images / "0.png")
     if moved:
         job.rename(tmp_path / "elsewhere")
         import_result(tmp_path / "elsewhere" / "result", bpy.context.scene)

@@ -14,10 +14,9 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from gaussian_wrapping_addon.core.jobs import client as job_client
-from gaussian_wrapping_addon.ops.common import background
-from gaussian_wrapping_addon.ops.common.addon import properties_of
-from gaussian_wrapping_addon.ops.dataset import photo_check, photo_look
-from gaussian_wrapping_addon.ui.dataset import dataset_panel
+from gaussian_wrapping_addon.ops import background, dataset
+from gaussian_wrapping_addon.ops.addon import properties_of
+from gaussian_wrapping_addon.ui import dataset_panel
 from tests.blender.fake_layout import draw
 
 pytestmark = pytest.mark.usefixtures("addon")
@@ -26,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("addon")
 @pytest.fixture(autouse=True)
 def stopped() -> Iterator[None]:
     yield
-    photo_check.stop()
+    dataset.stop_check()
 
 
 def photos(folder: Path) -> Path:
@@ -45,7 +44,7 @@ def photos(folder: Path) -> Path:
 
 def wait_for_the_end() -> None:
     until_s = time.monotonic() + 60
-    while photo_check.is_busy() or photo_look.is_busy():
+    while dataset.is_checking() or dataset.is_busy():
         assert time.monotonic() < until_s
         background.poll()
         time.sleep(0.02)
@@ -54,7 +53,7 @@ def wait_for_the_end() -> None:
 def test_findings_of_the_worker_join_those_of_the_check(tmp_path: Path) -> None:
     properties = properties_of(bpy.context.scene)
     properties.source = str(photos(tmp_path / "set"))
-    photo_check.start(bpy.context.scene)
+    dataset.start_check(bpy.context.scene)
     wait_for_the_end()
     texts = draw(dataset_panel.GWRAP_PT_dataset).texts.replace("\n", " ")
     assert "1 photo is much less sharp than the photos beside: p3.jpg." in texts
@@ -69,7 +68,7 @@ def test_without_a_worker_the_check_goes_on(
     monkeypatch.delenv(job_client.PYTHON_VARIABLE, raising=False)
     monkeypatch.setattr(job_client, "_has_torch", lambda: False)
     properties_of(bpy.context.scene).source = str(photos(tmp_path / "set"))
-    photo_check.start(bpy.context.scene)
+    dataset.start_check(bpy.context.scene)
     wait_for_the_end()
     severities = {f.severity for f in properties_of(bpy.context.scene).findings}
     assert severities == {"fact"}
@@ -77,7 +76,7 @@ def test_without_a_worker_the_check_goes_on(
 
 def test_a_missing_package_gets_its_button() -> None:
     error = {"error": "a.heic: no package.", "hint": "Press Add.", "extras": ["heif"]}
-    (row,) = photo_look.rows_of([{"message": "photo 1 of 2"}, error])
+    (row,) = dataset.rows_of([{"message": "photo 1 of 2"}, error])
     assert row == {
         "severity": "error", "message": "a.heic: no package.", "hint": "Press Add.",
         "extra": "heif",
@@ -97,6 +96,6 @@ def test_a_missing_package_gets_its_button() -> None:
 
 
 def test_a_worker_that_says_nothing_is_told() -> None:
-    (row,) = photo_look.rows_of([], "It broke")
+    (row,) = dataset.rows_of([], "It broke")
     assert row["severity"] == "warning"
     assert "It broke" in row["message"]

@@ -13,18 +13,17 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
-from gaussian_wrapping_addon.core.settings.saved_settings import savable_settings
-from gaussian_wrapping_addon.ops.jobs import job_timer
-from gaussian_wrapping_addon.ops.jobs.panel_settings import job_settings
-from gaussian_wrapping_addon.ops.presets import preset_files
-from gaussian_wrapping_addon.ops.presets.preset_files import (
+from gaussian_wrapping_addon.core.settings.job import savable_settings
+from gaussian_wrapping_addon.ops import job_timer, presets
+from gaussian_wrapping_addon.ops.panel_settings import job_settings
+from gaussian_wrapping_addon.ops.presets import (
     MOST_PRESETS,
     apply_preset,
     delete_preset,
     preset_names,
     save_preset,
 )
-from gaussian_wrapping_addon.ui.presets.preset_menu import GWRAP_MT_presets
+from gaussian_wrapping_addon.ui.training_panel import GWRAP_MT_presets
 from tests.blender.fake_layout import FakeLayout
 
 pytestmark = pytest.mark.usefixtures("addon")
@@ -176,7 +175,7 @@ def test_a_preset_of_the_same_name_is_replaced_and_there_is_a_limit(folder: Path
 
 
 def test_no_folder_for_presets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preset_files, "_folder", lambda create=False: None)
+    monkeypatch.setattr(presets, "_folder", lambda create=False: None)
     assert preset_names() == []
     with pytest.raises(UsageError, match="no folder for presets"):
         save_preset(bpy.context.scene, "one")
@@ -189,7 +188,7 @@ def test_no_preset_is_applied_while_a_job_runs() -> None:
     job_timer.watch(bpy.context.scene, Path("/tmp/gwrap-none"), client, imports=False)  # type: ignore[arg-type]
     assert not bpy.ops.gwrap.apply_preset.poll()
     assert bpy.ops.gwrap.save_preset.poll()
-    job_timer.forget_all()
+    job_timer.forget_all_jobs()
     assert bpy.ops.gwrap.apply_preset.poll()
 
 

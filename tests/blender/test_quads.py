@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.mesh.polygons import JoinedMesh, Polygons, join_triangles
-from gaussian_wrapping_addon.ops.baking import quads
-from gaussian_wrapping_addon.ops.baking.quads import quads_of
-from gaussian_wrapping_addon.ops.baking.triangulation import Triangulation, triangulation_of
+from gaussian_wrapping_addon.core.mesh.textured_mesh import JoinedMesh, Polygons, join_triangles
+from gaussian_wrapping_addon.ops import bake_objects
+from gaussian_wrapping_addon.ops.bake_objects import Triangulation, quads_of, triangulation_of
 
 WANTED = 400
 
@@ -124,8 +123,8 @@ def test_corners_repeated_along_seams_and_loose_ones_do_not_matter() -> None:
 def test_modifiers_count_and_large_meshes_are_decimated(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(quads, "MAX_TRIANGLES", 2000)
-    caplog.set_level("INFO", quads.__name__)
+    monkeypatch.setattr(bake_objects, "MAX_TRIANGLES", 2000)
+    caplog.set_level("INFO", bake_objects.__name__)
     thing = add_ball()
     thing.modifiers.new("More", "SUBSURF").levels = 1
     before = file_content()
@@ -195,7 +194,7 @@ def test_what_quadriflow_cannot_work_on_is_refused_with_numbers(
     assert thing.name in caught.value.message
     assert "Voxel" in caught.value.hint
     # Blender itself refuses it too, without saying why: that is reported as well.
-    monkeypatch.setattr(quads, "_refuse_unsound", lambda *_: False)
+    monkeypatch.setattr(bake_objects, "_refuse_unsound", lambda *_: False)
     with pytest.raises(UsageError, match=r"made no quads of the 128\d triangles"):
         quads_on(thing)
     assert file_content() == before

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.regions.region_box import (
+from gaussian_wrapping_addon.ops import addon
+from gaussian_wrapping_addon.ops.region_objects import (
     LEAST_HALF,
     cage_frame,
     cage_matrix,
+    hull_in_blender,
     is_editable_box,
     set_cage_matrix,
     steadied,
 )
-from gaussian_wrapping_addon.ops.regions.region_objects import hull_in_blender
 
 pytestmark = pytest.mark.usefixtures("addon")
 
@@ -26,7 +26,7 @@ def make_box(*, parent: bool = True, scale: tuple = (0.5, 2.0, 0.1)) -> bpy.type
     collection = bpy.context.scene.collection
     thing = bpy.data.objects.new("box", None)
     thing.empty_display_type, thing.empty_display_size = "CUBE", 0.7
-    thing[tags.KIND] = "region"
+    thing[addon.KIND] = "region"
     thing.location, thing.rotation_euler, thing.scale = (0.4, -0.3, 0.9), (0.2, 0.5, -1.1), scale
     thing.delta_location, thing.delta_scale = (0.1, 0, 0), (1, 2, 1)
     collection.objects.link(thing)

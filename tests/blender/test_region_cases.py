@@ -13,9 +13,10 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.regions.region_hull import MOST_CANDIDATES, convex_hull
-from gaussian_wrapping_addon.ops.regions.region_objects import (
+from gaussian_wrapping_addon.ops import addon
+from gaussian_wrapping_addon.ops.region_objects import (
+    MOST_CANDIDATES,
+    convex_hull,
     is_convex,
     local_hull,
 )
@@ -141,7 +142,7 @@ def test_36_a_dented_mesh_is_told_that_its_hull_counts(monkeypatch: pytest.Monke
     thing = bpy.context.view_layer.objects.active
     assert not is_convex(thing)
     told: list[tuple[set[str], str]] = []
-    from gaussian_wrapping_addon.ops.regions.region_operators import GWRAP_OT_use_as_region
+    from gaussian_wrapping_addon.ops.region_operators import GWRAP_OT_use_as_region
 
     class Fake:
         def report(self, kind: set[str], text: str) -> None:
@@ -190,16 +191,16 @@ def test_36_an_object_of_a_library_is_refused(tmp_path: Path) -> None:
     bpy.context.view_layer.objects.active = thing
     with pytest.raises(RuntimeError, match="linked from a library"):
         bpy.ops.gwrap.use_as_region()
-    assert tags.kind_of(thing) == ""
+    assert addon.kind_of(thing) == ""
     assert len(region_from_object(thing)) == 42, "its volume can be exported all the same"
 
 
 def regions() -> list[bpy.types.Object]:
-    return list(tags.objects_of_kind(bpy.context.scene, "region"))
+    return list(addon.objects_of_kind(bpy.context.scene, "region"))
 
 
 def mesh_names() -> set[str]:
-    return {m[tags.REGION] for m in tags.objects_of_kind(bpy.context.scene, "mesh")}
+    return {m[addon.REGION] for m in addon.objects_of_kind(bpy.context.scene, "mesh")}
 
 
 def box_at(x: float, name: str) -> bpy.types.Object:
@@ -245,10 +246,10 @@ def test_36_a_region_changed_while_its_job_runs(
     assert {"auto", "Door"} <= mesh_names(), "the result is there under the name it was asked by"
     if change == "renamed":
         assert len(regions()) == before
-        assert box[tags.REGION] == "Door"
+        assert box[addon.REGION] == "Door"
         assert box.name == "Window", "the person's name stays"
     else:
-        (made,) = [r for r in regions() if r[tags.REGION] == "Door" and tags.frame_of(r)]
+        (made,) = [r for r in regions() if r[addon.REGION] == "Door" and addon.frame_of(r)]
         assert volume(region_from_object(made)) > 0.0, "a box is made of the result's own"
     assert not [o for o in bpy.data.objects if o.name.startswith("Door") and not o.users]
 
@@ -270,16 +271,16 @@ def test_36_copies_and_new_names_never_overwrite(photos: Path, worker: object) -
 
     mesh(first, copy)
     assert {"auto", "Door", "Door_001"} <= mesh_names()
-    assert (first[tags.REGION], copy[tags.REGION]) == ("Door", "Door_001")
+    assert (first[addon.REGION], copy[addon.REGION]) == ("Door", "Door_001")
     third = copy.copy()  # carries the mark of its origin
     first.users_collection[0].objects.link(third)
     copy.name = "Old Copy"
     third.name = "Third"
     mesh(third)
-    assert third[tags.REGION] == "Third"
+    assert third[addon.REGION] == "Third"
     assert {"auto", "Door", "Door_001", "Third"} == mesh_names()
     mesh(copy)
-    assert copy[tags.REGION] == "Door_001", "the one that is left keeps its folder"
+    assert copy[addon.REGION] == "Door_001", "the one that is left keeps its folder"
     assert {"auto", "Door", "Door_001", "Third"} == mesh_names()
     assert {p.name for p in (folder / "result").iterdir() if (p / "mesh.npz").is_file()} == (
         mesh_names()

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.regions import region_watch
-from gaussian_wrapping_addon.ops.regions.region_objects import create_region
-from gaussian_wrapping_addon.ui.regions import region_drawing
+from gaussian_wrapping_addon.ops import addon, region_operators
+from gaussian_wrapping_addon.ops.region_objects import create_region
+from gaussian_wrapping_addon.ui import region_panel
 
 pytestmark = pytest.mark.usefixtures("addon")
 
@@ -29,18 +28,18 @@ def box(name: str = "box") -> bpy.types.Object:
 def mesh_region() -> bpy.types.Object:
     bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=1)
     thing = bpy.context.view_layer.objects.active
-    thing[tags.KIND] = "region"
+    thing[addon.KIND] = "region"
     bpy.context.view_layer.update()
     return thing
 
 
 def names() -> list[str]:
-    found = region_drawing.visible_regions(bpy.context.scene, bpy.context.view_layer)
+    found = region_panel.visible_regions(bpy.context.scene, bpy.context.view_layer)
     return [thing.name for thing in found]
 
 
 def test_a_box_is_its_twelve_edges() -> None:
-    edges = region_drawing.edges_of(box())
+    edges = region_panel.edges_of(box())
     assert edges is not None
     assert edges.shape == (12, 2, 3)
     assert edges.dtype == np.float32
@@ -52,7 +51,7 @@ def test_a_box_is_its_twelve_edges() -> None:
 
 def test_a_convex_mesh_is_its_own_edges_and_a_dent_is_none() -> None:
     thing = mesh_region()  # an icosahedron
-    edges = region_drawing.edges_of(thing)
+    edges = region_panel.edges_of(thing)
     assert edges is not None
     own = {
         tuple(sorted(tuple(np.round(thing.data.vertices[i].co, 4)) for i in edge.vertices))
@@ -68,19 +67,19 @@ def test_a_convex_mesh_is_its_own_edges_and_a_dent_is_none() -> None:
     thing.data.vertices[0].co *= 0.01
     thing.data.update()
     bpy.context.view_layer.update()
-    dented = region_drawing.edges_of(thing)
+    dented = region_panel.edges_of(thing)
     assert dented is not None
     assert np.linalg.norm(dented, axis=2).min() > 0.5, "nothing is drawn to a dent"
 
 
 def test_what_is_no_region_draws_nothing() -> None:
     bpy.ops.curve.primitive_bezier_circle_add()
-    assert region_drawing.edges_of(bpy.context.view_layer.objects.active) is None
+    assert region_panel.edges_of(bpy.context.view_layer.objects.active) is None
     line = bpy.data.meshes.new("line")
     line.from_pydata([(0, 0, 0), (0, 0, 1)], [(0, 1)], [])
-    assert region_drawing.edges_of(bpy.data.objects.new("line", line)) is None
+    assert region_panel.edges_of(bpy.data.objects.new("line", line)) is None
     bpy.ops.object.empty_add(type="SPHERE")
-    assert region_drawing.edges_of(bpy.context.view_layer.objects.active) is None
+    assert region_panel.edges_of(bpy.context.view_layer.objects.active) is None
 
 
 def test_hidden_regions_are_left_out_and_the_active_one_is_last() -> None:
@@ -105,37 +104,37 @@ def test_hidden_regions_are_left_out_and_the_active_one_is_last() -> None:
 
 def test_edges_are_made_anew_only_where_the_shape_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
-    monkeypatch.setattr(region_drawing, "_made", lambda edges: made.append(edges) or len(made))
+    monkeypatch.setattr(region_panel, "_made", lambda edges: made.append(edges) or len(made))
     cube, ball = box(), mesh_region()
-    first = region_drawing._batch(cube), region_drawing._batch(ball)
+    first = region_panel._batch(cube), region_panel._batch(ball)
     assert len(made) == 2
     cube.location.x, ball.location.x = 3, 4  # the matrix moves what is drawn
     bpy.context.view_layer.update()
-    assert (region_drawing._batch(cube), region_drawing._batch(ball)) == first
+    assert (region_panel._batch(cube), region_panel._batch(ball)) == first
     cube.empty_display_size = 2.0
     ball.data.vertices[0].co *= 2.0
     ball.data.update()
     bpy.context.view_layer.update()
-    assert region_drawing._batch(cube) != first[0]
-    assert region_drawing._batch(ball) != first[1]
+    assert region_panel._batch(cube) != first[0]
+    assert region_panel._batch(ball) != first[1]
     assert len(made) == 4
     assert made[2] == pytest.approx(2.0 * made[0])
-    monkeypatch.setattr(region_drawing, "MOST_CACHED", 1)
-    region_drawing._batch(cube)
-    assert len(region_drawing._drawing.batches) <= 4
-    region_watch.forget()
+    monkeypatch.setattr(region_panel, "MOST_CACHED", 1)
+    region_panel._batch(cube)
+    assert len(region_panel._drawing.batches) <= 4
+    region_operators.forget()
 
 
 def test_the_handler_goes_with_the_addon(addon: Any) -> None:
-    assert region_drawing.VIEW.handle is not None
-    handle = region_drawing.VIEW.handle
+    assert region_panel.VIEW.handle is not None
+    handle = region_panel.VIEW.handle
     addon.unregister()
-    assert region_drawing.VIEW.handle is None
-    assert not region_drawing._drawing.batches
+    assert region_panel.VIEW.handle is None
+    assert not region_panel._drawing.batches
     with pytest.raises((ValueError, RuntimeError)):
         bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
     addon.register()
-    assert region_drawing.VIEW.handle is not None
+    assert region_panel.VIEW.handle is not None
 
 
 def test_an_error_while_drawing_is_told_once(
@@ -144,10 +143,10 @@ def test_an_error_while_drawing_is_told_once(
     def broken(_context: object) -> None:
         raise RuntimeError("no such shader")
 
-    monkeypatch.setattr(region_drawing, "_draw", broken)
+    monkeypatch.setattr(region_panel, "_draw", broken)
     space = SimpleNamespace(overlay=SimpleNamespace(show_overlays=True))
     with caplog.at_level(logging.ERROR):
         for _ in range(3):
-            region_drawing.VIEW.draw(SimpleNamespace(space_data=space))
+            region_panel.VIEW.draw(SimpleNamespace(space_data=space))
     assert [r.getMessage() for r in caplog.records] == ["regions cannot be drawn"]
     assert "no such shader" in caplog.text

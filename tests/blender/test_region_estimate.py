@@ -16,12 +16,11 @@ from typing import Any
 import bpy
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.processes.helper_process import child_command
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
-from gaussian_wrapping_addon.ops.common import background, estimate_child, tags
-from gaussian_wrapping_addon.ops.meshing import region_estimate
-from gaussian_wrapping_addon.ops.regions.region_objects import create_region
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.worker.helper_process import child_command
+from gaussian_wrapping_addon.ops import addon, background, meshing
+from gaussian_wrapping_addon.ops.region_objects import create_region
 
 pytestmark = pytest.mark.usefixtures("addon")
 
@@ -31,7 +30,7 @@ WAIT_S = 120.0
 @pytest.fixture(autouse=True)
 def _no_questions() -> Iterator[None]:
     yield
-    region_estimate.stop()
+    meshing.stop()
 
 
 def play_until(holds: Callable[[], bool]) -> None:
@@ -47,8 +46,8 @@ def region_of(folder: Path) -> bpy.types.Object:
     collection = bpy.context.scene.collection
     frame = bpy.data.objects.new("frame", None)
     collection.objects.link(frame)
-    frame[tags.KIND], frame[tags.RESULT] = "frame", str(folder / "result")
-    frame[tags.WORLD_FROM_SCENE] = json.dumps(Similarity().to_json())
+    frame[addon.KIND], frame[addon.RESULT] = "frame", str(folder / "result")
+    frame[addon.WORLD_FROM_SCENE] = json.dumps(Similarity().to_json())
     region = create_region("box", 1.4 * CUBE_CORNERS, frame, collection)
     bpy.context.view_layer.update()
     bpy.context.view_layer.objects.active = region
@@ -70,10 +69,10 @@ def test_the_workers_answer_is_shown_until_something_changes(tmp_path: Path) -> 
     region = region_of(tmp_path / "job" / "out")
     scene = bpy.context.scene
     assert bpy.ops.gwrap.estimate_regions() == {"FINISHED"}
-    assert region_estimate.is_waiting(region)
+    assert meshing.is_waiting(region)
     assert not bpy.ops.gwrap.estimate_regions.poll()
-    play_until(lambda: not region_estimate.is_busy())
-    estimate, holds = region_estimate.estimate_for(scene, region)
+    play_until(lambda: not meshing.is_busy())
+    estimate, holds = meshing.estimate_for(scene, region)
     assert estimate is not None
     assert holds
     assert not estimate.warnings, estimate.warnings
@@ -82,7 +81,7 @@ def test_the_workers_answer_is_shown_until_something_changes(tmp_path: Path) -> 
 
     def still() -> bool:
         bpy.context.view_layer.update()
-        return region_estimate.estimate_for(scene, region)[1]
+        return meshing.estimate_for(scene, region)[1]
 
     region.location.x += 0.5
     assert not still()
@@ -104,14 +103,14 @@ def test_the_workers_answer_is_shown_until_something_changes(tmp_path: Path) -> 
     assert still()
     region.gwrap.own_edge_length, region.gwrap.edge_length = True, 0.6  # of a diagonal of 4.85
     assert bpy.ops.gwrap.estimate_regions() == {"FINISHED"}
-    play_until(lambda: not region_estimate.is_busy())
-    estimate, _ = region_estimate.estimate_for(scene, region)
+    play_until(lambda: not meshing.is_busy())
+    estimate, _ = meshing.estimate_for(scene, region)
     assert estimate is not None
     assert not estimate.warnings
     region.gwrap.edge_length = 1.0
     assert bpy.ops.gwrap.estimate_regions() == {"FINISHED"}
-    play_until(lambda: not region_estimate.is_busy())
-    estimate, _ = region_estimate.estimate_for(scene, region)
+    play_until(lambda: not meshing.is_busy())
+    estimate, _ = meshing.estimate_for(scene, region)
     assert estimate is not None
     assert "reduced" in " ".join(estimate.warnings)
 
@@ -122,16 +121,16 @@ def test_disabling_the_addon_ends_the_process(
     folder = tmp_path / "out"
     region = region_of(folder)
     slow = [sys.executable, "-c", "import time; time.sleep(100)"]
-    monkeypatch.setattr(region_estimate, "child_command", lambda *_, **__: slow)
-    region_estimate.start(bpy.context.scene, [region], folder, sys.executable)
-    child = region_estimate._state.running[region.session_uid].child
+    monkeypatch.setattr(meshing, "child_command", lambda *_, **__: slow)
+    meshing.start(bpy.context.scene, [region], folder, sys.executable)
+    child = meshing._state.running[region.session_uid].child
     play_until(lambda: child.process is not None)
     process = child.process
     assert process is not None
     os.kill(process.pid, 0)
     addon.unregister()
     assert process.wait(10) != 0
-    assert not region_estimate.is_busy()
+    assert not meshing.is_busy()
     assert not bpy.app.timers.is_registered(background.poll)
     addon.register()
     with pytest.raises(ProcessLookupError):
@@ -144,14 +143,14 @@ def test_a_worker_that_says_nothing_is_an_answer(
     region = region_of(tmp_path)
     for command, words in (
         ([sys.executable, "-c", "raise SystemExit('no torch here')"], "no torch here"),
-        (child_command(region_estimate.MODULE, "{", python=sys.executable), ""),
+        (child_command(meshing.MODULE, "{", python=sys.executable), ""),
         ([str(tmp_path / "nowhere")], "does not run"),
     ):
-        monkeypatch.setattr(region_estimate, "child_command", lambda *_, c=command, **__: c)
-        region_estimate.start(bpy.context.scene, [region], tmp_path, sys.executable)
-        play_until(lambda: not region_estimate.is_busy())
-        estimate, _ = region_estimate.estimate_for(bpy.context.scene, region)
+        monkeypatch.setattr(meshing, "child_command", lambda *_, c=command, **__: c)
+        meshing.start(bpy.context.scene, [region], tmp_path, sys.executable)
+        play_until(lambda: not meshing.is_busy())
+        estimate, _ = meshing.estimate_for(bpy.context.scene, region)
         assert estimate is not None
         assert estimate.warnings
         assert words in " ".join(estimate.warnings)
-    assert estimate_child.run_child([sys.executable, "-c", "print(1)"], lambda _: True, 20)[0] == []
+    assert background.run_child([sys.executable, "-c", "print(1)"], lambda _: True, 20)[0] == []

@@ -9,10 +9,10 @@ import bpy
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.meshing.points import resolution
-from gaussian_wrapping_addon.ops.regions import region_resolution
-from gaussian_wrapping_addon.ops.regions.region_resolution import checked_edge_length, own_lengths
-from gaussian_wrapping_addon.ops.results.scene_objects import import_result
+from gaussian_wrapping_addon.core.meshing import surface_points
+from gaussian_wrapping_addon.ops import region_operators
+from gaussian_wrapping_addon.ops.region_operators import checked_edge_length, own_lengths
+from gaussian_wrapping_addon.ops.scene_objects import import_result
 from tests.blender.synthetic_result import WORLD_FROM_SCENE, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
@@ -50,11 +50,11 @@ def test_impossible_lengths_are_refused(
 ) -> None:
     region.gwrap.own_edge_length = True
     # Past the property's own limits, as another file or script might.
-    monkeypatch.setattr(region_resolution, "edge_length_in_blender", lambda *_: length)
+    monkeypatch.setattr(region_operators, "edge_length_in_blender", lambda *_: length)
     with pytest.raises(UsageError, match=words) as caught:
         checked_edge_length(bpy.context.scene, region)
     assert caught.value.hint
 
 
 def test_the_limit_is_the_workers() -> None:
-    assert region_resolution.FINEST_SHARE == resolution.FINEST_SHARE
+    assert region_operators.FINEST_SHARE == surface_points.FINEST_SHARE

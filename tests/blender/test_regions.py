@@ -14,11 +14,11 @@ from mathutils import Euler, Matrix
 
 from gaussian_wrapping_addon.core.errors import ParseError, UsageError, WrapError
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS, CUBE_TRIANGLES
-from gaussian_wrapping_addon.core.regions.region_file import parse_region_file, region_to_json
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.regions.region_objects import create_region
-from gaussian_wrapping_addon.ops.regions.region_operators import GWRAP_OT_export_region
-from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult, import_result
+from gaussian_wrapping_addon.core.regions.files import parse_region_file, region_to_json
+from gaussian_wrapping_addon.ops import addon
+from gaussian_wrapping_addon.ops.region_objects import create_region
+from gaussian_wrapping_addon.ops.region_operators import GWRAP_OT_export_region
+from gaussian_wrapping_addon.ops.scene_objects import ImportedResult, import_result
 from tests.blender.region_shapes import region_from_object
 from tests.blender.synthetic_result import WORLD_FROM_SCENE, write_result
 
@@ -137,7 +137,7 @@ def test_a_mesh_region_is_its_hull_with_modifiers(result: ImportedResult) -> Non
     array.count = 2
     array.relative_offset_displace = (2, 0, 0)
     assert bpy.ops.gwrap.use_as_region() == {"FINISHED"}
-    assert tags.kind_of(thing) == "region"
+    assert addon.kind_of(thing) == "region"
     assert thing.parent == result.frame
     world = region_from_object(thing)
     scene = WORLD_FROM_SCENE.inverse().points(world)
@@ -192,7 +192,7 @@ def test_what_encloses_no_volume_is_refused(make: object) -> None:
 
 
 def test_a_frame_that_lost_its_coordinates_is_refused(result: ImportedResult) -> None:
-    result.frame[tags.WORLD_FROM_SCENE] = '{"scale": 1}'
+    result.frame[addon.WORLD_FROM_SCENE] = '{"scale": 1}'
     with pytest.raises(UsageError, match="lost its world coordinates"):
         region_from_object(result.regions[0])
     result.frame.scale = (0, 0, 0)
@@ -246,7 +246,7 @@ def test_a_solid_that_is_no_box_comes_back_as_a_mesh(
 
 def test_our_file_is_what_the_worker_reads(result: ImportedResult, tmp_path: Path) -> None:
     pytest.importorskip("scipy")
-    from gaussian_wrapping_addon.core.regions.region import read_region
+    from gaussian_wrapping_addon.core.regions.scene_regions import read_region
 
     path = tmp_path / "box.json"
     bpy.context.view_layer.objects.active = result.regions[0]

@@ -12,9 +12,8 @@ import pytest
 
 import gaussian_wrapping_addon
 from gaussian_wrapping_addon import registration
-from gaussian_wrapping_addon.ops.common import background
-from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer
-from gaussian_wrapping_addon.ui.jobs import points_drawing
+from gaussian_wrapping_addon.ops import background, job_timer, jobs
+from gaussian_wrapping_addon.ui import job_view
 
 REPOSITORY = Path(gaussian_wrapping_addon.__file__).resolve().parents[1]
 
@@ -28,7 +27,7 @@ def left_behind() -> list[str]:
             found += [name for h in handlers if "gaussian_wrapping" in h.__module__]
     bar = bpy.types.STATUSBAR_HT_header._dyn_ui_initialize()
     found += [f.__name__ for f in bar if "gaussian_wrapping" in f.__module__]
-    found += ["points"] if points_drawing.VIEW.handle is not None else []
+    found += ["points"] if job_view.VIEW.handle is not None else []
     if bpy.app.timers.is_registered(background.poll):
         found.append("poll")
     return found
@@ -68,7 +67,7 @@ def test_register_and_unregister_twice() -> None:
 def test_register_after_register_doubles_nothing() -> None:
     gaussian_wrapping_addon.register()
     gaussian_wrapping_addon.register()
-    assert bpy.app.handlers.load_post.count(job_attach.after_load) == 1
+    assert bpy.app.handlers.load_post.count(jobs.after_load) == 1
     gaussian_wrapping_addon.unregister()
     assert left_behind() == []
 

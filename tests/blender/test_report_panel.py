@@ -12,15 +12,10 @@ import bpy
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.ops.common import known_jobs, tags
-from gaussian_wrapping_addon.ops.results import report_operators
-from gaussian_wrapping_addon.ops.results.report_data import (
-    MAX_WARNINGS,
-    figures_of_report,
-    report_of,
-)
-from gaussian_wrapping_addon.ops.results.scene_objects import import_result
-from gaussian_wrapping_addon.ui.results.report_panel import _MAX_WARNINGS, GWRAP_PT_report
+from gaussian_wrapping_addon.ops import addon, results
+from gaussian_wrapping_addon.ops.result_files import MAX_WARNINGS, figures_of_report, report_of
+from gaussian_wrapping_addon.ops.scene_objects import import_result
+from gaussian_wrapping_addon.ui.result_panel import _MAX_WARNINGS, GWRAP_PT_report
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.synthetic_result import png_bytes, write_result
 from tests.core.evaluation.report.report_examples import REGION, full_region, full_summary
@@ -139,11 +134,11 @@ def test_what_an_older_report_lacks_is_not_measured(tmp_path: Path, report: Any)
 )  # fmt: skip
 def test_edited_figures_are_survived(tmp_path: Path, text: str) -> None:
     imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
-    imported.frame[tags.FIGURES] = text
+    imported.frame[addon.FIGURES] = text
     texts = draw(GWRAP_PT_report).texts
     assert texts
     assert "nan" not in texts.lower().split()
-    imported.frame[tags.FIGURES] = 5
+    imported.frame[addon.FIGURES] = 5
     assert draw(GWRAP_PT_report).texts == "No report yet"
 
 
@@ -190,9 +185,9 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     class FakeBpy:
         ops, data = Ops(), bpy.data
 
-    monkeypatch.setattr(report_operators, "bpy", FakeBpy())
-    monkeypatch.setattr(known_jobs, "_session", [])
-    monkeypatch.setattr(known_jobs, "_stored", lambda: [])
+    monkeypatch.setattr(results, "bpy", FakeBpy())
+    monkeypatch.setattr(addon, "_session", [])
+    monkeypatch.setattr(addon, "_stored", lambda: [])
     return paths
 
 
@@ -202,7 +197,7 @@ def test_opening_the_report(tmp_path: Path, opened: list[str]) -> None:
     import_result(result, bpy.context.scene)
     with pytest.raises(RuntimeError, match="not been used on this computer"):
         bpy.ops.gwrap.read_report()
-    known_jobs.remember(result.parent)
+    addon.remember(result.parent)
     with pytest.raises(RuntimeError, match=r"no report\.md"):
         bpy.ops.gwrap.read_report()
     elsewhere = tmp_path / "elsewhere.md"
@@ -220,7 +215,7 @@ def test_opening_the_report(tmp_path: Path, opened: list[str]) -> None:
 def test_showing_pictures(tmp_path: Path, opened: list[str]) -> None:
     result = write_result(tmp_path / "job")
     import_result(result, bpy.context.scene)
-    known_jobs.remember(result.parent)
+    addon.remember(result.parent)
     with pytest.raises(RuntimeError, match="no pictures"):
         bpy.ops.gwrap.show_pictures()
     names = ("report/held-out-0.jpg", "auto/comparison-1.jpg", "preview.png")

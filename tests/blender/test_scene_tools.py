@@ -13,18 +13,18 @@ import bpy
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.frames.placement_file import FILE_NAME, read_placement
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.ops.common import known_jobs, tags
-from gaussian_wrapping_addon.ops.placement import placement
-from gaussian_wrapping_addon.ops.regions.region_objects import (
-    matrix_of,
-    transformed,
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.placement import FILE_NAME, read_placement
+from gaussian_wrapping_addon.ops import addon, placement
+from gaussian_wrapping_addon.ops.region_objects import matrix_of, transformed
+from gaussian_wrapping_addon.ops.region_operators import own_lengths
+from gaussian_wrapping_addon.ops.scene_objects import (
+    ImportedResult,
+    export_usd,
+    import_result,
+    write_blend,
 )
-from gaussian_wrapping_addon.ops.regions.region_resolution import own_lengths
-from gaussian_wrapping_addon.ops.results.blend_writer import export_usd, write_blend
-from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult, import_result
 from tests.blender.placed_scene import (
     in_blender,
     pick_vertices,
@@ -52,7 +52,7 @@ def job(tmp_path: Path) -> Path:
     result = write_result(tmp_path / "job")
     values = json.loads((result / "scene.json").read_text())
     (result / "scene.json").write_text(json.dumps({**values, "cameras": upright_cameras()}))
-    known_jobs.remember(tmp_path / "job")
+    addon.remember(tmp_path / "job")
     return tmp_path / "job"
 
 
@@ -284,7 +284,7 @@ def push(message: str) -> None:
 
 def frame_now() -> bpy.types.Object:
     """Undo replaces objects: find the frame anew."""
-    return next(o for o in bpy.data.objects if tags.kind_of(o) == "frame")
+    return next(o for o in bpy.data.objects if addon.kind_of(o) == "frame")
 
 
 @pytest.mark.parametrize("mode", ["OBJECT", "EDIT"])
@@ -380,7 +380,7 @@ def test_a_broken_placement_file_is_told_before_anything_changes(job: Path) -> N
 
 
 def forget(_job: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(known_jobs, "is_trusted", lambda _folder: False)
+    monkeypatch.setattr(addon, "is_trusted", lambda _folder: False)
 
 
 def remove(job: Path, _monkeypatch: pytest.MonkeyPatch) -> None:
@@ -432,7 +432,7 @@ def test_regions_and_later_meshes_live_under_the_same_transform(
     again = import_result(job / "result", bpy.context.scene)
     bpy.context.view_layer.update()
     assert placement.placement_of(again.frame).to_json() == placed.to_json()
-    fine = next(m for m in again.meshes if m[tags.REGION] == "fine")
+    fine = next(m for m in again.meshes if m[addon.REGION] == "fine")
     local = np.array(fine.data.vertices[7].co[:], np.float64)
     assert local == pytest.approx([0.25] * 3), "vertices stay in the scene frame"
     assert transformed(matrix_of(fine), local[None]) == pytest.approx(
@@ -444,7 +444,7 @@ def test_blend_and_usd_of_a_placed_result_are_placed(job: Path, result: Imported
     pick_vertices(result.meshes[0], [0, 4])
     bpy.ops.gwrap.set_scale(distance=0.5)
     write_blend(job / "result", job / "result" / "scene.blend")
-    (mesh,) = [o for o in bpy.data.objects if tags.kind_of(o) == "mesh"]
+    (mesh,) = [o for o in bpy.data.objects if addon.kind_of(o) == "mesh"]
     assert list(mesh.matrix_world.to_scale()) == pytest.approx([0.5] * 3)
     (path,) = export_usd(job / "result")
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)

@@ -10,12 +10,14 @@ import bpy
 import pytest
 
 from gaussian_wrapping_addon.core.settings import JobSettings, declarations, declared
-from gaussian_wrapping_addon.ops.worker import preferred_worker
-from gaussian_wrapping_addon.ui import preferences
-from gaussian_wrapping_addon.ui.computers import computers_panel
-from gaussian_wrapping_addon.ui.dataset import dataset_panel
-from gaussian_wrapping_addon.ui.meshing import mesh_panel, texture_panel
-from gaussian_wrapping_addon.ui.training import train_advanced_panel, train_panel
+from gaussian_wrapping_addon.ops import worker_setup
+from gaussian_wrapping_addon.ui import (
+    computers_panel,
+    dataset_panel,
+    mesh_panel,
+    preferences,
+    training_panel,
+)
 from tests.blender.fake_layout import draw
 from tests.fake_setting import GROUPS, copy_with_fake_setting, said_by
 
@@ -115,12 +117,12 @@ def test_every_declared_property_is_there_and_drawn() -> None:
         properties.method, properties.resolution, properties.decimate = method, resolution, True
         for panel in (
             dataset_panel.GWRAP_PT_dataset,
-            train_panel.GWRAP_PT_train,
-            train_advanced_panel.GWRAP_PT_train_advanced,
+            training_panel.GWRAP_PT_train,
+            training_panel.GWRAP_PT_train_advanced,
             computers_panel.GWRAP_PT_computers,
             mesh_panel.GWRAP_PT_mesh,
             mesh_panel.GWRAP_PT_mesh_advanced,
-            texture_panel.GWRAP_PT_texture,
+            mesh_panel.GWRAP_PT_texture,
         ):
             drawn |= {field.name for field in draw(panel).fields}
     shown = [entry for entry in declarations(JobSettings) if entry.panel is not None]
@@ -129,7 +131,7 @@ def test_every_declared_property_is_there_and_drawn() -> None:
 
 @pytest.mark.usefixtures("addon")
 def test_full_size_is_chosen_with_the_other_parts_of_the_model() -> None:
-    names = [field.name for field in draw(train_advanced_panel.GWRAP_PT_train_advanced).fields]
+    names = [field.name for field in draw(training_panel.GWRAP_PT_train_advanced).fields]
     assert names[:8] == [
         "harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size", "dense_start",
         "refine_poses",
@@ -145,16 +147,16 @@ def test_the_device_is_the_machines_and_shown_with_the_training(
     entry = declared("device")
     assert entry.property_owner == "preferences"
     assert [entry.from_panel(word) for word in ("AUTO", "CPU", "CUDA")] == ["auto", "cpu", "cuda"]
-    panel = train_advanced_panel.GWRAP_PT_train_advanced
+    panel = training_panel.GWRAP_PT_train_advanced
     assert "device" not in {field.name for field in draw(panel).fields}, "not as an add-on"
     mine = SimpleNamespace(
         bl_rna=SimpleNamespace(properties={"device"}), device="CUDA", threads=3,
         worker_python="", keep_running=False,
     )  # fmt: skip
-    for module in (train_advanced_panel, preferred_worker):
+    for module in (training_panel, worker_setup):
         monkeypatch.setattr(module, "addon_preferences", lambda _context: mine)
     assert "device" in {field.name for field in draw(panel).fields}
-    choice = preferred_worker.worker_choice(bpy.context)
+    choice = worker_setup.worker_choice(bpy.context)
     assert (choice.device, choice.threads) == ("cuda", 3)
 
 

@@ -16,7 +16,7 @@ import gaussian_wrapping_addon
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
-from gaussian_wrapping_addon.ops.jobs import job_timer, watched_jobs
+from gaussian_wrapping_addon.ops import job_timer
 from tests.blender.job_play import play_until, start_wrap, status_of, write_fake_python
 
 STALL_S = 0.05
@@ -41,7 +41,7 @@ class SleepingDisk:
     """Looks at a job get no answer until :meth:`wake`; the answer is a status of its own."""
 
     def __init__(self, folder: Path) -> None:
-        self.job = watched_jobs.jobs[str(folder)]
+        self.job = job_timer.jobs[str(folder)]
         self.told = replace(self.job.client.poll(), message="told late")
         self.kills = 0
         self._awake = threading.Event()
@@ -94,7 +94,7 @@ def test_a_cancelled_job_is_ended_by_force_all_the_same(running: Path, disk: Sle
     job_timer.poll_jobs(lambda: now_s + limits.CANCEL_GRACE_S - 1.0)
     assert disk.kills == 0
     job_timer.poll_jobs(lambda: now_s + limits.CANCEL_GRACE_S + 1.0)
-    assert watched_jobs.is_running(str(running)), "nothing is known yet"
+    assert job_timer.is_running(str(running)), "nothing is known yet"
     end_s = time.monotonic() + 20.0
     while not disk.kills and time.monotonic() < end_s:
         time.sleep(0.01)
@@ -109,7 +109,7 @@ def test_an_answer_that_nobody_waits_for_changes_nothing(
     job_timer.poll_jobs()
     assert disk.job.status_read is not None
     if away == "detached":
-        watched_jobs.detach(bpy.context.scene)
+        job_timer.detach(bpy.context.scene)
     elif away == "another file":
         bpy.ops.wm.read_homefile(use_empty=True)
     else:
@@ -118,5 +118,5 @@ def test_an_answer_that_nobody_waits_for_changes_nothing(
     job_timer.poll_jobs()
     if away == "disabled":
         gaussian_wrapping_addon.register()
-        assert watched_jobs.jobs == {}
+        assert job_timer.jobs == {}
     assert len(bpy.data.objects) == 0

@@ -20,7 +20,7 @@ from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE, JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
-from gaussian_wrapping_addon.core.regions.region_file import region_to_json
+from gaussian_wrapping_addon.core.regions.files import region_to_json
 from gaussian_wrapping_addon.core.settings import (
     MASK_MODES,
     MODEL_SELECTION,
@@ -28,12 +28,11 @@ from gaussian_wrapping_addon.core.settings import (
     preset,
     to_json,
 )
-from gaussian_wrapping_addon.ops.common import background, known_jobs
-from gaussian_wrapping_addon.ops.jobs import job_timer, live_preview, panel_settings
-from gaussian_wrapping_addon.ops.jobs.live_figures import live_rows
-from gaussian_wrapping_addon.ops.results.scene_objects import import_result
-from gaussian_wrapping_addon.ops.training import training_estimate
-from gaussian_wrapping_addon.ui.training import train_advanced_panel, train_panel
+from gaussian_wrapping_addon.ops import addon, background, job_timer, panel_settings
+from gaussian_wrapping_addon.ops import training as training_estimate
+from gaussian_wrapping_addon.ops.job_timer import live_rows
+from gaussian_wrapping_addon.ops.scene_objects import import_result
+from gaussian_wrapping_addon.ui import training_panel
 from tests.blender.fake_layout import draw
 from tests.blender.fake_worker import LIVE, picture
 from tests.blender.job_play import write_fake_python
@@ -41,8 +40,8 @@ from tests.blender.synthetic_result import npy_bytes, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
 
-PANEL = train_advanced_panel.GWRAP_PT_train_advanced
-TRAIN = train_panel.GWRAP_PT_train
+PANEL = training_panel.GWRAP_PT_train_advanced
+TRAIN = training_panel.GWRAP_PT_train
 
 
 class Client:
@@ -57,8 +56,8 @@ class Client:
 
 @pytest.fixture(autouse=True)
 def _nothing_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(known_jobs, "_session", [])
-    job_timer.forget_all()
+    monkeypatch.setattr(addon, "_session", [])
+    job_timer.forget_all_jobs()
 
 
 def training() -> bpy.types.PropertyGroup:
@@ -213,7 +212,7 @@ def test_live_rows(figures: object, rows: dict[str, str] | None) -> None:
 
 
 def write_picture(folder: Path, name: str = "train-now", data: bytes | None = None) -> Path:
-    path = folder / "stages" / name / live_preview.PICTURE
+    path = folder / "stages" / name / job_timer.PICTURE
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(npy_bytes(picture()) if data is None else data)
     return path
@@ -221,25 +220,25 @@ def write_picture(folder: Path, name: str = "train-now", data: bytes | None = No
 
 def refreshed(key: str, now_s: float) -> bool:
     """Look for a picture, wait until it is read, and show it."""
-    assert not live_preview.refresh(key, now_s), "it is read in a thread"
-    reading = live_preview._shown[key].reading
+    assert not job_timer.refresh(key, now_s), "it is read in a thread"
+    reading = job_timer._live_preview_shown[key].reading
     if reading is not None:
         assert reading.finished(20.0)
-    return live_preview.refresh(key, now_s)
+    return job_timer.refresh(key, now_s)
 
 
 def test_the_picture_follows_the_file_and_survives_bad_ones(tmp_path: Path) -> None:
     key = str(tmp_path)
     assert not refreshed(key, 0.0), "no picture yet"
     path = write_picture(tmp_path)
-    assert not refreshed(key, live_preview.EVERY_S - 0.1), "not yet time"
+    assert not refreshed(key, job_timer.EVERY_S - 0.1), "not yet time"
     assert refreshed(key, 10.0)
-    stamp = live_preview._shown[key].stamp
+    stamp = job_timer._live_preview_shown[key].stamp
     assert stamp is not None
     assert stamp[0] == str(path)
-    assert len(live_preview.icons_of(key)) == 2, "photo and rendering"
-    names = live_preview._shown[key].names
-    left, right = (live_preview._pictures[name] for name in names)
+    assert len(job_timer.icons_of(key)) == 2, "photo and rendering"
+    names = job_timer._live_preview_shown[key].names
+    left, right = (job_timer._pictures[name] for name in names)
     assert left.image_size[:] == right.image_size[:]
     colours = [np.array(p.image_pixels_float[:]).reshape(-1, 4).mean(0) for p in (left, right)]
     assert colours[1][:3] == pytest.approx(0.875 * colours[0][:3], abs=0.03)
@@ -252,15 +251,15 @@ def test_the_picture_follows_the_file_and_survives_bad_ones(tmp_path: Path) -> N
     bad_ones = (b"", b"no picture", b"PK\x03\x04 no zip", several.getvalue(), huge, flat)
     for bad in (*bad_ones, npy_bytes(picture())[:200], npy_bytes(np.zeros(0))):
         write_picture(tmp_path, data=bad)
-        assert not refreshed(key, live_preview._shown[key].searched_s + 10.0)
-        assert live_preview.icons_of(key)
+        assert not refreshed(key, job_timer._live_preview_shown[key].searched_s + 10.0)
+        assert job_timer.icons_of(key)
     (path.parent / "done.json").write_text("{}")
-    assert live_preview.newest_picture(tmp_path) is None, "a finished training is not under way"
-    live_preview.forget(key)
-    assert live_preview.icons_of(key) == ()
-    assert len(live_preview._pictures) == 0
-    live_preview.stop()
-    live_preview.stop()
+    assert job_timer.newest_picture(tmp_path) is None, "a finished training is not under way"
+    job_timer.forget(key)
+    assert job_timer.icons_of(key) == ()
+    assert len(job_timer._pictures) == 0
+    job_timer.stop()
+    job_timer.stop()
 
 
 def test_a_running_training_is_drawn_and_let_go(tmp_path: Path) -> None:
@@ -269,17 +268,17 @@ def test_a_running_training_is_drawn_and_let_go(tmp_path: Path) -> None:
     client = Client(running)
     job_timer.watch(bpy.context.scene, tmp_path, client, imports=False)  # type: ignore[arg-type]
     job_timer.poll_jobs()
-    assert live_preview._shown[str(tmp_path)].reading.finished(20.0)
+    assert job_timer._live_preview_shown[str(tmp_path)].reading.finished(20.0)
     job_timer.poll_jobs()
-    layout = draw(train_panel.GWRAP_PT_train)
+    layout = draw(training_panel.GWRAP_PT_train)
     assert "750 of 3,000" in layout.texts
     assert "iteration 750" not in layout.texts.lower().replace("750 of", ""), "not told twice"
     assert [name for name, *_ in layout.log].count("template_icon") == 2
     assert "gwrap.estimate" not in draw(TRAIN).operators
     client.status = replace(running, state="CANCELLED")
     job_timer.poll_jobs()
-    assert live_preview.icons_of(str(tmp_path)) == ()
-    assert "template_icon" not in [name for name, *_ in draw(train_panel.GWRAP_PT_train).log]
+    assert job_timer.icons_of(str(tmp_path)) == ()
+    assert "template_icon" not in [name for name, *_ in draw(training_panel.GWRAP_PT_train).log]
 
 
 def finished_job(folder: Path) -> Path:
@@ -391,15 +390,15 @@ def test_stopping_forgets_the_question(worker: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_pictures_of_blocks_are_shown_but_their_points_are_only_a_part(tmp_path: Path) -> None:
-    whole = live_preview.WHOLE_TRAININGS
+    whole = job_timer.WHOLE_TRAININGS
     for number, name in enumerate(("blocks-ab/coarse-all", "blocks-ab/block-0001")):
-        path = tmp_path / "stages" / name / live_preview.PICTURE
+        path = tmp_path / "stages" / name / job_timer.PICTURE
         path.parent.mkdir(parents=True)
         path.write_bytes(b"picture")
         os.utime(path, ns=(number, 10**9 + number))
-    newest = live_preview.newest_picture(tmp_path)
+    newest = job_timer.newest_picture(tmp_path)
     assert newest is not None
     assert "block-0001" in newest[0]
-    points = live_preview.newest_picture(tmp_path, live_preview.PICTURE, whole)
+    points = job_timer.newest_picture(tmp_path, job_timer.PICTURE, whole)
     assert points is not None
     assert "coarse-all" in points[0]

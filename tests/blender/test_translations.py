@@ -16,12 +16,12 @@ import pytest
 
 import gaussian_wrapping_addon
 from gaussian_wrapping_addon import registration
-from gaussian_wrapping_addon.core.processes.worker_extras import EXTRAS
+from gaussian_wrapping_addon.core.jobs.install import CUDA_BRINGS
 from gaussian_wrapping_addon.core.settings import JobSettings, declarations
-from gaussian_wrapping_addon.core.setup.commands import CUDA_BRINGS
-from gaussian_wrapping_addon.ops.common import translate
-from gaussian_wrapping_addon.ops.common.translate import CONTEXT, tr
-from gaussian_wrapping_addon.ui.common.text import progress_text, wrapped
+from gaussian_wrapping_addon.core.worker.environment import EXTRAS
+from gaussian_wrapping_addon.ops import addon
+from gaussian_wrapping_addon.ops.addon import CONTEXT, tr
+from gaussian_wrapping_addon.ui.panel_base import progress_text, wrapped
 from gaussian_wrapping_addon.ui.translations import table
 from tests.blender.fake_layout import draw
 
@@ -190,7 +190,7 @@ class Languages:
 def languages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Languages:
     found = Languages(request.param)
     blender = SimpleNamespace(app=SimpleNamespace(translations=found))
-    monkeypatch.setattr(translate, "bpy", blender)
+    monkeypatch.setattr(addon, "bpy", blender)
     monkeypatch.setattr(table, "bpy", blender)
     table.register()
     return found

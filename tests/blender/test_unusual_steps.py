@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.results.scene_objects import import_result
+from gaussian_wrapping_addon.ops import addon
+from gaussian_wrapping_addon.ops.scene_objects import import_result
 from tests.blender.job_play import meshes, play_to, play_until, start_wrap, write_fake_python
 from tests.blender.synthetic_result import write_region_result
 
@@ -37,7 +37,7 @@ def _photos(folder: Path) -> Path:
 
 
 def _of_kind(kind: str) -> list[bpy.types.Object]:
-    return [thing for thing in bpy.data.objects if tags.kind_of(thing) == kind]
+    return [thing for thing in bpy.data.objects if addon.kind_of(thing) == kind]
 
 
 def test_photos_typed_over_others_leave_the_finished_job_alone(job: Path, tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_a_box_is_added_to_a_result_that_is_linked(overridden: bool, tmp_path: P
     assert bpy.ops.gwrap.add_region_box(around="RESULT") == {"FINISHED"}
     thing = bpy.context.view_layer.objects.active
     assert thing.library is None
-    assert tags.kind_of(thing.parent) == "frame"
+    assert addon.kind_of(thing.parent) == "frame"
 
 
 def test_a_full_copy_of_a_scene_gets_its_own_meshes(job: Path) -> None:
@@ -111,14 +111,14 @@ def test_a_new_box_does_not_take_the_name_of_a_mesh_whose_box_was_deleted(job: P
     bpy.ops.gwrap.add_region_box(around="RESULT")
     assert bpy.ops.gwrap.mesh_region() == {"FINISHED"}
     play_until(lambda: meshes() == 2, "the region is meshed")
-    thing = next(t for t in _of_kind("mesh") if t[tags.REGION] == "Region")
+    thing = next(t for t in _of_kind("mesh") if t[addon.REGION] == "Region")
     assert bpy.ops.gwrap.delete_region(name="Region") == {"FINISHED"}
     bpy.ops.gwrap.add_region_box(around="RESULT")
     assert bpy.ops.gwrap.mesh_region() == {"FINISHED"}
     play_until(lambda: meshes() == 3, "the second region stands beside the first")
     names = {path.name for path in (job / "result").iterdir() if path.is_dir()}
     assert names == {"auto", "Region", "Region_2"}
-    assert thing[tags.REGION] == "Region"
+    assert thing[addon.REGION] == "Region"
 
 
 def test_a_mesh_in_edit_mode_in_another_scene_is_brought_up_to_date_later(job: Path) -> None:
@@ -127,7 +127,7 @@ def test_a_mesh_in_edit_mode_in_another_scene_is_brought_up_to_date_later(job: P
     bpy.context.view_layer.objects.active = thing
     bpy.ops.object.mode_set(mode="EDIT")
     bpy.context.window.scene = bpy.data.scenes.new("Second")
-    write_region_result(job / "result" / thing[tags.REGION], half=0.2)
+    write_region_result(job / "result" / thing[addon.REGION], half=0.2)
     with pytest.raises(UsageError, match="Edit Mode"):
         import_result(job / "result", bpy.context.scene)
     bpy.context.window.scene = first

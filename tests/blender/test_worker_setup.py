@@ -14,18 +14,16 @@ import bpy
 import pytest
 
 from gaussian_wrapping_addon.core.jobs import client as job_client
+from gaussian_wrapping_addon.core.jobs.install import FoundPython, SetupRequest, SetupTask, probe
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
-from gaussian_wrapping_addon.core.processes import worker_environment
-from gaussian_wrapping_addon.core.processes.worker_environment import WorkerEnvironment
-from gaussian_wrapping_addon.core.processes.worker_extras import EXTRAS
-from gaussian_wrapping_addon.core.processes.worker_requirements import requirements_file
-from gaussian_wrapping_addon.core.setup.commands import SetupRequest
-from gaussian_wrapping_addon.core.setup.install import SetupTask
-from gaussian_wrapping_addon.core.setup.pythons import FoundPython, probe
-from gaussian_wrapping_addon.ops.common import background
-from gaussian_wrapping_addon.ops.worker import worker_check, worker_setup, worker_setup_operators
-from gaussian_wrapping_addon.ui.dataset import dataset_panel
-from gaussian_wrapping_addon.ui.worker import worker_setup_view
+from gaussian_wrapping_addon.core.worker import environment as worker_environment
+from gaussian_wrapping_addon.core.worker.environment import (
+    EXTRAS,
+    WorkerEnvironment,
+    requirements_file,
+)
+from gaussian_wrapping_addon.ops import background, worker_setup
+from gaussian_wrapping_addon.ui import dataset_panel, worker_setup_view
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.core.setup.wheels import write_wheel
 
@@ -45,8 +43,8 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     for name, value in vars(fresh).items():
         monkeypatch.setattr(worker_setup.state, name, value)
     yield folder
+    worker_setup.stop_setup()
     worker_setup.stop()
-    worker_check.stop()
 
 
 def drawn() -> FakeLayout:
@@ -104,7 +102,7 @@ def test_going_online_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not bpy.app.online_access, "the bpy module is offline"
     assert not poll()
     assert "Allow Online Access" in drawn().texts.replace("\n", " ")
-    monkeypatch.setattr(worker_setup_operators, "wheel_folder", lambda _context: "/wheels")
+    monkeypatch.setattr(worker_setup, "wheel_folder", lambda _context: "/wheels")
     assert poll()
     worker_setup.state.pythons = []
     assert not poll()
@@ -127,14 +125,14 @@ def test_only_what_we_made_can_be_removed(root: Path) -> None:
 def test_the_dialog_shows_the_commands(
     cuda: bool, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_setup_operators, "wheel_folder", lambda _context: "/wheels")
+    monkeypatch.setattr(worker_setup, "wheel_folder", lambda _context: "/wheels")
     worker_setup.state.has_cuda = cuda
     layout = FakeLayout()
     layout_prop = SimpleNamespace(properties={"python", "torch", "extras"})
     fake = SimpleNamespace(
         layout=layout, python=PYTHON.path, torch="cpu", extras={"raw"}, bl_rna=layout_prop
     )
-    worker_setup_operators.GWRAP_OT_set_up_worker.draw(fake, bpy.context)
+    worker_setup.GWRAP_OT_set_up_worker.draw(fake, bpy.context)
     text = " ".join(layout.texts.split())
     made = f"{PYTHON.path} -I -m venv --clear {root / 'env'}"
     assert made.replace(" ", "") in text.replace(" ", ""), "a long path is broken at its hyphens"
@@ -143,11 +141,11 @@ def test_the_dialog_shows_the_commands(
     assert "rawpy==" in text
     assert "pillow-heif" not in text
     assert "gwrap.copy_setup_commands" in layout.operators
-    choices = [item[0] for item in worker_setup_operators._torch_items(None, None)]
+    choices = [item[0] for item in worker_setup._torch_items(None, None)]
     assert choices == (["cpu", "cuda", "index"] if cuda else ["cpu", "index"])
     assert "on the GPU" not in text
     fake.layout, fake.torch = FakeLayout(), "cuda"
-    worker_setup_operators.GWRAP_OT_set_up_worker.draw(fake, bpy.context)
+    worker_setup.GWRAP_OT_set_up_worker.draw(fake, bpy.context)
     assert "Training and vacancy on the GPU, for several GiB more" in fake.layout.texts
 
 
@@ -168,11 +166,11 @@ def test_extras_have_a_button_each_until_they_are_there(
     assert layout.operators.count("gwrap.add_extra") == len(EXTRAS) - 1
     assert "Add Camera RAW…" in layout.texts
     assert not bpy.ops.gwrap.add_extra.poll(), "Blender may not go online"
-    monkeypatch.setattr(worker_setup_operators, "wheel_folder", lambda _context: "/wheels")
+    monkeypatch.setattr(worker_setup, "wheel_folder", lambda _context: "/wheels")
     assert bpy.ops.gwrap.add_extra.poll()
     shown = FakeLayout()
     fake = SimpleNamespace(layout=shown, extra="raw")
-    worker_setup_operators.GWRAP_OT_add_extra.draw(fake, bpy.context)
+    worker_setup.GWRAP_OT_add_extra.draw(fake, bpy.context)
     text = "".join(shown.texts.split())
     assert f"{python}-I-mpip--isolatedinstall" in text
     assert "--find-links/wheels--no-depsrawpy==" in text
@@ -188,10 +186,10 @@ def test_a_set_up_from_start_to_end_in_blender(
     real = probe(sys.executable)
     request = SetupRequest(str(root), real.path, str(requirements), "cpu", str(tmp_path / "wheels"))
     asked = []
-    monkeypatch.setattr(worker_check, "start", asked.append)
+    monkeypatch.setattr(worker_setup, "start", asked.append)
     no_worker(monkeypatch)
     longest_s = 0.0
-    worker_setup.start(request)
+    worker_setup.start_setup(request)
     assert bpy.app.timers.is_registered(background.poll)
     while worker_setup.state.is_busy:
         begun_s = time.monotonic()
@@ -212,7 +210,7 @@ def test_a_set_up_is_cancelled(root: Path, tmp_path: Path) -> None:
     requirements = tmp_path / "r.txt"
     requirements.write_text("gwalpha==1.0\n")
     python = probe(sys.executable).path
-    worker_setup.start(
+    worker_setup.start_setup(
         SetupRequest(str(root), python, str(requirements), "cpu", str(tmp_path / "wheels"))
     )
     assert bpy.ops.gwrap.cancel_setup() == {"FINISHED"}

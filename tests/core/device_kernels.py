@@ -5,11 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from gaussian_wrapping_addon.core.render.cuda.kernels import (
-    Kernels,
-    cuda_available,
-    device_kernels,
-)
+from gaussian_wrapping_addon.core.render.cuda.kernels import Kernels, cuda_available, device_kernels
 
 DEVICES = ["emulated", pytest.param("cuda", marks=pytest.mark.gpu)]
 """Values of a parameter ``device`` of a test."""

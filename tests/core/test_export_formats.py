@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.command_line.parser import build_parser
-from gaussian_wrapping_addon.core.export_formats import (
+from gaussian_wrapping_addon.core.names import (
     BLENDER_FORMATS,
     EXPORT_FORMATS,
     JOB_FORMATS,

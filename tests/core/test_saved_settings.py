@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.core.settings.saved_settings import (
+from gaussian_wrapping_addon.core.settings.job import (
     FORMAT,
     MAX_BYTES,
     MAX_NOTES,

@@ -84,7 +84,7 @@ def module(name: str) -> Any:
 
 def job_status() -> Any:
     """Return the status of the scene's job as the panel shows it; None without one."""
-    return module("ops.jobs.watched_jobs").status_of(bpy.context.scene.gwrap.job_folder)
+    return module("ops.job_timer").status_of(bpy.context.scene.gwrap.job_folder)
 
 
 def state_of_job() -> str:

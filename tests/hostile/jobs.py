@@ -11,13 +11,10 @@ from typing import Any
 
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
-    JobFolder,
-    JobStatus,
-    process_start_ticks,
-)
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
 from gaussian_wrapping_addon.core.names import JOB_MARKER
 from gaussian_wrapping_addon.core.settings import JobSettings
+from gaussian_wrapping_addon.core.worker.spawn import process_start_ticks
 from tests.core.jobs.commands.test_export_files import write_result
 from tests.core.jobs.finished_sphere import write_finished_sphere
 from tests.hostile.case import Build

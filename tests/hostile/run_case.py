@@ -22,15 +22,15 @@ from pathlib import Path
 from typing import Any
 
 from gaussian_wrapping_addon import batch
-from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import splat_extent
 from gaussian_wrapping_addon.core.errors import EXIT_DONE, WrapError
-from gaussian_wrapping_addon.core.gaussians.foreign_splat import read_foreign_splat
-from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
+from gaussian_wrapping_addon.core.gaussians.files import read_foreign_splat
+from gaussian_wrapping_addon.core.jobs.stages.cameras import run_cameras
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.processes.peak_memory import own_peak_bytes
+from gaussian_wrapping_addon.core.loading.other_inputs import splat_extent
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings
+from gaussian_wrapping_addon.core.worker.helper_process import own_peak_bytes
 from tests.hostile.case import Variant, Way
 from tests.hostile.same_process import workers_in_this_process
 from tests.hostile.surroundings import CASE, HOME, TEMPORARY, changes, content, make_place, watched

@@ -16,8 +16,8 @@ from collections.abc import Iterator
 from unittest import mock
 
 from gaussian_wrapping_addon.core.errors import EXIT_OTHER
-from gaussian_wrapping_addon.core.jobs.commands import run_in_worker, worker_call
-from gaussian_wrapping_addon.core.processes.process_identity import Caller
+from gaussian_wrapping_addon.core.jobs.commands import run_in_worker
+from gaussian_wrapping_addon.core.worker.spawn import Caller
 
 _CORE = "gaussian_wrapping_addon.core"
 
@@ -52,6 +52,6 @@ def workers_in_this_process() -> Iterator[None]:
     """Run what ``run_in_worker`` starts in this process while the block runs."""
     with (
         mock.patch.object(run_in_worker, "spawn", _Ended),
-        mock.patch.object(worker_call, "exit_with_caller", _watch_nobody),
+        mock.patch.object(run_in_worker, "exit_with_caller", _watch_nobody),
     ):
         yield

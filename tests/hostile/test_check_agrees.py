@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.loading.source_kind import source_kind
+from gaussian_wrapping_addon.core.loading.source_kind import source_kind
 from tests.hostile.all_cases import rows
 from tests.hostile.case import Variant, Way
 from tests.hostile.run_case import run_variant

@@ -64,7 +64,7 @@ def _add_worker(commands: Any) -> None:
 def _worker(options: Namespace) -> int:
     from ...core.errors import EXIT_CANCELLED, UsageError
     from ...core.files import real_path
-    from ...core.settings.choices import MAX_PROCESSES
+    from ...core.settings.declaration import MAX_PROCESSES
 
     if not 1 <= options.slots <= MAX_PROCESSES:
         raise UsageError("--slots is out of range.", f"Give from 1 to {MAX_PROCESSES}.")
@@ -109,8 +109,8 @@ def _add_doctor(commands: Any) -> None:
 
 
 def _doctor(options: Namespace) -> int:
-    from ...core.cluster.addresses import scheduler_address
     from ...core.errors import UsageError
+    from ...core.farm.addresses import scheduler_address
     from ...core.files import real_path
     from ...core.names import SHARED_VARIABLE
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ...core.cluster.ssh_hosts import Host
+    from ...core.farm.hosts import Host
 
 _BATCH = Path(__file__).resolve().parents[2] / "batch.py"
 
@@ -58,8 +58,8 @@ def add_ssh(commands: Any) -> None:
 
 
 def _ssh(options: Namespace) -> int:
-    from ...core.cluster.ssh_hosts import checked_hosts, hosts_named, read_hosts, ssh_command
     from ...core.errors import UsageError
+    from ...core.farm.hosts import checked_hosts, hosts_named, read_hosts, ssh_command
 
     if not 1.0 <= options.limit <= 3600.0:
         raise UsageError("--limit is out of range.", "Give from 1 to 3600.")
@@ -105,8 +105,8 @@ def _add_system(commands: Any, name: str, title: str) -> None:
 
 
 def _batch_jobs(options: Namespace) -> int:
-    from ...core.cluster.batch_systems import MAX_WORKERS, Wanted
     from ...core.errors import UsageError
+    from ...core.farm.hosts import MAX_WORKERS, Wanted
     from ...core.files import real_path
 
     if not 1 <= options.workers <= MAX_WORKERS:
@@ -150,9 +150,9 @@ def _add_there(parser: ArgumentParser, python: str) -> None:
 
 
 def _usual(options: Namespace) -> Host:
-    from ...core.cluster.ssh_hosts import Host
     from ...core.errors import UsageError
-    from ...core.settings.choices import MAX_PROCESSES
+    from ...core.farm.hosts import Host
+    from ...core.settings.declaration import MAX_PROCESSES
 
     if not 1 <= options.slots <= MAX_PROCESSES:
         raise UsageError("--slots is out of range.", f"Give from 1 to {MAX_PROCESSES}.")
@@ -162,8 +162,7 @@ def _usual(options: Namespace) -> Host:
 
 def _request(options: Namespace) -> dict[str, Any]:
     """Return address and certificates, checked here: others would be asked in vain."""
-    from ...core.cluster.addresses import scheduler_address
-    from ...core.cluster.certificates import checked_folder
+    from ...core.farm.addresses import checked_folder, scheduler_address
     from ...core.files import real_path
 
     address = scheduler_address(options.address)

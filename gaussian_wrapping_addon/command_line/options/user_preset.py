@@ -10,7 +10,7 @@ from typing import Any
 
 from ...core.errors import UsageError
 from ...core.settings import JobSettings
-from ...core.settings.saved_settings import read_saved_settings, savable_settings
+from ...core.settings.job import read_saved_settings, savable_settings
 
 OPTION = "--user-preset"
 

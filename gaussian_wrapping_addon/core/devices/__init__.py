@@ -5,6 +5,8 @@ In: the setting ``device``. Out: a :class:`DeviceChoice`, or why a GPU cannot be
 load the folder: torch is imported where it is needed, in the worker.
 """
 
+from __future__ import annotations
+
 from .choice import CPU, DeviceChoice, choose_device, reject_absent_gpu, stage_device
 
 __all__ = ["CPU", "DeviceChoice", "choose_device", "reject_absent_gpu", "stage_device"]

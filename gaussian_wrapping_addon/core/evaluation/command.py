@@ -10,22 +10,37 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.camera import Camera
-from ..dataset.loading.source_kind import read_poses, source_kind
-from ..dataset.similarity import Similarity
 from ..errors import DatasetError, ParseError, UsageError
 from ..files import read_json
+from ..loading.source_kind import read_poses, source_kind
 from ..progress import Progress
-from .alignment.pose_error import pose_errors
-from .alignment.similarity_alignment import IcpResult, icp
-from .layouts.dtu import align_to_scan, is_dtu_folder, read_dtu, score_dtu
-from .layouts.mesh_input import is_cloud, read_cloud, read_mesh
-from .layouts.tanks import SAMPLES as TANKS_SAMPLES
-from .layouts.tanks import align_to_log, is_tanks_folder, read_tanks, score_tanks
-from .surface.dtu_chamfer import DENSITY_MM, MAX_DISTANCE_MM, PATCH_MM
-from .surface.samples import SurfaceSamples, sample_uniformly
-from .surface.scores import MIN_THIN_SHARE, PROTOCOLS, score_protocols
-from .surface.truth import TRUTH_FILE, Truth, read_truth
+from ..scene.camera import Camera, Similarity
+from .alignment import IcpResult, icp, pose_errors
+from .dtu_chamfer import DENSITY_MM, MAX_DISTANCE_MM, PATCH_MM
+from .layouts import SAMPLES as TANKS_SAMPLES
+from .layouts import (
+    align_to_log,
+    align_to_scan,
+    is_cloud,
+    is_dtu_folder,
+    is_tanks_folder,
+    read_cloud,
+    read_dtu,
+    read_mesh,
+    read_tanks,
+    score_dtu,
+    score_tanks,
+)
+from .surface_scores import (
+    MIN_THIN_SHARE,
+    PROTOCOLS,
+    TRUTH_FILE,
+    SurfaceSamples,
+    Truth,
+    read_truth,
+    sample_uniformly,
+    score_protocols,
+)
 
 LAYOUTS = ("auto", "scene", "mesh", "tanks", "dtu")
 ALIGNMENTS = ("none", "cameras", "icp")

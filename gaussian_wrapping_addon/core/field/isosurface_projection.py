@@ -1,20 +1,50 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Project points onto the surface ``vacancy = 0.5`` by safeguarded Newton and bracketing."""
+"""Points moved onto the isosurface."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from .. import tolerances
-from ..dataset.camera import Camera
+from .. import limits
 from ..progress import Progress
-from .vacancy.vacancy import SETTLED, VacancyResult
+from ..scene.camera import Camera
+from .vacancy import SETTLED, VacancyResult
 from .vector_field import MIN_SLOPE, VectorFieldResult
+
+# -- Residuals of vertices with respect to the isosurface, in vacancy -----------------------------
+
+
+def isosurface_residuals(vacancy: Any, points: np.ndarray) -> dict[str, Any]:
+    """Measure ``|v - 0.5|`` at points that should lie on the isosurface; empty without points.
+
+    The keys ``level_error_*`` are those of reports.
+
+    Parameters
+    ----------
+    vacancy : VacancyField
+        Or any object with ``vacancy(points)``.
+    points : (n, 3) float64
+        Scene frame.
+    """
+    if len(points) == 0:
+        return {}
+    away = np.abs(vacancy.vacancy(points).filled.astype(np.float64) - limits.ISO_LEVEL)
+    return {
+        "level_error_mean": float(away.mean()),
+        "level_error_median": float(np.median(away)),
+        "level_error_p95": float(np.quantile(away, 0.95)),
+        "level_error_p99": float(np.quantile(away, 0.99)),
+        "level_error_max": float(away.max()),
+    }
+
+
+# -- Project points onto the surface ``vacancy = 0.5`` by safeguarded Newton and bracketing -------
+
 
 TOLERANCE = 0.01
 """Largest residual of a point on the surface: about the error of the field due to truncated tails
@@ -206,14 +236,14 @@ class _Search:
         self.phase = np.full(n, _NEWTON, np.int8)
         self.status = np.full(n, ProjectionStatus.DROPPED, np.uint8)
         seen = first.camera >= 0
-        done = seen & (np.abs(self.v - tolerances.ISO_LEVEL) <= self.target)
+        done = seen & (np.abs(self.v - limits.ISO_LEVEL) <= self.target)
         self.status[done] = ProjectionStatus.CONVERGED
         # Unseen points have no vacancy; without Gaussians there is no length scale.
         self.rows = np.flatnonzero(seen & ~done & (self.sigma > 0.0))
 
     def result(self, evaluations: int) -> ProjectionResult:
         """Return the best position of every point."""
-        residual = np.abs(self.best_v - tolerances.ISO_LEVEL)
+        residual = np.abs(self.best_v - limits.ISO_LEVEL)
         close = (self.status == ProjectionStatus.DROPPED) & (residual <= self.tolerance)
         close &= self.best_camera >= 0
         newton = self.phase == _NEWTON
@@ -263,7 +293,7 @@ class _Search:
         return np.linalg.norm(trial - self.start[rows], axis=1)
 
     def _is_exhausted(self, rows: np.ndarray, trial: np.ndarray) -> np.ndarray:
-        inward = self.v[rows] > tolerances.ISO_LEVEL
+        inward = self.v[rows] > limits.ISO_LEVEL
         too_far = self._travel(rows, trial) > self.max_travel[rows]
         too_far |= inward & (self.marched[rows] > MAX_INWARD_MARCH)
         # Outwards, the last step ends at the limit itself.
@@ -277,7 +307,7 @@ class _Search:
 
     def _newton(self, rows: np.ndarray) -> np.ndarray:
         length = np.linalg.norm(self.V[rows], axis=1)  # > 0
-        step = np.log(tolerances.ISO_LEVEL / self.v[rows]) / (length * self.slope[rows])
+        step = np.log(limits.ISO_LEVEL / self.v[rows]) / (length * self.slope[rows])
         limit = MAX_STEP_SIGMAS * self.sigma[rows]
         step = np.clip(step, -limit, limit) * 0.5 ** self.halvings[rows]
         return self.x[rows] + (step / length)[:, None] * self.V[rows]
@@ -292,14 +322,14 @@ class _Search:
         known = (self.outward[rows] != 0.0).any(1) & (not along_ray)
         outward = np.where(known[:, None], self.outward[rows], to_camera)
         self.along_ray[rows] = ~known
-        occupied = self.v[rows] < tolerances.ISO_LEVEL
+        occupied = self.v[rows] < limits.ISO_LEVEL
         self.direction[rows] = np.where(occupied[:, None], outward, -outward)
 
     def _march(self, rows: np.ndarray) -> np.ndarray:
         self.marched[rows] += 1
         count = self.marched[rows]
         # Inwards, longer steps could miss a thin wall.
-        occupied = self.v[rows] < tolerances.ISO_LEVEL
+        occupied = self.v[rows] < limits.ISO_LEVEL
         outward = np.minimum(2.0 ** (count - 1), self._remaining_sigmas(rows))
         reach = np.where(occupied, outward, count) * self.sigma[rows]
         return self.x[rows] + reach[:, None] * self.direction[rows]
@@ -320,8 +350,8 @@ class _Search:
         rows = self.rows
         v = evaluated.vacancy.astype(np.float64)
         seen = evaluated.camera >= 0
-        error = np.abs(v - tolerances.ISO_LEVEL)
-        better = seen & (error < np.abs(self.best_v[rows] - tolerances.ISO_LEVEL))
+        error = np.abs(v - limits.ISO_LEVEL)
+        better = seen & (error < np.abs(self.best_v[rows] - limits.ISO_LEVEL))
         self.best_x[rows[better]] = trial[better]
         self.best_v[rows[better]] = v[better]
         self.best_camera[rows[better]] = evaluated.camera[better]
@@ -333,7 +363,7 @@ class _Search:
         self.status[rows[done & newton]] = ProjectionStatus.CONVERGED
         self.status[rows[done & ~newton]] = ProjectionStatus.BISECTED
 
-        crossed = (v > tolerances.ISO_LEVEL) != (self.v[rows] > tolerances.ISO_LEVEL)
+        crossed = (v > limits.ISO_LEVEL) != (self.v[rows] > limits.ISO_LEVEL)
         # A long march may cross the surface into unseen space; a Newton step is halved there.
         crossed &= seen | march
         opened = newton & crossed & ~done
@@ -363,16 +393,16 @@ class _Search:
         self, rows: np.ndarray, from_x: np.ndarray, from_v: np.ndarray, x: np.ndarray, v: np.ndarray
     ) -> None:
         self.phase[rows] = _BRACKET
-        side = (v > tolerances.ISO_LEVEL).astype(np.int64)
+        side = (v > limits.ISO_LEVEL).astype(np.int64)
         self.ends[rows, side] = x
-        self.weights[rows, side] = v - tolerances.ISO_LEVEL
+        self.weights[rows, side] = v - limits.ISO_LEVEL
         self.ends[rows, 1 - side] = from_x[rows]
-        self.weights[rows, 1 - side] = from_v[rows] - tolerances.ISO_LEVEL
+        self.weights[rows, 1 - side] = from_v[rows] - limits.ISO_LEVEL
 
     def _shorten(self, rows: np.ndarray, x: np.ndarray, v: np.ndarray) -> None:
-        side = (v > tolerances.ISO_LEVEL).astype(np.int64)
+        side = (v > limits.ISO_LEVEL).astype(np.int64)
         self.ends[rows, side] = x
-        self.weights[rows, side] = v - tolerances.ISO_LEVEL
+        self.weights[rows, side] = v - limits.ISO_LEVEL
         # Illinois rule: halve the weight of an end retained twice, or it would stay for ever.
         again = side == self.last_side[rows]
         self.weights[rows[again], 1 - side[again]] *= 0.5

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .. import tolerances
+from .. import limits
+from ..compiled import kernel, part
 from ..gaussians.model import GaussianArrays
-from ..kernels.compiled import kernel, part
-from ..kernels.parallel import default_threads, even_bounds, run_chunks
-from .box_grid import EMPTY_KEY, build_box_grid, cell_key, hash_key
+from ..parallel import default_threads, even_bounds, run_chunks
+from .samples import EMPTY_KEY, build_box_grid, cell_key, hash_key
 
 TAIL = 1e-4
 """Gaussians with a smaller value at a point are ignored (docs/method.md, section 5.2)."""
@@ -198,7 +198,7 @@ class VectorField:
                 begin, end, order, points, self._table, self._half, grid.origin, grid.level_size,
                 grid.table_begin, grid.table_mask, grid.slot_keys, grid.slot_cells,
                 grid.cell_begin, grid.owners, self.oriented,
-                tolerances.ORIENTED_MIN_NORM**2, V, sigma_local, strongest,
+                limits.ORIENTED_MIN_NORM**2, V, sigma_local, strongest,
             )  # fmt: skip
 
         if count and len(self._table):
@@ -236,6 +236,6 @@ class VectorField:
             known = np.flatnonzero(weak & (nearest >= 0))
             normals = self._normals[nearest[known]]  # (k, 3)
             norm = np.linalg.norm(normals, axis=1)
-            oriented = norm >= tolerances.ORIENTED_MIN_NORM
+            oriented = norm >= limits.ORIENTED_MIN_NORM
             out[known[oriented]] = normals[oriented] / norm[oriented, None]
         return out

@@ -17,7 +17,7 @@ POINT: Final = np.dtype([("position", "<f4", (3,)), ("color", "u1", (4,))])
 """Scene frame; sRGB with opacity: 16 bytes a point."""
 MOST_POINTS: Final = 50_000
 """Show a surface as well as all of them would, and are read in milliseconds."""
-MAX_BYTES: Final = MOST_POINTS * POINT.itemsize + 4096
+MAX_POINTS_BYTES: Final = MOST_POINTS * POINT.itemsize + 4096
 """Of a file: the points and NumPy's header."""
 VISIBLE_OPACITY: Final = 0.1
 """Fainter Gaussians are mist that would hide the others."""

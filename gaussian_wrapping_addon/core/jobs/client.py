@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Start, watch and stop the worker process of a job folder. Needs neither torch nor bpy."""
+"""Starts, watches and stops the worker of a job."""
 
 from __future__ import annotations
 
@@ -25,17 +25,14 @@ from ..errors import (
     WorkerError,
     unwritable_error,
 )
-from ..files import real_path
-from ..processes.helper_process import child_command
-from ..processes.process_identity import is_here, process_alive
-from ..processes.spawn import kill_group, spawn
-from ..processes.worker_environment import ready_worker
-from ..processes.worker_requirements import not_started
-from ..regular_files import open_regular, touch_regular
+from ..files import open_regular, real_path, touch_regular
+from ..worker.environment import not_started, ready_worker
+from ..worker.helper_process import child_command
+from ..worker.spawn import is_here, kill_group, process_alive, spawn
+from .stages.training import killed_hint, killed_mesh_hint
 from .store.job_file import JobFile, read_job, reject_region_conflicts, write_job
 from .store.job_folder import FOREIGN_LOCK_HINT, JobFolder, JobStatus
 from .store.rollback import save_rollback
-from .training.oom_retry import killed_hint, killed_mesh_hint
 
 WORKER_MODULE = "jobs.worker"
 PYTHON_VARIABLE = "GAUSSIAN_WRAPPING_PYTHON"

@@ -2,8 +2,8 @@
 """The ``run-part`` command: run one part of a job in a process of its own.
 
 Runs in the worker's Python, on any computer that sees the job folder. Writes one JSON object per
-line to stdout, in the protocol of :mod:`.commands.run_in_worker`. The exit code is one of
-:mod:`.parts.exit_codes`.
+line to stdout, in the protocol of :mod:`.run_in_worker`. The exit code is one of
+:mod:`.graph`.
 """
 
 from __future__ import annotations
@@ -22,32 +22,34 @@ from .. import limits
 from ..devices import choose_device
 from ..errors import EXIT_RESOURCES, Cancelled, UsageError, WorkerError, WrapError
 from ..files import seconds_since_written
-from ..kernels.parallel import default_threads
-from ..meshing.tiles.kinds import TILE_KINDS
-from ..processes.helper_process import emit, kill_helpers
-from ..processes.parent_death import end_with_parent
-from ..processes.process_identity import Caller
+from ..names import TILE_KINDS
+from ..parallel import default_threads
 from ..progress import Progress
-from .failure import failure_of
-from .parts.code_version import code_version
-from .parts.exit_codes import (
+from ..worker.helper_process import emit, kill_helpers
+from ..worker.spawn import Caller, end_with_parent
+from .parts.graph import (
     CANCELLED,
     DONE,
     MAY_WORK_ELSEWHERE,
     NEVER,
     OTHER_CODE,
+    STATES_FOLDER,
+    Part,
+    PartsGraph,
+    code_version,
     part_exit_code,
+    plan_hash,
+    read_parts,
+    read_state,
+    states_folder,
 )
-from .parts.graph import Part, PartsGraph, read_parts
 from .parts.lease import PartLease
-from .parts.part_runner import PartResult, PartRunner
-from .parts.part_state import STATES_FOLDER, read_state, states_folder
-from .parts.planning import plan_hash
-from .parts.walk import HERE
-from .stages.region_meshing import TILES_FOLDER
+from .parts.runner import HERE, PartResult, PartRunner
+from .stages.meshing import TILES_FOLDER
 from .store.job_file import JobFile, read_job
 from .store.job_folder import JobFolder, JobStatus
 from .store.rollback import discard_rollback
+from .worker import failure_of
 
 _logger = logging.getLogger(__name__)
 

@@ -2,7 +2,7 @@
 """The ``queue`` command: many jobs, one after another or side by side on a Dask cluster.
 
 Runs in the worker's Python; writes one JSON object per line, in the protocol of
-:mod:`.commands.run_in_worker`. Each job is a process of its own that can be killed and begun again:
+:mod:`.run_in_worker`. Each job is a process of its own that can be killed and begun again:
 it goes on from what it has finished.
 """
 
@@ -19,7 +19,6 @@ from types import FrameType
 from typing import Any
 
 from .. import limits
-from ..cluster.dask_tasks import DaskTasks, Ended, request_of
 from ..errors import (
     EXIT_CANCELLED,
     EXIT_DONE,
@@ -29,22 +28,27 @@ from ..errors import (
     ParseError,
     WrapError,
 )
-from ..evaluation.report.text import measured, part
-from ..files import read_json, write_json
-from ..processes.helper_process import child_command, emit
-from ..processes.parent_death import end_with_parent
-from ..processes.process_identity import Caller
-from ..regular_files import touch_regular
-from ..settings.farm import LOCAL
+from ..evaluation.report.figures import measured, part
+from ..farm.dask import DaskTasks, Ended, request_of
+from ..files import read_json, touch_regular, write_json
+from ..settings.job import LOCAL
+from ..worker.helper_process import child_command, emit
+from ..worker.spawn import Caller, end_with_parent
 from . import worker
 from .client import JobClient
-from .failure import failure_of
-from .parts.code_version import code_version
-from .parts.exit_codes import CANCELLED, DONE, MAY_WORK_ELSEWHERE, NEVER, OTHER_CODE
-from .parts.graph import read_parts
-from .parts.planning import plan_hash
+from .parts.graph import (
+    CANCELLED,
+    DONE,
+    MAY_WORK_ELSEWHERE,
+    NEVER,
+    OTHER_CODE,
+    code_version,
+    plan_hash,
+    read_parts,
+)
 from .store.job_file import read_job
 from .store.job_folder import JobFolder
+from .worker import failure_of
 
 MODULE = "jobs.queue_process"
 TABLE_NAME = "queue.json"
@@ -62,7 +66,7 @@ def main(arguments: list[str]) -> int:
     """Run the queue of ``arguments = [{"out", "jobs", "computers", ...} as JSON]``.
 
     With ``{"out", "job", "code"}``, what a Dask worker calls, run that one job; the exit code is
-    then one of :mod:`.parts.exit_codes`.
+    then one of :mod:`.graph`.
     """
     request = json.loads(arguments[0])
     folder = JobFolder(Path(request["out"]))

@@ -8,13 +8,10 @@ import time
 from collections.abc import Callable
 
 from ..devices import DeviceChoice, choose_device
-from ..kernels.parallel import default_threads
+from ..parallel import default_threads
 from ..progress import Progress, ProgressEvent
-from .masking.masks_stage import check_mask_model
-from .parts.engine import Engine, InProcess
-from .parts.job_progress import JobProgress
-from .parts.part_runner import PartRunner
-from .parts.walk import Walk
+from .parts.runner import Engine, InProcess, JobProgress, PartRunner, Walk
+from .stages.masks import check_mask_model
 from .store.job_file import JobFile, reject_region_conflicts
 from .store.job_folder import JobFolder
 

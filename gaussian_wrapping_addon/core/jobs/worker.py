@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The worker process: lock the job folder, run the job, keep ``status.json`` up to date."""
+"""The worker process of a job."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import logging
 import math
@@ -11,26 +12,76 @@ import os
 import signal
 import threading
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
 
 from .. import limits
-from ..errors import EXIT_DONE, Cancelled, WrapError
-from ..files import remove_partial_files
-from ..log_lines import LineFormatter
-from ..processes.helper_process import emit, kill_helpers
-from ..processes.process_identity import (
-    Caller,
-    host_and_pid_namespace,
-    process_start_ticks,
+from ..errors import (
+    DISK_FULL_ERRNOS,
+    EXIT_DONE,
+    EXIT_OTHER,
+    EXIT_RESOURCES,
+    Cancelled,
+    WrapError,
+    unwritable_error,
 )
-from ..progress import COMPILING, ProgressEvent
-from ..regular_files import open_regular
-from .failure import failure_of
+from ..files import open_regular, remove_partial_files
+from ..progress import COMPILING, LineFormatter, ProgressEvent
+from ..worker.environment import package_error
+from ..worker.helper_process import emit, kill_helpers
+from ..worker.spawn import Caller, host_and_pid_namespace, process_start_ticks
 from .store.job_file import read_job
 from .store.job_folder import JobFolder, JobStatus
 from .store.rollback import discard_rollback, roll_back
+
+# -- What a job that failed tells: exit code, error and next step of any exception ----------------
+
+
+FULL_DISK_HINT = "Make room on that disk, then resume: the last checkpoint is intact."
+MEMORY_HINT = "Close other programs, or choose a smaller preset."
+BUG_HINT = "Send the job folder's log.txt with a bug report."
+_NO_THREAD = "can't start new thread"
+"""What Python says where the system gives no memory, or no number, to another thread."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """What ``status.json`` says of a failed job."""
+
+    code: int
+    error: str
+    hint: str
+    is_known: bool = True
+    """Whether users can do something about it; else the log needs the traceback."""
+
+
+def failure_of(error: Exception, root: Path) -> Failure:
+    """Describe an exception that ended a job.
+
+    Parameters
+    ----------
+    root : Path
+        The job folder: where a full disk is, if the error does not name a file.
+    """
+    if isinstance(error, WrapError):
+        cause = error.__cause__
+        is_full = isinstance(cause, OSError) and cause.errno in DISK_FULL_ERRNOS
+        return Failure(error.exit_code, error.message, FULL_DISK_HINT if is_full else error.hint)
+    if isinstance(error, OSError) and error.errno in DISK_FULL_ERRNOS:
+        full = unwritable_error(error.filename or root, error)
+        return Failure(full.exit_code, full.message, FULL_DISK_HINT)
+    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+        return Failure(EXIT_RESOURCES, "Not enough memory.", MEMORY_HINT)
+    if isinstance(error, ImportError | OSError) and (known := package_error(error)):
+        return Failure(known.exit_code, known.message, known.hint)
+    if isinstance(error, RuntimeError) and _NO_THREAD in str(error):
+        return Failure(EXIT_RESOURCES, "The system starts no further thread.", MEMORY_HINT)
+    return Failure(EXIT_OTHER, f"Unexpected {type(error).__name__}: {error}", BUG_HINT, False)
+
+
+# -- The worker process: lock the job folder, run the job, keep ``status.json`` up to date --------
+
 
 _logger = logging.getLogger(__name__)
 

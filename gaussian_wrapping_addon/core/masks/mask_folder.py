@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The folder of made masks: PNGs to look at and edit, and the list of those that were rejected.
-
-Standard library only, so that Blender can load it.
-"""
+"""Made masks and their folder."""
 
 from __future__ import annotations
 
@@ -17,9 +14,39 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from .. import limits
-from ..errors import ParseError
-from ..files import read_json, resolve_inside, write_bytes, write_json
-from ..regular_files import is_real_folder, read_bounded
+from ..errors import DatasetError, ParseError, ResourceError
+from ..files import is_real_folder, read_bounded, read_json, resolve_inside, write_bytes, write_json
+from ..limits import MAX_MODEL_BYTES
+
+# -- The file of a segmentation model, looked at before a job starts. Standard library only -------
+
+
+def check_model_file(path: Path) -> None:
+    """Raise where a model's file is missing, no regular file, empty or too large; reads nothing.
+
+    Raises
+    ------
+    DatasetError, ResourceError
+    """
+    try:
+        size = path.stat().st_size if path.is_file() else None
+    except OSError:
+        size = None
+    if not size:
+        state = "is empty" if size == 0 else "is not there, or no file"
+        raise DatasetError(f"The mask model {path} {state}.", "Check the path.")
+    if size > MAX_MODEL_BYTES:
+        raise ResourceError(
+            f"The mask model {path.name} has {size / 2**30:.1f} GiB; "
+            f"{MAX_MODEL_BYTES / 2**30:.0f} GiB are the limit.",
+            "Choose a smaller model.",
+        )
+
+
+# -- The folder of made masks: PNGs to look at and edit, and the list of those that were rejected
+#
+# Standard library only, so that Blender can load it.
+
 
 FOLDER = "masks"
 """In the job folder."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..dataset.photos.photo_file import read_photo
 from ..files import read_json, write_bytes
-from ..processes.helper_process import emit
-from .cleaning import cleaned, encoded
-from .segmentation_model import SegmentationModel
+from ..photos.photo_file import read_photo
+from ..worker.helper_process import emit
+from .making import SegmentationModel, cleaned, encoded
 
 
 def main(folder: Path) -> None:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.camera import Camera
-from ..kernels.compiled import kernel
-from ..kernels.parallel import even_bounds, run_chunks
-from ..tolerances import SCENE_RADIUS
+from ..compiled import kernel
+from ..limits import SCENE_RADIUS
+from ..parallel import even_bounds, run_chunks
+from ..scene.camera import Camera
 
 NEAR_DEPTH = 1e-3 * SCENE_RADIUS
 """Near plane in scene units, so that a camera inside a mesh sees past it; callers in other frames

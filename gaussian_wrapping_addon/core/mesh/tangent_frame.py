@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from .topology import area_vectors, next_half_edges
+from .surface_mesh import area_vectors, next_half_edges
 
 
 @dataclass(frozen=True)

@@ -12,27 +12,23 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.camera import Camera
 from ..errors import MeshingError
-from ..field.depth_samples import DepthSamples
-from ..field.isosurface_residual import isosurface_residuals
+from ..field.isosurface_projection import isosurface_residuals
+from ..field.samples import DepthSamples
 from ..gaussians.model import GaussianArrays
 from ..mesh.components import compacted, without_floaters
-from ..mesh.surface_mesh import SurfaceMesh
-from ..mesh.topology import edge_lengths
-from ..progress import Progress
-from ..regions.cap_planes import cap_planes
-from ..regions.convex_region import Region
-from ..report_warning import ReportWarning
+from ..mesh.surface_mesh import SurfaceMesh, edge_lengths
+from ..progress import Progress, ReportWarning
+from ..regions.scene_regions import cap_planes
+from ..regions.shapes import Region
+from ..scene.camera import Camera
 from ..settings import MeshingSettings
-from .cleanup.degenerate import remove_degenerate
-from .points.candidate_surface import no_surface_error, pivot_cloud, pivots_alone
-from .points.pivots import pivot_rule
-from .points.spacing import footprints
-from .tetrahedra.boundary_faces import tetrahedron_neighbours
-from .tetrahedra.delaunay import bounding_points, delaunay
-from .tetrahedra.marching_tetrahedra import bisect, marching_closed
-from .tetrahedra.tetrahedron_cut import cut_to_region
+from .classification import tetrahedron_neighbours
+from .delaunay import bounding_points, delaunay
+from .marching_tetrahedra import bisect, cut_to_region, marching_closed
+from .pivots import pivot_rule
+from .repair import remove_degenerate
+from .surface_points import footprints, no_surface_error, pivot_cloud, pivots_alone
 
 _logger = logging.getLogger(__name__)
 
@@ -76,7 +72,7 @@ def mesh_by_pivots(
         ``pivots`` (per Gaussian), ``pivot_box``, ``pivot_samples`` and ``min_component_share`` are
         used. An edge length or a number of points does not apply; the provenance notes that.
     depth_samples : DepthSamples, optional
-        Depth-map samples of the isosurface in the region (:mod:`.depth_samples`); not used with
+        Depth-map samples of the isosurface in the region (:mod:`.samples`); not used with
         ``pivot_samples = "none"``.
 
     Returns

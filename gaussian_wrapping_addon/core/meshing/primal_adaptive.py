@@ -12,28 +12,33 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.camera import Camera
 from ..errors import MeshingError
-from ..field.depth_samples import DepthSamples
-from ..field.isosurface_residual import isosurface_residuals
+from ..field.isosurface_projection import isosurface_residuals
+from ..field.samples import DepthSamples
 from ..gaussians.model import GaussianArrays
 from ..mesh.components import compacted, without_floaters
-from ..mesh.simplification.edge_flips import flip_edges
-from ..mesh.simplification.vertex_selection import select_vertices
-from ..mesh.surface_mesh import SurfaceMesh
-from ..mesh.topology import edge_lengths
+from ..mesh.simplification import flip_edges, select_vertices
+from ..mesh.surface_mesh import SurfaceMesh, edge_lengths
 from ..progress import Progress
-from ..regions.convex_region import Region
+from ..regions.shapes import Region
+from ..scene.camera import Camera
 from ..settings import MeshingSettings
-from .cleanup.degenerate import remove_degenerate
-from .cleanup.repair import split_nonmanifold
-from .cleanup.small_handles import without_small_handles
-from .points.candidate_surface import candidate_surface
-from .points.resolution import DenseRequest, checked_request, dense_request, nominal_edge
-from .points.surface_points import KIND_CAP, KIND_JUMP, KIND_SURFACE, SurfacePoints, SurfaceSampler
-from .tetrahedra.boundary_faces import boundary_faces, tetrahedron_neighbours
-from .tetrahedra.classification import classify, on_one_sheet
-from .tetrahedra.delaunay import bounding_points, delaunay
+from .classification import boundary_faces, classify, on_one_sheet, tetrahedron_neighbours
+from .clean_up import without_small_handles
+from .delaunay import bounding_points, delaunay
+from .repair import remove_degenerate, split_nonmanifold
+from .surface_points import (
+    KIND_CAP,
+    KIND_JUMP,
+    KIND_SURFACE,
+    DenseRequest,
+    SurfacePoints,
+    SurfaceSampler,
+    candidate_surface,
+    checked_request,
+    dense_request,
+    nominal_edge,
+)
 
 _logger = logging.getLogger(__name__)
 
@@ -65,7 +70,7 @@ def mesh_region(
     """Mesh the surface ``vacancy = 0.5`` inside a region, closed by caps on the region's boundary.
 
     With adaptive spacing a denser mesh is extracted and simplified to the vertices that its shape
-    needs (:mod:`..mesh.simplification.vertex_selection`). ``vacancy`` decides about space that no
+    needs (:mod:`.simplification`). ``vacancy`` decides about space that no
     camera sees. Without an edge length or a number of points the mesh has about 50 thousand faces.
 
     Parameters
@@ -90,7 +95,7 @@ def mesh_region(
         Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices.
         0 means that ``settings.points`` applies.
     depth_samples : DepthSamples, optional
-        Depth-map samples of the isosurface in the region (:mod:`.depth_samples`).
+        Depth-map samples of the isosurface in the region (:mod:`.samples`).
 
     Returns
     -------

@@ -12,17 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..dataset.camera import Camera
 from ..gaussians.model import TRAINED, OrientedGaussians
-from ..kernels.array_store import ArrayStore
-from ..kernels.parallel import default_threads
-from .cuda.cuda_render import render_cuda
-from .projection.projection import RawArrays, RawGradients, project_backward, project_gaussians
-from .raster.blend import Images, RenderBuffers, ScreenView
-from .tiling.tiles import TileBinning
-from .types.gradients import ImageGradients
-from .types.images import Render, RenderStatistics
-from .types.options import RenderOptions
+from ..parallel import ArrayStore, default_threads
+from ..scene.camera import Camera
+from .cuda.device_renderer import render_cuda
+from .projection import RawArrays, RawGradients, project_backward, project_gaussians
+from .raster import Images, RenderBuffers, ScreenView
+from .tiles import TileBinning
+from .types import ImageGradients, Render, RenderOptions, RenderStatistics
 from .view_renderer import ViewPass, ViewRenderer, allocate_screen, band_view
 
 
@@ -37,7 +34,7 @@ def render(
     options: RenderOptions | None = None,
     buffers: RenderBuffers | None = None,
 ) -> Render:
-    """Render as defined by :func:`~.reference.reference.render_reference`, in float32.
+    """Render as defined by :func:`~.reference.render_reference`, in float32.
 
     Differentiable with respect to every tensor of ``gaussians`` except ``filter_3d``. Images and
     gradients are bitwise the same for any number of threads.

@@ -11,35 +11,32 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..dataset.camera import Camera
 from ..errors import UsageError
-from ..kernels.array_store import ArrayStore
-from ..kernels.parallel import (
+from ..parallel import (
     CHUNKS_PER_THREAD,
+    ArrayStore,
     balanced_bounds,
     default_threads,
     even_bounds,
     run_chunks,
 )
-from .projection.projection import (
-    RawArrays,
-    ScreenGaussians,
-    project_backward_visible,
-    project_gaussians,
-)
-from .raster.blend import Images, RenderBuffers, ScreenView, blend, write_intersection_gradients
-from .raster.intersection_sums import (
+from ..scene.camera import Camera
+from .projection import RawArrays, ScreenGaussians, project_backward_visible, project_gaussians
+from .raster import (
+    Images,
+    RenderBuffers,
+    ScreenView,
     add_intersection_gradients,
     add_intersection_weights,
+    blend,
     mark_visible,
+    write_intersection_gradients,
     write_screen_gradients,
 )
-from .simd.raster_math import ROW_VALUES, vector_lanes
-from .tiling.block_masks import mask_kernel
-from .tiling.tiles import TileBinning, TileLists
-from .types.gradients import ImageGradients, VisibleGradients
-from .types.images import RenderStatistics
-from .types.options import RenderOptions
+from .simd import ROW_VALUES, vector_lanes
+from .tile_kernels import mask_kernel
+from .tiles import TileBinning, TileLists
+from .types import ImageGradients, RenderOptions, RenderStatistics, VisibleGradients
 
 INTERSECTION_BYTES = 4 * ROW_VALUES + 32
 """Memory of one intersection: gradient, list entry, block mask, blending weights."""
@@ -114,7 +111,7 @@ class ViewPass:
     ----------
     color, normal, geometric_normal : (h, w, 3) float32
     alpha, depth : (h, w) float32
-        The images of :class:`~.types.images.Render`. They must not be modified before
+        The images of :class:`~.types.Render`. They must not be modified before
         :meth:`backward`.
     gaussians, screen : RawArrays, ScreenGaussians
         What was rendered, and its projection.
@@ -360,7 +357,7 @@ class ViewRenderer:
         options: RenderOptions | None = None,
         images: Images | None = None,
     ) -> ViewPass:
-        """Render like :func:`~.render.render`, without autograd.
+        """Render like :func:`~.render`, without autograd.
 
         The parameters must not change before :meth:`ViewPass.backward` has run. The result of the
         previous call is overwritten.

@@ -5,7 +5,9 @@ In: values from command line, panel or job file. Out: validated frozen dataclass
 Standard library only, so that Blender can load it.
 """
 
-from .choices import (
+from __future__ import annotations
+
+from .declaration import (
     BOUNDARIES,
     CORRELATIONS,
     FIELD_CAMERAS,
@@ -23,10 +25,14 @@ from .choices import (
     UNSEEN,
     UP_AXES,
     UV_CHOICES,
+    Declaration,
+    declarations,
+    from_json,
+    key_values,
+    to_json,
+    with_values,
 )
-from .declaration import Declaration, declarations, with_values
 from .job import JobSettings, declared, preset
-from .json_values import from_json, key_values, to_json
 from .meshing import MeshingSettings
 from .texture import TextureSettings
 from .training import MODEL_SELECTION, TrainingSettings

@@ -1,30 +1,164 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Declare a setting once, as a field of a settings class with metadata.
-
-Validation, command line, Blender properties, panels, job file and ``docs/settings.md`` are
-generated from these declarations. To add a setting, add one field::
-
-    smoothness: float = setting(
-        0.5,
-        help="Weight of the smoothness term.",
-        check=Range(0.0, 1.0),
-        option=Option("--smoothness", metavar="W"),
-        panel=PanelProperty("Smoothness", "How strongly neighbouring vertices hold each other"),
-    )
-"""
+"""One declaration for each setting: default, range, option, panel property, help."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, cast
 
-from ..errors import SettingError
-from .checks import Check, Choices
-from .choices import SWITCH
+from ..errors import SettingError, UsageError
+
+# -- Checks of a setting's value: numeric ranges, choices, subsets and other conditions -----------
+
+
+class Check(Protocol):
+    """Condition that a setting's value must fulfil, with a description of valid values."""
+
+    @property
+    def wanted(self) -> str:
+        """Description of valid values, for the sentence "Give <wanted>."."""
+
+    def holds(self, value: Any) -> bool:
+        """Tell whether a value is valid."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """A finite number from ``low`` to ``high``."""
+
+    low: float
+    high: float = math.inf
+    zero: str = ""
+    """Meaning of 0, if it is allowed in addition to the range."""
+    words: str = ""
+    """Replaces the generated description."""
+    below_high: bool = False
+    """Whether ``high`` itself is excluded."""
+
+    @property
+    def wanted(self) -> str:
+        if self.words:
+            return self.words
+        to = "to below" if self.below_high else "to"
+        span = f"from {_plain(self.low)} {to} {_plain(self.high)}"
+        return f"0 ({self.zero}) or {span}" if self.zero else span
+
+    @property
+    def lowest(self) -> float:
+        """The smallest valid value, 0 if it has a meaning of its own."""
+        return 0 if self.zero else self.low
+
+    def holds(self, value: Any) -> bool:
+        if self.zero and value == 0:
+            return True
+        if value == math.inf or (self.below_high and value >= self.high):
+            return False
+        return bool(self.low <= value <= self.high)
+
+
+@dataclass(frozen=True)
+class Choices:
+    """One of a list of words or numbers."""
+
+    values: tuple[Any, ...]
+
+    @property
+    def wanted(self) -> str:
+        return f"one of {', '.join(map(str, self.values))}"
+
+    def holds(self, value: Any) -> bool:
+        return value in self.values
+
+
+@dataclass(frozen=True)
+class Subset:
+    """Any number of words of a list."""
+
+    values: tuple[str, ...]
+
+    @property
+    def wanted(self) -> str:
+        return f"among {', '.join(self.values)}"
+
+    def holds(self, value: Any) -> bool:
+        return set(value) <= set(self.values)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Any value that a function accepts."""
+
+    accepts: Callable[[Any], bool]
+    wanted: str
+
+    def holds(self, value: Any) -> bool:
+        return self.accepts(value)
+
+
+def _plain(number: float) -> str:
+    return str(int(number)) if float(number).is_integer() else str(number)
+
+
+# -- The choices of settings ----------------------------------------------------------------------
+
+
+PRESETS = ("draft", "standard", "fine", "paper", "large")
+SELECTION_MODES = ("auto", "on", "off")
+"""Of an optional part of the model; ``"auto"`` selects it by evidence in the photos."""
+SWITCH = ("off", "on")
+
+DEVICE = r"auto|cpu|cuda(:[0-9]{1,3})?"
+"""Pattern of the devices that a job can be given."""
+
+COMPUTERS = r"|local|(tcp|tls)://(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253}):[0-9]{1,5}"
+"""Pattern of where the parts of a job run; empty: here, in one process."""
+MAX_PROCESSES = 64
+
+MASK_MODES = ("ignore", "background", "auto")
+"""``"auto"``: background where the masks were made of a turntable, a region or by a model, else
+ignore."""
+MASKS_MADE = ("off", "region")
+MODEL_RANGES = ("imagenet", "half", "unit")
+"""Colours of a segmentation model: mean and deviation of ImageNet, -0.5 to 0.5, 0 to 1."""
+MAX_MASK_GROW_PX = 200
+GEOREFERENCES = ("auto", "on", "off")
+TURNTABLE_MODES = ("auto", "on", "off")
+PANORAMA_MODES = ("auto", "on", "off")
+CORRELATIONS = ("signed", "squared")
+SPACINGS = ("adaptive", "uniform")
+MESH_METHODS = ("pam", "pivots")
+PIVOT_COUNTS = (2, 3, 9)
+PIVOT_BOXES = ("normal", "gof")
+PIVOT_SAMPLES = ("depth", "none")
+BOUNDARIES = ("closed", "open")
+UNSEEN = ("empty", "occupied")
+FIELD_CAMERAS = ("training", "all")
+MAX_LODS = 8
+TEXTURE_SOURCES = ("photos", "gaussians")
+UV_CHOICES = ("auto", "own", "new")
+"""Of a mesh from elsewhere; ``"auto"``: its own if it has any."""
+UP_AXES = ("auto", "y", "z")
+"""Of a mesh file; ``"auto"``: as the format is exported."""
+
+
+# -- Declare a setting once, as a field of a settings class with metadata -------------------------
+#
+# Validation, command line, Blender properties, panels, job file and ``docs/settings.md`` are
+# generated from these declarations. To add a setting, add one field::
+#
+#     smoothness: float = setting(
+#         0.5,
+#         help="Weight of the smoothness term.",
+#         check=Range(0.0, 1.0),
+#         option=Option("--smoothness", metavar="W"),
+#         panel=PanelProperty("Smoothness", "How strongly neighbouring vertices hold each other"),
+#     )
+
 
 _KEY = "setting"
 
@@ -301,3 +435,80 @@ def validate(settings: Any) -> None:
         check = declared.check
         if check is not None and not check.holds(value_at(settings, declared.path)):
             raise SettingError(declared.path, check.wanted)
+
+
+# -- Convert settings to JSON values and back, as in ``job.json`` ---------------------------------
+
+
+_KINDS: dict[Any, str] = {int: "a whole number", float: "a number", str: "text"}
+_SHOWN_NAME = 40
+"""Characters of an unknown entry that a message shows."""
+
+
+def to_json(settings: Any) -> dict[str, Any]:
+    """Convert a settings dataclass to plain JSON values."""
+    return dataclasses.asdict(settings)
+
+
+def key_values(settings: Any) -> dict[str, Any]:
+    """Return the JSON values that decide about the result of a stage, for its key.
+
+    Settings without influence on the result are left out, and settings that 0.1.0 did not have
+    where they have their default: results of earlier versions stay valid.
+    """
+    left_out = {
+        entry.path
+        for entry in declarations(cast(type, type(settings)))
+        if not entry.affects_result
+        or (entry.since and value_at(settings, entry.path) == entry.default)
+    }
+    return {name: value for name, value in to_json(settings).items() if name not in left_out}
+
+
+def has_kind(kind: Any, value: Any) -> bool:
+    """Return whether a JSON value is one of a setting of type ``int``, ``float`` or ``str``."""
+    if kind is float:
+        try:
+            return not isinstance(value, bool) and math.isfinite(value)
+        except (TypeError, OverflowError):
+            return False
+    return kind in (int, str) and type(value) is kind
+
+
+def from_json(kind: type, values: Any, location: str = "settings") -> Any:
+    """Build a settings dataclass from JSON values.
+
+    Raises
+    ------
+    UsageError
+        A key is unknown or a value has the wrong type; names the location and the expected type.
+    """
+    if not isinstance(values, dict):
+        raise UsageError(f"{location} must be an object.", "Write it as {...}.")
+    hints = typing.get_type_hints(kind)
+    fields = {f.name for f in dataclasses.fields(kind)}
+    unknown = sorted(set(values) - fields)
+    if unknown:
+        name = unknown[0][:_SHOWN_NAME]
+        raise UsageError(f"{location} has an unknown entry {name!r}.", "Remove it.")
+    arguments = {}
+    for name, value in values.items():
+        wanted = hints[name]
+        where = f"{location}.{name}"
+        if dataclasses.is_dataclass(wanted):
+            arguments[name] = from_json(typing.cast(type, wanted), value, where)
+        elif wanted is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+            try:
+                arguments[name] = float(value)
+            except OverflowError:
+                raise UsageError(f"{where} is too large.", "Give a smaller number.") from None
+        elif wanted is not float and has_kind(wanted, value):
+            arguments[name] = value
+        elif typing.get_origin(wanted) is tuple and isinstance(value, (list, tuple)):
+            if not all(isinstance(v, str) for v in value):
+                raise UsageError(f"{where} must hold only text.", "Use strings.")
+            arguments[name] = tuple(value)
+        else:
+            kind_wanted = _KINDS.get(wanted, "a list of text")
+            raise UsageError(f"{where} has the wrong type.", f"Give {kind_wanted}.")
+    return kind(**arguments)

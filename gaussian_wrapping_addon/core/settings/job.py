@@ -1,43 +1,189 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""All settings of one job, and its presets."""
+"""Settings of a job, and how stored ones are read."""
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from ..errors import UsageError
-from ..export_formats import JOB_FORMATS
+from ..errors import ParseError, UsageError
+from ..files import read_json, write_json
 from ..limits import MAX_CHOSEN_FRAMES, MIN_IMAGES
-from .checks import Choices, Condition, Range, Subset
-from .choices import (
+from ..names import JOB_FORMATS
+from .declaration import (
+    COMPUTERS,
     DEVICE,
     GEOREFERENCES,
     MASKS_MADE,
     MAX_MASK_GROW_PX,
+    MAX_PROCESSES,
     MODEL_RANGES,
     PANORAMA_MODES,
     PRESETS,
     SWITCH,
     TURNTABLE_MODES,
-)
-from .declaration import (
+    Choices,
+    Condition,
     Declaration,
     Item,
     Option,
     PanelProperty,
+    Range,
+    Subset,
     declarations,
+    has_kind,
     setting,
     validate,
     with_values,
 )
-from .farm import certificates_setting, computers_setting, processes_setting
-from .markers import MARKERS_WANTED, are_markers, checked_markers
 from .meshing import MeshingSettings
 from .texture import TextureSettings
 from .training import TrainingSettings
+
+# -- Settings of a job's engine: on which processes and computers its parts run -------------------
+
+
+LOCAL = "local"
+"""A cluster of this computer, made for a job and gone with it."""
+
+
+def computers_setting() -> Any:
+    """Return the declaration of ``computers``."""
+    return setting(
+        "",
+        help="What runs the parts of a job. Empty: this process, one after another; local: several "
+        "processes of this computer; tls://HOST:PORT: the computers of a Dask scheduler.",
+        check=Condition(
+            lambda value: re.fullmatch(COMPUTERS, value) is not None,
+            "local or tls://HOST:PORT",
+        ),
+        option=Option(
+            "--computers",
+            "local|tls://HOST:PORT",
+            "run parts side by side: in processes of this computer, or at a Dask scheduler's",
+            scope="region",
+        ),
+        affects_result=False,
+        since="0.2.0",
+    )
+
+
+def processes_setting() -> Any:
+    """Return the declaration of ``processes``."""
+    return setting(
+        2,
+        help="Parts that run side by side on this computer.",
+        check=Range(1, MAX_PROCESSES),
+        unit="processes",
+        option=Option(
+            "--processes", help="parts side by side with --computers local", scope="region"
+        ),
+        panel=PanelProperty(
+            "Processes",
+            "Parts of a job that run side by side on this computer, each with its own memory",
+            default=1,
+            owner="scene",
+            panel_name="computers",
+            soft_high=8,
+        ),
+        affects_result=False,
+        since="0.2.0",
+    )
+
+
+def certificates_setting() -> Any:
+    """Return the declaration of ``certificates``."""
+    return setting(
+        "",
+        help="Folder of the certificates for tls:// addresses; empty: the one that the environment "
+        "variable GW_CERTIFICATES names.",
+        option=Option(
+            "--certificates",
+            "DIR",
+            "certificates for tls:// addresses",
+            scope="region",
+            parse=lambda text: str(Path(text)),
+        ),
+        affects_result=False,
+        since="0.2.0",
+    )
+
+
+# -- Printed markers as a setting: dictionary and side, such as ``4x4_50:0.05`` -------------------
+
+
+MARKER_DICTIONARIES = (
+    "4x4_50", "4x4_100", "4x4_250", "4x4_1000", "5x5_50", "5x5_100", "5x5_250", "5x5_1000",
+    "6x6_50", "6x6_100", "6x6_250", "6x6_1000", "7x7_50", "7x7_100", "7x7_250", "7x7_1000",
+    "aruco_original", "aruco_mip_36h12",
+    "apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11",
+)  # fmt: skip
+"""Names of marker dictionaries: OpenCV's without ``DICT_``, in small letters."""
+MAX_SIDE_M = 1000.0
+MARKERS_WANTED = "DICTIONARY:SIZE, such as 4x4_50:0.05, the size in metres"
+
+
+@dataclass(frozen=True)
+class MarkerSpec:
+    """Which markers were printed."""
+
+    dictionary: str
+    """A name of :data:`MARKER_DICTIONARIES`."""
+    side_m: float
+    """Side of the black square, metres."""
+
+
+def marker_spec(text: str) -> MarkerSpec | None:
+    """Read the setting; None of an empty text.
+
+    Raises
+    ------
+    UsageError
+        The dictionary is unknown, or the size is no length greater than 0.
+    """
+    if not text:
+        return None
+    name, colon, size = text.strip().rpartition(":")
+    if not colon:
+        raise UsageError(f"Markers {text!r} have no size.", f"Give {MARKERS_WANTED}.")
+    dictionary = name.strip().lower().removeprefix("dict_")
+    if dictionary not in MARKER_DICTIONARIES:
+        raise UsageError(
+            f"There is no marker dictionary {name!r}.",
+            f"Use one of {', '.join(MARKER_DICTIONARIES)}.",
+        )
+    try:
+        side = float(size)
+    except ValueError:
+        side = math.nan
+    if not 0.0 < side <= MAX_SIDE_M:
+        raise UsageError(
+            f"The marker size {size.strip()!r} is not a length of up to {MAX_SIDE_M:g} m.",
+            "Give the side of the black square in metres, such as 0.05.",
+        )
+    return MarkerSpec(dictionary, side)
+
+
+def checked_markers(text: str) -> str:
+    """Return the option as it is kept, or raise as :func:`marker_spec` does."""
+    spec = marker_spec(text)
+    return "" if spec is None else f"{spec.dictionary}:{spec.side_m!r}"
+
+
+def are_markers(text: str) -> bool:
+    """Tell whether :func:`marker_spec` reads a text."""
+    try:
+        marker_spec(text)
+    except UsageError:
+        return False
+    return True
+
+
+# -- All settings of one job, and its presets -----------------------------------------------------
 
 
 def _formats(text: str) -> tuple[str, ...]:
@@ -451,7 +597,7 @@ class JobSettings:
         return self.make_masks != "off" or bool(self.mask_model)
 
     def validated(self) -> JobSettings:
-        """Return self, or raise :class:`~..errors.SettingError` naming the first bad setting."""
+        """Return self, or raise :class:`~.errors.SettingError` naming the first bad setting."""
         validate(self)
         return self
 
@@ -479,3 +625,97 @@ def declared(path: str) -> Declaration:
         There is no such setting.
     """
     return {entry.path: entry for entry in declarations(JobSettings)}[path]
+
+
+# -- Settings that a user saves under a name, as JSON (docs/file-formats.md) ----------------------
+#
+# Values are by path and in the words of the settings, so that they outlive changes of the panel.
+# A file of another version is used as far as it goes: what is unknown or out of range is named
+# and left out.
+
+
+FORMAT: Final = "GaussianWrappingSettings"
+VERSION: Final = 1
+MAX_BYTES: Final = 64 * 1024
+"""A file with every setting has about 2 kB."""
+MAX_NOTES: Final = 5
+"""Of a file that holds something else; the others are counted."""
+_SHOWN_NAME: Final = 40
+"""Characters of an unknown entry that a note shows."""
+
+
+@dataclass(frozen=True)
+class SavedSettings:
+    """Contents of a file of saved settings."""
+
+    values: dict[str, Any]
+    """By path; 0 leaves a number to the preset."""
+    panel: dict[str, Any]
+    """Choices of the panel that are no settings of a job, by property, not validated."""
+    notes: tuple[str, ...]
+    """What was left out, a sentence each."""
+
+
+def savable_settings() -> list[Declaration]:
+    """Return the settings that are saved: those of a panel, without paths and the machine's."""
+    return [
+        declared
+        for declared in declarations(JobSettings)
+        if declared.panel is not None
+        and declared.property_owner != "preferences"
+        and declared.panel_name != "computers"
+        and not (declared.kind is str and not declared.choices)
+    ]
+
+
+def write_saved_settings(path: Path, values: Mapping[str, Any], panel: Mapping[str, Any]) -> None:
+    """Write saved settings atomically; the parameters are as in :class:`SavedSettings`."""
+    write_json(
+        path,
+        {"format": FORMAT, "version": VERSION, "settings": dict(values), "panel": dict(panel)},
+    )
+
+
+def read_saved_settings(path: Path) -> SavedSettings:
+    """Read saved settings.
+
+    Raises
+    ------
+    ParseError
+        The file holds something else; names the entry and what to do.
+    OSError
+        It cannot be read.
+    """
+    hint = "Delete this preset, and save it again."
+    stored = read_json(path, most_bytes=MAX_BYTES)
+    if not isinstance(stored, dict) or stored.get("format") != FORMAT:
+        raise ParseError(path, "format", f"is not {FORMAT!r}.", hint)
+    if type(stored.get("version")) is not int or stored["version"] != VERSION:
+        raise ParseError(path, "version", f"is not {VERSION}.", hint)
+    settings, panel = stored.get("settings"), stored.get("panel", {})
+    for name, part in (("settings", settings), ("panel", panel)):
+        if not isinstance(part, dict):
+            raise ParseError(path, name, "is not an object.", hint)
+    assert isinstance(settings, dict)
+    assert isinstance(panel, dict)
+    known = {declared.path: declared for declared in savable_settings()}
+    values, notes = {}, []
+    for name, value in settings.items():
+        declared = known.get(name)
+        if declared is None:
+            notes.append(f"{name[:_SHOWN_NAME]!r} is no setting of this version.")
+        elif not _is_valid(declared, value):
+            notes.append(f"{name} is out of range, and stays as it is.")
+        else:
+            values[name] = float(value) if declared.kind is float else value
+    if len(notes) > MAX_NOTES:
+        notes[MAX_NOTES:] = [f"{len(notes) - MAX_NOTES} more entries were left out."]
+    return SavedSettings(values, panel, tuple(notes))
+
+
+def _is_valid(declared: Declaration, value: Any) -> bool:
+    if not has_kind(declared.kind, value):
+        return False
+    if declared.panel is not None and declared.panel.preset_if_zero and value == 0:
+        return True
+    return declared.check is None or declared.check.holds(value)

@@ -6,8 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..limits import MAX_TILES, SHORTEST_EDGE
-from .checks import Choices, Condition, Range
-from .choices import (
+from .declaration import (
     BOUNDARIES,
     FIELD_CAMERAS,
     MESH_METHODS,
@@ -16,8 +15,14 @@ from .choices import (
     PIVOT_SAMPLES,
     SPACINGS,
     UNSEEN,
+    Choices,
+    Condition,
+    Item,
+    Option,
+    PanelProperty,
+    Range,
+    setting,
 )
-from .declaration import Item, Option, PanelProperty, setting
 
 
 def _is_tiles(text: str) -> bool:

@@ -7,9 +7,18 @@ from dataclasses import dataclass
 
 from ..errors import UsageError
 from ..limits import MAX_ATLASES
-from .checks import Choices, Range
-from .choices import MAX_LODS, SELECTION_MODES, SWITCH, TEXTURE_SOURCES
-from .declaration import Item, Option, PanelProperty, setting
+from .declaration import (
+    MAX_LODS,
+    SELECTION_MODES,
+    SWITCH,
+    TEXTURE_SOURCES,
+    Choices,
+    Item,
+    Option,
+    PanelProperty,
+    Range,
+    setting,
+)
 
 
 def _size(text: str) -> int:

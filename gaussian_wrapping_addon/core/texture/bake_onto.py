@@ -9,23 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.photo_source import PhotoSource
-from ..dataset.scene import Scene
 from ..errors import MeshingError
-from ..mesh.components import volumes_and_areas
-from ..mesh.exchange.mesh_reader import FileMesh
-from ..mesh.face_graph import face_graph
-from ..mesh.simplification.decimation import decimate
-from ..mesh.surface_mesh import SurfaceMesh
-from ..mesh.textured_mesh import TexturedMesh
-from ..mesh.topology import half_edges
-from ..mesh.udims import FIRST_UDIM
-from ..progress import Progress
-from ..report_warning import ReportWarning
+from ..mesh.components import face_graph, volumes_and_areas
+from ..mesh.exchange import FileMesh
+from ..mesh.simplification import decimate
+from ..mesh.surface_mesh import SurfaceMesh, half_edges
+from ..mesh.textured_mesh import FIRST_UDIM, TexturedMesh
+from ..progress import Progress, ReportWarning
+from ..scene.scene import PhotoSource, Scene
 from ..settings import TextureSettings
-from .cost.texture_size import side_in_photos
+from .size import side_in_photos
 from .texture_mesh import texture_mesh, validate_for_texturing
-from .unwrap.own_uvs import OwnUvs, overlap_warning, own_uvs
+from .unwrap.unwrap import OwnUvs, overlap_warning, own_uvs
 
 HARDLY_SEEN_SHARE = 0.05
 """A mesh of which photos see less probably lies elsewhere, or its faces point inwards."""

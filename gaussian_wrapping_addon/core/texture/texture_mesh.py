@@ -10,33 +10,28 @@ from pathlib import Path
 import numpy as np
 
 from .. import limits
-from ..dataset.photo_source import PhotoSource
-from ..dataset.scene import Scene
 from ..errors import MeshingError, UsageError
-from ..mesh.face_graph import FaceGraph, face_graph
-from ..mesh.surface_mesh import SurfaceMesh
+from ..mesh.components import FaceGraph, face_graph
+from ..mesh.surface_mesh import SurfaceMesh, area_vectors
 from ..mesh.textured_mesh import AtlasMaps, TexturedMesh
-from ..mesh.topology import area_vectors
-from ..progress import Progress
-from ..report_warning import ReportWarning
+from ..progress import Progress, ReportWarning
+from ..scene.scene import PhotoSource, Scene
 from ..settings import TextureSettings
-from .atlas.atlas_raster import AtlasRaster
-from .bake.atlas_colors import MAX_FILL_SOURCES, AtlasColors, fill_harmonically
-from .bake.atlas_points import atlas_points, blocks_of
-from .bake.bake import bake, correction_sample_count, prepare_photos
-from .bake.coverage_statistics import CoverageStatistics
-from .bake.photo_samples import SurfaceArrays, SurfacePoints
-from .cost.texture_memory import fit_into_memory
-from .cost.texture_size import (
-    EXPECTED_UTILISATION,
-    gutter_for,
-    plan_textures,
-    required_side,
+from .atlas import AtlasRaster
+from .atlas_colors import MAX_FILL_SOURCES, AtlasColors, fill_harmonically
+from .bake import (
+    CoverageStatistics,
+    atlas_points,
+    bake,
+    blocks_of,
+    correction_sample_count,
+    prepare_photos,
 )
-from .detail.detail import bake_detail, merged_statistics, wants_normal_map
-from .unwrap.own_uvs import uv_area
-from .unwrap.stretch import texture_stretch
-from .unwrap.unwrap import Unwrap, unwrap
+from .levels_of_detail import bake_detail, merged_statistics, wants_normal_map
+from .photo_samples import SurfaceArrays, SurfacePoints
+from .size import EXPECTED_UTILISATION, fit_into_memory, gutter_for, plan_textures, required_side
+from .unwrap.charts import texture_stretch
+from .unwrap.unwrap import Unwrap, unwrap, uv_area
 
 _logger = logging.getLogger(__name__)
 
@@ -84,7 +79,7 @@ def texture_mesh(
     unwrapped : Unwrap, optional
         Existing UVs to keep.
     polygons : (f,) int64, optional
-        Polygon that each face is a part of, for new UVs: see :func:`.unwrap.unwrap.unwrap`.
+        Polygon that each face is a part of, for new UVs: see :func:`.unwrap.unwrap`.
 
     Raises
     ------

@@ -11,18 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.camera import Camera
-from ..dataset.photo_source import PhotoSource
 from ..gaussians.model import OrientedGaussians
-from ..render.types.gradients import ImageGradients
-from ..render.types.options import RenderOptions
-from ..stereo.depth_priors import DepthPrior
-from .appearance.background import draw_background
-from .appearance.photo_exposure import exposure_rate
-from .devices.backend import Backend, Shown
-from .devices.windows import Window, windows
-from .losses.multi_view import MultiViewOptions, add_image_gradients
-from .poses.camera_poses import pose_rate_px
+from ..render.types import ImageGradients, RenderOptions
+from ..scene.camera import Camera
+from ..scene.scene import PhotoSource
+from ..stereo.depth_maps import DepthPrior
+from .adam import add_image_gradients
+from .backend import Backend, Shown, Window, windows
+from .background import draw_background
+from .camera_poses import pose_rate_px
+from .exposure import exposure_rate
+from .multi_view import MultiViewOptions
 from .schedule import Schedule
 from .state import TrainingState
 

@@ -15,20 +15,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ..dataset.photo_source import PhotoSource
-from ..dataset.view_split import evenly_spaced
 from ..files import write_bytes
 from ..gaussians.model import OrientedGaussians
 from ..gaussians.preview_points import POINTS_FILE, points_file, preview_points
-from ..imaging.lpips import lpips_if_ready
-from ..imaging.view_metrics import psnr, score_images
+from ..image_metrics import lpips_if_ready, psnr, score_images
 from ..progress import Progress
-from ..render.projection.projection import RawArrays
-from ..render.types.options import RenderOptions
-from ..render.types.renderer import Renderer
+from ..render.projection import RawArrays
+from ..render.types import Renderer, RenderOptions
 from ..render.view_renderer import ViewRenderer
+from ..scene.scene import PhotoSource, evenly_spaced
 from ..settings import TrainingSettings
-from .result import HeldOutMetrics
+from .state import HeldOutMetrics
 
 _logger = logging.getLogger(__name__)
 
@@ -87,7 +84,7 @@ def measure_held_out(
         Renderer to reuse; not one whose last view still awaits its backward pass.
     exposure_correction : callable, optional
         Applied to each render before it is measured
-        (:func:`~.appearance.photo_exposure.corrected_for_measuring`).
+        (:func:`~.exposure.corrected_for_measuring`).
     check : callable, optional
         Called before each view; an exception ends the measurement.
 
@@ -138,7 +135,7 @@ class LiveView:
         Held-out views. The middle one is shown.
     folder : Path
         Receives :data:`PREVIEW_FILE`, :data:`PIXELS_FILE` and
-        :data:`~..gaussians.preview_points.POINTS_FILE`, each replaced atomically.
+        :data:`~.preview_points.POINTS_FILE`, each replaced atomically.
     settings : TrainingSettings
         ``preview_every_s`` is the time between two updates; 0 disables them.
     threads : int

@@ -9,24 +9,25 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import torch
 
-from .. import tolerances
-from ..dataset.photo_source import PhotoSource
-from ..gaussians.mip_filter import mip_filter
-from ..gaussians.model import OrientedGaussians
+from .. import limits
+from ..gaussians.model import OrientedGaussians, mip_filter
 from ..progress import Progress
-from .cancellation import cancellable
-from .density.contribution import contributions, needed_by_a_view, prune_contributors
-from .density.density_control import densify_and_prune, reset_opacity
-from .density.free_space import contradicted
-from .density.wrapping import WrapView, normal_errors, start_orientation, wrap
+from ..scene.scene import PhotoSource
+from .density import (
+    contradicted,
+    contributions,
+    densify_and_prune,
+    needed_by_a_view,
+    prune_contributors,
+    reset_opacity,
+)
+from .harmonics_selection import TrialView, select_harmonics
 from .iteration import Stepper, may_wrap
 from .live_view import divisor_for
+from .model_selection import select_poses, select_wrapping
 from .schedule import Schedule
-from .selection.harmonics_selection import select_harmonics
-from .selection.harmonics_trial import TrialView
-from .selection.model_selection import select_wrapping
-from .selection.pose_selection import select_poses
-from .state import TrainingState
+from .state import TrainingState, cancellable
+from .wrapping import WrapView, normal_errors, start_orientation, wrap
 
 _logger = logging.getLogger(__name__)
 
@@ -279,6 +280,6 @@ class Rounds:
         All of them, however many: what only the views left out show would count as unseen.
         """
         side = self.schedule.long_side_px
-        divisor = divisor if side / divisor >= 2 * tolerances.TILE_PX else 1
+        divisor = divisor if side / divisor >= 2 * limits.TILE_PX else 1
         for view in cancellable(self.views, self.progress):
             yield WrapView(self.photos.camera(view, divisor), self.photos.mask(view, divisor))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .. import tolerances
+from .. import limits
 from ..settings import TrainingSettings
 
 POSITION_RATE = (1.6e-4, 1.6e-6)
@@ -263,7 +263,7 @@ class Schedule:
         share = min(1.0, self._share(iteration))
         if self.refines:
             share = REFINING_FROM + (1.0 - REFINING_FROM) * share
-        position = growth["means"] * tolerances.SCENE_RADIUS * first * (last / first) ** share
+        position = growth["means"] * limits.SCENE_RADIUS * first * (last / first) ** share
         coefficients = (self.settings.sh_degree + 1) ** 2
         rate = {name: value * growth[name] for name, value in RATES.items()}
         sh = np.full((coefficients, 3), rate["sh_rest"])

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.camera import Camera
-from ..dataset.scene import Scene, View
-from ..dataset.similarity import Similarity
 from ..errors import Cancelled
 from ..progress import Progress
+from ..scene.camera import Camera, Similarity
+from ..scene.scene import Scene, View
 from ..settings import TrainingSettings
 
 _logger = logging.getLogger(__name__)

@@ -14,8 +14,7 @@ from typing import Final
 
 import bpy
 
-from ...ops.common.addon import addon_package
-from ...ops.common.translate import CONTEXT
+from ...ops.addon import CONTEXT, addon_package
 
 _logger = logging.getLogger(__name__)
 

@@ -8,12 +8,8 @@ import socket
 
 import pytest
 
-from gaussian_wrapping_addon.core.cluster.addresses import (
-    Address,
-    check_reachable,
-    scheduler_address,
-)
 from gaussian_wrapping_addon.core.errors import FarmError, SettingError, UsageError
+from gaussian_wrapping_addon.core.farm.addresses import Address, check_reachable, scheduler_address
 from gaussian_wrapping_addon.core.settings import JobSettings, key_values
 
 GOOD = {

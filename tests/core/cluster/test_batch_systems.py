@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from gaussian_wrapping_addon.core.cluster.batch_systems import Wanted, make_job
 from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.farm.hosts import Wanted, make_job
 
 SLURM = Wanted("slurm", 8, "32GB", "04:00:00", "gpu", "lab-7", ("--gres=gpu:1",))
 

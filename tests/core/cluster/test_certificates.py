@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.cluster import certificates
-from gaussian_wrapping_addon.core.cluster.certificates import (
+from gaussian_wrapping_addon.core.errors import ResourceError, UsageError
+from gaussian_wrapping_addon.core.farm import addresses
+from gaussian_wrapping_addon.core.farm.addresses import (
     CA_NAME,
     CERTIFICATE_NAME,
     FOLDER_VARIABLE,
@@ -20,7 +21,6 @@ from gaussian_wrapping_addon.core.cluster.certificates import (
     checked_folder,
     make_certificates,
 )
-from gaussian_wrapping_addon.core.errors import ResourceError, UsageError
 
 pytest.importorskip("cryptography", reason="the extra farm is not installed")
 
@@ -99,7 +99,7 @@ def test_the_folder_is_given_or_that_of_the_environment(
         checked_folder(str(tmp_path))
     make_certificates(tmp_path)
     assert checked_folder(str(tmp_path)) == tmp_path
-    monkeypatch.setenv(certificates.FOLDER_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(addresses.FOLDER_VARIABLE, str(tmp_path))
     assert checked_folder("") == tmp_path
 
 

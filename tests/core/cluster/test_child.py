@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from gaussian_wrapping_addon.core.cluster import child
-from gaussian_wrapping_addon.core.cluster.dask_tasks import request_of
+from gaussian_wrapping_addon.core.farm import child
+from gaussian_wrapping_addon.core.farm.dask import request_of
 from gaussian_wrapping_addon.core.names import SHARED_VARIABLE
 
 

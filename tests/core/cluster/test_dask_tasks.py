@@ -12,15 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.cluster import dask_tasks
-from gaussian_wrapping_addon.core.cluster.dask_tasks import (
-    DaskTasks,
-    Ended,
-    FarmLostError,
-    request_of,
-)
 from gaussian_wrapping_addon.core.errors import UsageError, WorkerError
-from gaussian_wrapping_addon.core.processes.process_identity import process_alive
+from gaussian_wrapping_addon.core.farm import dask
+from gaussian_wrapping_addon.core.farm.dask import DaskTasks, Ended, FarmLostError, request_of
+from gaussian_wrapping_addon.core.worker.spawn import process_alive
 
 pytest.importorskip("distributed", reason="Dask is not installed: set-up-worker --add farm")
 pytestmark = [
@@ -137,8 +132,8 @@ def test_children_end_with_the_cluster(tmp_path: Path) -> None:
 def test_a_cluster_whose_workers_have_all_ended_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dask_tasks, "_LOOK_S", 0.1)
-    monkeypatch.setattr(dask_tasks, "_NONE_S", 0.3)
+    monkeypatch.setattr(dask, "_LOOK_S", 0.1)
+    monkeypatch.setattr(dask, "_NONE_S", 0.3)
     own = DaskTasks("local", 1)
     monkeypatch.setattr(own, "_workers", dict)  # as if their start had failed
     submit(own, "nap", "import time; time.sleep(60)", tmp_path)
@@ -184,7 +179,7 @@ def connected(address: str) -> DaskTasks | None:
 
 
 def test_nothing_answers_or_nothing_may_be_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask_tasks, "CONNECT_S", 2.0)
+    monkeypatch.setattr(dask, "CONNECT_S", 2.0)
     with pytest.raises(WorkerError, match="No Dask scheduler answers at tcp://127"):
         DaskTasks("tcp://127.0.0.1:1", 1)
     with socket.create_server(("127.0.0.1", 0)) as hung:  # the system accepts, nobody answers

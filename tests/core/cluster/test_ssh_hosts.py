@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.cluster.ssh_hosts import (
+from gaussian_wrapping_addon.core.errors import ParseError, UsageError
+from gaussian_wrapping_addon.core.farm.hosts import (
     MAX_FILE_BYTES,
     Host,
     checked_hosts,
@@ -18,7 +19,6 @@ from gaussian_wrapping_addon.core.cluster.ssh_hosts import (
     ssh_command,
     worker_command,
 )
-from gaussian_wrapping_addon.core.errors import ParseError, UsageError
 
 USUAL = Host("", "/mnt/farm", "/home/me/keys", "python3", "/opt/add on/batch.py")
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.quaternion import quaternion_from_rotation
-from gaussian_wrapping_addon.core.dataset.readers.source_model import LENS_NAMES
+from gaussian_wrapping_addon.core.readers.source_model import LENS_NAMES
+from gaussian_wrapping_addon.core.scene.camera import quaternion_from_rotation
 from tests.poses import look_at_pose
 
 WIDTH, HEIGHT = 64, 48

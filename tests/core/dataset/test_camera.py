@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.render.scenes import look_at
 
 CAMERA = look_at((2.2, 1.0, 0.8), width=33, height=17)

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.refined_scene import (
+from gaussian_wrapping_addon.core.errors import ParseError
+from gaussian_wrapping_addon.core.scene.scene import (
     POSES_NAME,
+    Scene,
+    View,
     load_refined_scene,
     save_poses,
+    save_scene,
     with_poses,
 )
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
-from gaussian_wrapping_addon.core.errors import ParseError
 from tests.core.training.small_scene import sphere_scene
 
 

@@ -7,11 +7,7 @@ import dataclasses
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.view_split import (
-    evenly_spaced,
-    held_out_views,
-    training_views,
-)
+from gaussian_wrapping_addon.core.scene.scene import evenly_spaced, held_out_views, training_views
 from tests.core.training.small_scene import PhotosInMemory, sphere_scene
 
 

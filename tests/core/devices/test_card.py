@@ -8,26 +8,25 @@ from pathlib import Path
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.devices import card
-from gaussian_wrapping_addon.core.devices.card import gpu_findings
-from gaussian_wrapping_addon.core.devices.choice import DeviceChoice
+from gaussian_wrapping_addon.core.devices import choice
+from gaussian_wrapping_addon.core.devices.choice import DeviceChoice, gpu_findings
 from gaussian_wrapping_addon.core.errors import DeviceError
 from gaussian_wrapping_addon.core.jobs.commands import doctor
-from gaussian_wrapping_addon.core.render.cuda import driver, kernels
+from gaussian_wrapping_addon.core.render.cuda import compiler, kernels
 
 GIB = 1 << 30
 
 
 def test_without_a_gpu_one_line_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = DeviceChoice("cpu", "", "There is no driver.")
-    monkeypatch.setattr(card, "choose_device", lambda setting: chosen)
+    monkeypatch.setattr(choice, "choose_device", lambda setting: chosen)
     assert gpu_findings() == [("Device", "jobs run on the processor: There is no driver.")]
 
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = DeviceChoice("cuda:0", "Card 0", "It passed.")
-    monkeypatch.setattr(card, "choose_device", lambda setting: chosen)
+    monkeypatch.setattr(choice, "choose_device", lambda setting: chosen)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda index: f"Card {index}")
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (9, index))
@@ -54,8 +53,8 @@ def test_all_that_is_known_of_the_gpus_is_told(monkeypatch: pytest.MonkeyPatch) 
         def nvmlShutdown(self) -> int:  # noqa: N802
             return 0
 
-    monkeypatch.setattr(driver, "load_driver", Driver)
-    monkeypatch.setattr(card.ctypes, "CDLL", lambda name: Nvml())
+    monkeypatch.setattr(compiler, "load_driver", Driver)
+    monkeypatch.setattr(choice.ctypes, "CDLL", lambda name: Nvml())
     expected = [
         ("Device", "Card 0 (cuda:0); the test of its kernels passed"),
         ("GPU 0", "Card 0, compute capability 9.0, 3.0 of 8.0 GiB free"),
@@ -75,8 +74,8 @@ def test_without_nvml_the_driver_is_told_by_its_cuda(monkeypatch: pytest.MonkeyP
     def missing(name: str) -> None:
         raise OSError(name)
 
-    monkeypatch.setattr(card.ctypes, "CDLL", missing)
-    monkeypatch.setattr(card, "driver_cuda_version", lambda: "13.0")
+    monkeypatch.setattr(choice.ctypes, "CDLL", missing)
+    monkeypatch.setattr(choice, "driver_cuda_version", lambda: "13.0")
     assert gpu_findings()[-1] == ("GPU driver", "supports CUDA 13.0")
 
 
@@ -84,6 +83,6 @@ def test_the_doctor_survives_a_broken_driver(monkeypatch: pytest.MonkeyPatch) ->
     def broken(setting: str) -> None:
         raise DeviceError("The driver is broken.")
 
-    monkeypatch.setattr(card, "choose_device", broken)
+    monkeypatch.setattr(choice, "choose_device", broken)
     (found,) = doctor._devices()
     assert (found.good, found.finding) == (True, "jobs run on the processor: The driver is broken.")

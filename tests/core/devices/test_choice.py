@@ -14,14 +14,14 @@ import torch
 
 from gaussian_wrapping_addon.core.devices import (
     DeviceChoice,
+    checks,
     choice,
     choose_device,
-    kernel_check,
     reject_absent_gpu,
     stage_device,
 )
 from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, DeviceError
-from gaussian_wrapping_addon.core.render.cuda import driver, kernels
+from gaussian_wrapping_addon.core.render.cuda import compiler, kernels
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 GIB = 1 << 30
@@ -52,7 +52,7 @@ def two_gpus(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda index: (free[index], 8 * GIB))
     monkeypatch.setattr(kernels, "find_nvrtc", lambda major: Path(f"libnvrtc.so.{major}"))
     monkeypatch.setattr(kernels, "load_driver", lambda: None)
-    monkeypatch.setattr(kernel_check, "failure_on", passes)
+    monkeypatch.setattr(checks, "failure_on", passes)
     return tested
 
 
@@ -84,7 +84,7 @@ STEPS = {
     "No NVRTC library": lambda patch: patch.setattr(kernels, "find_nvrtc", lambda major: None),
     "no driver here": lambda patch: patch.setattr(kernels, "load_driver", no_driver),
     "renders another depth": lambda patch: patch.setattr(
-        kernel_check, "failure_on", lambda index: "The GPU renders another depth."
+        checks, "failure_on", lambda index: "The GPU renders another depth."
     ),
 }  # fmt: skip
 
@@ -168,7 +168,7 @@ class _Driver:
 
 
 def test_the_driver_alone_refuses_a_gpu_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(driver, "load_driver", lambda: _Driver(2))
+    monkeypatch.setattr(compiler, "load_driver", lambda: _Driver(2))
     for setting in ("auto", "cpu", "cuda", "cuda:0", "cuda:1"):
         reject_absent_gpu(setting)
     with pytest.raises(DeviceError, match="The device cuda:2 cannot be used: the driver finds 2"):
@@ -177,7 +177,7 @@ def test_the_driver_alone_refuses_a_gpu_that_is_not_there(monkeypatch: pytest.Mo
     def missing() -> None:
         raise DeviceError("The NVIDIA driver library x was not found.", "Update it.")
 
-    monkeypatch.setattr(driver, "load_driver", missing)
+    monkeypatch.setattr(compiler, "load_driver", missing)
     reject_absent_gpu("auto")
     with pytest.raises(DeviceError, match="driver library x was not found") as refused:
         reject_absent_gpu("cuda")

@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.devices import kernel_check
-from gaussian_wrapping_addon.core.devices.kernel_check import check_kernels, failure_on
+from gaussian_wrapping_addon.core.devices import checks
+from gaussian_wrapping_addon.core.devices.checks import check_kernels, failure_on
 from gaussian_wrapping_addon.core.errors import DeviceError, ResourceError
-from gaussian_wrapping_addon.core.render.cuda.kernels import cuda_available
-from gaussian_wrapping_addon.core.render.cuda.source import cuda_source
+from gaussian_wrapping_addon.core.render.cuda.kernels import cuda_available, cuda_source
 from tests.core.render.cuda.emulation import EmulatedKernels, build_emulator
 
 CPU = torch.device("cpu")
@@ -23,7 +22,7 @@ CPU = torch.device("cpu")
 def test_the_kernels_pass(
     ulp: float, emulator_library: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(kernel_check, "TOLERANCE", kernel_check.TOLERANCE / 10)  # with room
+    monkeypatch.setattr(checks, "TOLERANCE", checks.TOLERANCE / 10)  # with room
     assert check_kernels(EmulatedKernels(emulator_library, ulp=ulp), CPU) == ""
 
 
@@ -73,7 +72,7 @@ def test_failures_are_sentences(
     def fails(_index: int) -> None:
         raise error
 
-    monkeypatch.setattr(kernel_check, "device_kernels", fails)
+    monkeypatch.setattr(checks, "device_kernels", fails)
     assert failure_on(0) == told
 
 

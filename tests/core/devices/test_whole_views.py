@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.devices.whole_views import with_renderer
+from gaussian_wrapping_addon.core.devices.checks import with_renderer
 from gaussian_wrapping_addon.core.errors import Cancelled, DeviceError, ResourceError
 from gaussian_wrapping_addon.core.render.cuda import device_renderer
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer

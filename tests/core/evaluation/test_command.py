@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon import batch
 from gaussian_wrapping_addon.command_line.parser import build_parser
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.evaluation.command import (
     FRAME_MISMATCH_SHARE,
@@ -27,17 +26,14 @@ from gaussian_wrapping_addon.core.evaluation.command import (
     find_layout,
     table,
 )
-from gaussian_wrapping_addon.core.evaluation.layouts.mesh_input import (
-    is_cloud,
-    read_cloud,
-    read_mesh,
-)
-from gaussian_wrapping_addon.core.evaluation.surface.samples import sample_uniformly
+from gaussian_wrapping_addon.core.evaluation.layouts import is_cloud, read_cloud, read_mesh
+from gaussian_wrapping_addon.core.evaluation.surface_scores import sample_uniformly
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.commands.evaluate_command import job_cameras, job_mesh
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.region import write_region
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 from tests.core.evaluation.layouts.written_layouts import (
     JOB_FROM_TRUTH,
     bumpy_sphere,

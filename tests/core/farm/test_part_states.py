@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core import limits
-from gaussian_wrapping_addon.core.farm import part_states
-from gaussian_wrapping_addon.core.farm.part_states import SILENT_S, FailedPart, PartReader
+from gaussian_wrapping_addon.core.jobs.parts import states
+from gaussian_wrapping_addon.core.jobs.parts.states import SILENT_S, FailedPart, PartReader
 from tests.core.farm.job_parts import graph, write_state
 
 NOW_S = 1010.0
@@ -92,7 +92,7 @@ def test_odd_entries_do_no_harm(root: Path) -> None:
     (root / "parts" / "cameras.json").symlink_to(root / "parts.json")
     os.mkfifo(root / "parts" / "export.json")
     board = reader_of(root).read()
-    assert board.failed == (FailedPart("train", "host", "x" * part_states.MAX_TEXT_CHARACTERS),)
+    assert board.failed == (FailedPart("train", "host", "x" * states.MAX_TEXT_CHARACTERS),)
     assert board.totals == (0, 0, 1, 13)
 
 
@@ -106,8 +106,8 @@ def test_a_linked_folder_of_states_is_not_read(root: Path, tmp_path: Path) -> No
 
 def test_only_changed_files_are_read_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read = []
-    inner = part_states.read_state
-    monkeypatch.setattr(part_states, "read_state", lambda r, n: read.append(n) or inner(r, n))
+    inner = states.read_state
+    monkeypatch.setattr(states, "read_state", lambda r, n: read.append(n) or inner(r, n))
     reader = reader_of(root)
     write_state(root, "cameras", "DONE")
     write_state(root, "train", "RUNNING")

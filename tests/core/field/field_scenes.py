@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.poses import look_at_pose
 
 

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.core.field.depth_samples import (
+from gaussian_wrapping_addon.core.field.samples import (
     DepthSamples,
     bracket_pairs,
     sample_depth_maps,

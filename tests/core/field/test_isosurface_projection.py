@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.field.isosurface_projection import (
     MAX_TRAVEL_SIGMAS,
@@ -17,10 +16,14 @@ from gaussian_wrapping_addon.core.field.isosurface_projection import (
     ProjectionStatus,
     project_to_isosurface,
 )
-from gaussian_wrapping_addon.core.field.vacancy.brute_force import brute_force_vacancy
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField, VacancyResult
+from gaussian_wrapping_addon.core.field.vacancy import (
+    VacancyField,
+    VacancyResult,
+    brute_force_vacancy,
+)
 from gaussian_wrapping_addon.core.field.vector_field import VectorField, VectorFieldResult
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.field.field_scenes import (
     around_shell,
     camera_at,

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.field.vacancy.stable_logs import log_gaussian, log_one_minus
+from gaussian_wrapping_addon.core import limits
+from gaussian_wrapping_addon.core.field.vacancy_kernels import log_gaussian, log_one_minus
 from gaussian_wrapping_addon.core.field.vector_field import TAIL, VectorField
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
 from tests.core.field.field_scenes import (
@@ -36,7 +36,7 @@ def by_definition(arrays: GaussianArrays, points: np.ndarray, tail: float = 1e-3
     L, local = whitened(arrays, points)
     log_g = log_gaussian(arrays.log_opacities, (local**2).sum(-1))
     side = np.einsum("mi,nmi->nm", arrays.normals, points[:, None] - arrays.means) >= 0.0
-    side |= np.linalg.norm(arrays.normals, axis=1) < tolerances.ORIENTED_MIN_NORM
+    side |= np.linalg.norm(arrays.normals, axis=1) < limits.ORIENTED_MIN_NORM
     weight = np.where(side & (log_g >= np.log(tail)), odds(log_g), 0.0)
     return np.einsum("nm,mji,nmj->ni", weight, L, local)
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
-from gaussian_wrapping_addon.core.gaussians.foreign_splat import (
+from gaussian_wrapping_addon.core.gaussians.files import (
     SURFEL_THICKNESS,
     ForeignSplat,
     read_foreign_splat,
+    write_splat_ply,
+    write_viewer_ply,
 )
-from gaussian_wrapping_addon.core.gaussians.initialisation import SH_C0
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.gaussians.splat_ply import write_splat_ply, write_viewer_ply
+from gaussian_wrapping_addon.core.gaussians.model import SH_C0, OrientedGaussians
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 from tests.core.gaussians.splat_files import permuted, splat_columns, write_ply
 from tests.core.render.scenes import random_gaussians
 

@@ -10,18 +10,18 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
-from gaussian_wrapping_addon.core.gaussians.initialisation import (
+from gaussian_wrapping_addon.core.gaussians.model import (
     MIN_START_POINTS,
     SH_C0,
     gaussians_at,
     initial_gaussians,
 )
+from gaussian_wrapping_addon.core.limits import POINT_REACH, SCENE_RADIUS
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
-from gaussian_wrapping_addon.core.tolerances import POINT_REACH, SCENE_RADIUS
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from tests.core.render.scenes import look_at
 
 

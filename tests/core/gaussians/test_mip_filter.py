@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.gaussians.mip_filter import mip_filter
-from gaussian_wrapping_addon.core.tolerances import NEAR_Z
+from gaussian_wrapping_addon.core.gaussians.model import mip_filter
+from gaussian_wrapping_addon.core.limits import NEAR_Z
 from tests.core.render.scenes import look_at
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.gaussians.preview_points import (
-    MAX_BYTES,
+    MAX_POINTS_BYTES,
     MOST_POINTS,
     POINT,
     parse_points,
@@ -52,7 +52,7 @@ def test_many_are_thinned_evenly_and_fit_into_the_limit() -> None:
     steps = np.diff(points["position"][:, 0])
     assert (steps.min(), steps.max()) == (3.0, 5.0) or np.abs(steps - 4).max() <= 1
     assert points["position"][[0, -1], 0].tolist() == [0.0, count - 1.0]
-    assert len(points_file(points)) <= MAX_BYTES
+    assert len(points_file(points)) <= MAX_POINTS_BYTES
 
 
 def test_none_are_no_error() -> None:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.core.gaussians.splat_ply import (
+from gaussian_wrapping_addon.core.gaussians.files import (
     read_splat_ply,
     write_splat_ply,
     write_viewer_ply,
 )
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 from tests.core.render.scenes import random_gaussians
 
 FRAME = Similarity(

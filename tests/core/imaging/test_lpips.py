@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
+from gaussian_wrapping_addon.core import image_metrics as module
 from gaussian_wrapping_addon.core.errors import ParseError, ResourceError, UsageError
-from gaussian_wrapping_addon.core.imaging import lpips as module
-from gaussian_wrapping_addon.core.imaging.lpips import (
+from gaussian_wrapping_addon.core.image_metrics import (
     MIN_SIDE_PX,
     WEIGHTS_VARIABLE,
     Lpips,

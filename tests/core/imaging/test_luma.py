@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.imaging.luma import LUMA, grey_of
+from gaussian_wrapping_addon.core.resampling import LUMA, grey_of
 
 
 def test_grey_levels_of_the_primaries_and_of_white() -> None:

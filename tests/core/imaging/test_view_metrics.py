@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.imaging.ssim_kernels import BLOCK_PX
-from gaussian_wrapping_addon.core.imaging.view_metrics import (
+from gaussian_wrapping_addon.core.image_metrics import (
+    BLOCK_PX,
     PSNR_CAP_DB,
     compare,
     psnr,

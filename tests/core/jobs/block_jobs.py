@@ -8,17 +8,17 @@ from pathlib import Path
 
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, write_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     STAGE_VERSIONS,
+    JobFolder,
     Stage,
     read_done,
     source_fingerprint,
     stage_key,
 )
+from gaussian_wrapping_addon.core.scene.scene import save_scene
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings, TextureSettings
 from tests.core.jobs.finished_sphere import write_cube
 from tests.core.training.blocks.row_scene import SETTINGS, row_scene

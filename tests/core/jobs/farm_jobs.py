@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.parts.part_state import PartState, read_state
+from gaussian_wrapping_addon.core.jobs.parts.graph import PartState, read_state
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.processes.process_identity import process_alive
 from gaussian_wrapping_addon.core.settings import MeshingSettings
+from gaussian_wrapping_addon.core.worker.spawn import process_alive
 from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
 
 DEADLINE_S = 1500.0

@@ -8,19 +8,19 @@ from pathlib import Path
 
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.gaussians.gaussian_file import save_gaussians
-from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
+from gaussian_wrapping_addon.core.gaussians.files import save_gaussians
+from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, training_keys, write_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     STAGE_VERSIONS,
+    JobFolder,
+    JobStatus,
     source_fingerprint,
     stage_key,
 )
-from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.region import write_region
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.scene import save_scene
 from gaussian_wrapping_addon.core.settings import JobSettings, TextureSettings
 from tests.core.meshing.meshing_scenes import cube
 from tests.core.training.small_scene import sphere_gaussians, sphere_scene

@@ -27,14 +27,14 @@ from benchmarks.provenance import ROOT
 from benchmarks.runs import BATCH
 from benchmarks.scenes.build import SparsePoints, write_colmap
 from benchmarks.scenes.geometry import around_thing
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import WorkerError
 from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.jobs.queue_process import MODULE, TABLE_NAME
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.processes.process_identity import process_alive
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.region import write_region
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.worker.spawn import process_alive
 from tools.version_comparison.contents import differences
 
 PHOTOS, WIDTH_PX, HEIGHT_PX = 12, 64, 48

@@ -6,14 +6,10 @@ from __future__ import annotations
 import dataclasses
 
 from gaussian_wrapping_addon.core.devices import DeviceChoice
-from gaussian_wrapping_addon.core.jobs.parts.engine import InProcess
-from gaussian_wrapping_addon.core.jobs.parts.graph import Part
-from gaussian_wrapping_addon.core.jobs.parts.part_runner import PartResult, PartRunner
-from gaussian_wrapping_addon.core.jobs.parts.part_state import read_state
-from gaussian_wrapping_addon.core.jobs.parts.walk import Walk
+from gaussian_wrapping_addon.core.jobs.parts.graph import Part, read_state
+from gaussian_wrapping_addon.core.jobs.parts.runner import InProcess, PartResult, PartRunner, Walk
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage, read_done
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, Stage, read_done
 from gaussian_wrapping_addon.core.progress import Progress
 
 

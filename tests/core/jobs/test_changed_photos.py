@@ -11,23 +11,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.loading import load
-from gaussian_wrapping_addon.core.dataset.scene import Scene
-from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
-from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
+from gaussian_wrapping_addon.core.jobs.stages.cameras import run_cameras
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, training_keys
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     STAGE_VERSIONS,
+    JobFolder,
     Stage,
     source_fingerprint,
     stage_key,
 )
-from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
+from gaussian_wrapping_addon.core.loading import load
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, save_scene
 from gaussian_wrapping_addon.core.settings import JobSettings
 
 

@@ -14,29 +14,26 @@ import torch
 import trimesh
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.devices import choice
-from gaussian_wrapping_addon.core.field.vacancy import cuda_vacancy
+from gaussian_wrapping_addon.core.field import cuda_vacancy
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.jobs.runner import run_job
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.region import write_region
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.render.cuda import device_renderer
 from gaussian_wrapping_addon.core.render.cuda.device_renderer import DeviceRenderer
+from gaussian_wrapping_addon.core.scene.scene import Scene
 from gaussian_wrapping_addon.core.settings import (
     JobSettings,
     MeshingSettings,
     TextureSettings,
     TrainingSettings,
 )
-from gaussian_wrapping_addon.core.training.cost import machine_speed
-from gaussian_wrapping_addon.core.training.devices import chosen
-from gaussian_wrapping_addon.core.training.initialisation import point_start
-from gaussian_wrapping_addon.core.training.initialisation.splat_transform import (
-    transform_gaussians,
-)
+from gaussian_wrapping_addon.core.training import device_backend, estimate
+from gaussian_wrapping_addon.core.training import start as point_start
+from gaussian_wrapping_addon.core.training.splat_start import transform_gaussians
 from tests.core.render.cuda.emulation import EmulatedKernels
 from tests.core.training.devices.device_training import emulated_backend, perturbed_sphere
 from tests.core.training.small_scene import sphere_scene
@@ -78,9 +75,11 @@ def emulate(monkeypatch: pytest.MonkeyPatch, library: Path) -> None:
     monkeypatch.setattr(choice, "_usable", lambda index: (True, "It passed."))
     monkeypatch.setattr(choice, "_card", lambda index: "Some GPU")
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda index: (4 << 30, 8 << 30))
-    monkeypatch.setattr(machine_speed, "speeds", lambda threads, device: (1.0, 1.0))
+    monkeypatch.setattr(estimate, "speeds", lambda threads, device: (1.0, 1.0))
     monkeypatch.setattr(
-        chosen, "chosen_backend", lambda device, threads, **_: emulated_backend(kernels, device)
+        device_backend,
+        "chosen_backend",
+        lambda device, threads, **_: emulated_backend(kernels, device),
     )
     monkeypatch.setattr(
         device_renderer, "device_renderer",

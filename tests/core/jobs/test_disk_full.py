@@ -19,14 +19,14 @@ from gaussian_wrapping_addon.core.errors import EXIT_RESOURCES, ResourceError
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.mesh.mesh_file import save_mesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import save_mesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings
-from gaussian_wrapping_addon.core.texture.files.mesh_ply import write_mesh_ply
-from gaussian_wrapping_addon.core.texture.files.textured_files import write_glb, write_textured
+from gaussian_wrapping_addon.core.texture.file_checks import write_mesh_ply
+from gaussian_wrapping_addon.core.texture.files import write_glb, write_textured
 from gaussian_wrapping_addon.core.texture.unwrap import charts
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
-from gaussian_wrapping_addon.core.training.checkpoint import load_checkpoint, save_checkpoint
+from gaussian_wrapping_addon.core.training.state import load_checkpoint, save_checkpoint
 from tests.core.texture.files.test_textured_files import UTM, cube
 from tests.core.training.test_checkpoint import filled
 
@@ -37,7 +37,7 @@ WORKER = f"""
 import sys
 sys.path[:0] = [{str(ROOT)!r}]
 from gaussian_wrapping_addon.core.jobs import runner, worker
-from gaussian_wrapping_addon.core.training.checkpoint import save_checkpoint
+from gaussian_wrapping_addon.core.training.state import save_checkpoint
 from tests.core.training.test_checkpoint import filled
 def run_job(folder, job, event, cancelled):
     kept = folder.stages / "train-a"

@@ -15,7 +15,7 @@ from gaussian_wrapping_addon.core.errors import (
     DatasetError,
     ResourceError,
 )
-from gaussian_wrapping_addon.core.jobs.failure import failure_of
+from gaussian_wrapping_addon.core.jobs.worker import failure_of
 
 ROOT = Path("/jobs/a")
 LLVMLITE = (

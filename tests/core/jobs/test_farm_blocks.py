@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
+from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
 from gaussian_wrapping_addon.core.jobs.parts.graph import read_parts
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder

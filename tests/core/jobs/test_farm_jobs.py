@@ -11,7 +11,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.processes.process_identity import process_alive
+from gaussian_wrapping_addon.core.worker.spawn import process_alive
 from tests.core.jobs import farm_jobs
 from tests.core.jobs.farm_jobs import (
     kill,

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.cluster.certificates import FOLDER_VARIABLE, make_certificates
 from gaussian_wrapping_addon.core.errors import EXIT_USAGE, UsageError
+from gaussian_wrapping_addon.core.farm.addresses import FOLDER_VARIABLE, make_certificates
 from gaussian_wrapping_addon.core.jobs.client import JobClient, prepare_job
 from gaussian_wrapping_addon.core.jobs.store.job_file import write_job
 from gaussian_wrapping_addon.core.limits import SILENT_S

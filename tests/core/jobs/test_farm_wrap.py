@@ -13,13 +13,13 @@ import pytest
 
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.processes.process_identity import process_alive
 from gaussian_wrapping_addon.core.settings import (
     JobSettings,
     MeshingSettings,
     TextureSettings,
     TrainingSettings,
 )
+from gaussian_wrapping_addon.core.worker.spawn import process_alive
 from tests.core.jobs import farm_jobs
 from tests.core.jobs.farm_jobs import kill, parent_of, running
 from tests.core.jobs.finished_sphere import write_cube

@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.quaternion import quaternion_from_rotation
 from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, DatasetError
 from gaussian_wrapping_addon.core.jobs.runner import run_job
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
+from gaussian_wrapping_addon.core.scene.camera import quaternion_from_rotation
 from gaussian_wrapping_addon.core.settings import (
     JobSettings,
     MeshingSettings,

@@ -16,11 +16,17 @@ import pytest
 
 from gaussian_wrapping_addon.core.jobs import part_process
 from gaussian_wrapping_addon.core.jobs.client import prepare_job
-from gaussian_wrapping_addon.core.jobs.parts.graph import PARTS_NAME, read_parts, write_parts
-from gaussian_wrapping_addon.core.jobs.parts.part_state import new_state, read_state, write_state
-from gaussian_wrapping_addon.core.jobs.parts.planning import plan_if_missing
+from gaussian_wrapping_addon.core.jobs.parts.graph import (
+    PARTS_NAME,
+    new_state,
+    plan_if_missing,
+    read_parts,
+    read_state,
+    write_parts,
+    write_state,
+)
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.processes.helper_process import child_command
+from gaussian_wrapping_addon.core.worker.helper_process import child_command
 from tests.core.jobs import farm_jobs
 from tests.core.jobs.farm_jobs import mesh_in, same_mesh, states, tiled_sphere
 from tests.core.jobs.small_disk import fill, mounted_disk

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import ResourceError
-from gaussian_wrapping_addon.core.field.depth_samples import DepthSamples
-from gaussian_wrapping_addon.core.jobs.stages import region_meshing
+from gaussian_wrapping_addon.core.field.samples import DepthSamples
+from gaussian_wrapping_addon.core.jobs.stages import meshing
 from gaussian_wrapping_addon.core.meshing import pivot_meshing
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import MeshingSettings
@@ -26,7 +26,7 @@ from tests.core.meshing.meshing_scenes import (
 def mesh_here(folder: Path):
     points = np.random.default_rng(0).normal(size=(500, 3))
     points /= np.linalg.norm(points, axis=1)[:, None]
-    return region_meshing.mesh_by_pivots_in_stage(
+    return meshing.mesh_by_pivots_in_stage(
         folder, ShapeField(sphere(), 0.05), gaussians_on(sphere(), cube(1.5), 800, 0.05),
         some_cameras(), cube(1.5), MeshingSettings(method="pivots"), Progress(), seed=0, threads=1,
         depth_samples=DepthSamples(points, -points, np.full(500, 0.02)),
@@ -44,7 +44,7 @@ def test_the_estimate_goes_with_the_mesh(tmp_path: Path) -> None:
 def test_too_little_memory_is_refused_before_anything_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(region_meshing, "free_bytes", lambda *_: 1 << 20)
+    monkeypatch.setattr(meshing, "free_bytes", lambda *_: 1 << 20)
     monkeypatch.setattr(pivot_meshing, "mesh_by_pivots", lambda *_, **__: pytest.fail("began"))
     with pytest.raises(ResourceError, match="by pivots needs at least"):
         mesh_here(tmp_path)

@@ -19,12 +19,11 @@ from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, EXIT_DONE, EXIT_U
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.jobs import client, queue_process
 from gaussian_wrapping_addon.core.jobs.commands import run_in_worker
-from gaussian_wrapping_addon.core.jobs.parts.exit_codes import OTHER_CODE
-from gaussian_wrapping_addon.core.jobs.parts.planning import plan_if_missing
+from gaussian_wrapping_addon.core.jobs.parts.graph import OTHER_CODE, plan_if_missing
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.processes.helper_process import child_command
-from gaussian_wrapping_addon.core.processes.process_identity import Caller, process_alive
+from gaussian_wrapping_addon.core.worker.helper_process import child_command
+from gaussian_wrapping_addon.core.worker.spawn import Caller, process_alive
 from tests.core.jobs.farm_jobs import kill, parent_of
 from tests.core.jobs.finished_sphere import write_finished_sphere
 from tests.synthetic import write_ball_scene

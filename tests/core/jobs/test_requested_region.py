@@ -9,11 +9,11 @@ from typing import Any, cast
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.files import read_json
-from gaussian_wrapping_addon.core.jobs.stages.region_field import requested_region
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.region import write_region
+from gaussian_wrapping_addon.core.jobs.stages.meshing import requested_region
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 
 COS, SIN = np.cos(0.7), np.sin(0.7)
 

@@ -17,7 +17,7 @@ import pytest
 from gaussian_wrapping_addon.core.errors import ResourceError, SettingError
 from gaussian_wrapping_addon.core.jobs import runner
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.parts import part_runner
+from gaussian_wrapping_addon.core.jobs.parts import runner as part_runner
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from gaussian_wrapping_addon.core.dataset.frames.scene_grid import CENTER_STEP, POINT_STEP
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.scene import Scene
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.jobs.runner import run_job
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.loading.load import load_scene
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.frames import CENTER_STEP, POINT_STEP
+from gaussian_wrapping_addon.core.scene.scene import Scene
 from gaussian_wrapping_addon.core.settings import (
     JobSettings,
     MeshingSettings,

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import fibonacci_directions
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.loading.other_inputs import fibonacci_directions
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 from tests.core.gaussians.splat_files import permuted, splat_columns, write_ply
 from tests.core.training.splat_shells import AXES, shell_of_discs
 

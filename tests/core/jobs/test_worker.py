@@ -17,14 +17,14 @@ from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.jobs import client as client_module
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, write_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
-    JobFolder,
-    JobStatus,
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings
+from gaussian_wrapping_addon.core.worker.helper_process import child_command
+from gaussian_wrapping_addon.core.worker.spawn import (
+    CALLER_OPTION,
+    process_alive,
     process_start_ticks,
 )
-from gaussian_wrapping_addon.core.processes.helper_process import child_command
-from gaussian_wrapping_addon.core.processes.process_identity import CALLER_OPTION, process_alive
-from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings
 
 BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"
 

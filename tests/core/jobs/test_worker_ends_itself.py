@@ -13,18 +13,15 @@ import pytest
 
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
-    JobFolder,
-    JobStatus,
-)
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
 from gaussian_wrapping_addon.core.names import JOB_MARKER
-from gaussian_wrapping_addon.core.processes.process_identity import process_alive
+from gaussian_wrapping_addon.core.worker.spawn import process_alive
 
 DEAF = """
 import os, subprocess, sys, threading, time
 from pathlib import Path
 from gaussian_wrapping_addon.core import limits
-from gaussian_wrapping_addon.core.processes import helper_process
+from gaussian_wrapping_addon.core.worker import helper_process
 from gaussian_wrapping_addon.core.jobs import worker
 from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     JobFolder, JobStatus, process_start_ticks

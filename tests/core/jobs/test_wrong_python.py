@@ -19,9 +19,9 @@ from gaussian_wrapping_addon.core.jobs.commands import run_in_worker as calls
 from gaussian_wrapping_addon.core.jobs.commands.doctor import diagnose_worker
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.processes import worker_main
-from gaussian_wrapping_addon.core.processes.process_identity import process_start_ticks
 from gaussian_wrapping_addon.core.settings import JobSettings
+from gaussian_wrapping_addon.core.worker import worker_main
+from gaussian_wrapping_addon.core.worker.spawn import process_start_ticks
 
 posix = pytest.mark.skipif(os.name == "nt", reason="the interpreters are scripts")
 

@@ -21,21 +21,20 @@ import numpy as np
 import torch
 from numba.core.dispatcher import Dispatcher
 
-from gaussian_wrapping_addon.core.evaluation.views.preview import write_preview
+from gaussian_wrapping_addon.core.evaluation.photo_views import write_preview
 from gaussian_wrapping_addon.core.field.isosurface_projection import project_to_isosurface
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
+from gaussian_wrapping_addon.core.render.projection import RawArrays
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.gradients import VisibleGradients
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions, VisibleGradients
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import TextureSettings, TrainingSettings
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
-from gaussian_wrapping_addon.core.training.losses.losses import color_loss, normal_losses
-from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
+from gaussian_wrapping_addon.core.training.adam import Adam
+from gaussian_wrapping_addon.core.training.losses import color_loss, normal_losses
 from gaussian_wrapping_addon.core.training.schedule import Schedule
 from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.field.field_scenes import around_shell, cameras_around, shell_arrays

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.kernels.huge_pages import empty_array
+from gaussian_wrapping_addon.core.parallel import empty_array
 
 PAGE = 2**21
 

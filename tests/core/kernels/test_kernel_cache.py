@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.kernels import kernel_cache
+from gaussian_wrapping_addon.core import compiled
 from tests.proofs import first_then_proofs
 from tests.read_only import read_only
 
@@ -60,7 +60,7 @@ def installed(tmp_path: Path) -> Path:
 RUN = (
     "import logging; logging.basicConfig(format='%(message)s')\n"
     "from gaussian_wrapping_addon.core.some_kernel import run\n"
-    "from gaussian_wrapping_addon.core.gaussians.mip_filter import mip_filter\n"
+    "from gaussian_wrapping_addon.core.gaussians.model import mip_filter\n"
     "print(run(1.0), sum(run.stats.cache_hits.values()))\n"
 )
 
@@ -130,15 +130,15 @@ def test_a_change_in_an_imported_file_is_compiled(installed: Path) -> None:
 
 def test_imports_are_followed_however_they_are_written() -> None:
     core = PACKAGE / "core"
-    found = kernel_cache._imported(core / "render" / "projection" / "projection_activation.py")
+    found = compiled._imported(core / "render" / "projection" / "projection_activation.py")
     assert core / "tolerances.py" in found  # from .. import tolerances
     assert core / "kernels" / "compiled.py" in found  # from ..compiled import inline, kernel
     assert core / "render" / "projection" / "harmonics_kernels.py" in found
-    found = kernel_cache._imported(core / "render" / "raster" / "raster_forward.py")
+    found = compiled._imported(core / "render" / "raster" / "raster_forward.py")
     assert (
         core / "render" / "simd" / "raster_math.py" in found
     )  # names in brackets, over many lines
-    found = kernel_cache._imported(core / "jobs" / "training" / "training_stage.py")
+    found = compiled._imported(core / "jobs" / "training" / "training_stage.py")
     assert core / "training" / "trainer.py" in found  # within a function
     assert all(path.is_file() for path in found)
 

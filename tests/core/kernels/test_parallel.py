@@ -9,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.kernels.parallel import balanced_bounds, even_bounds, run_chunks
+from gaussian_wrapping_addon.core.parallel import balanced_bounds, even_bounds, run_chunks
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

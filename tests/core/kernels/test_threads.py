@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from gaussian_wrapping_addon.core.kernels import parallel
+from gaussian_wrapping_addon.core import parallel
 from tests.core.kernels import kernel_stages
 
 

@@ -14,14 +14,14 @@ from PIL import Image
 from gaussian_wrapping_addon.core.errors import DatasetError, ResourceError, WorkerError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.limits import MAX_MODEL_BYTES
-from gaussian_wrapping_addon.core.masks.segmentation_model import (
+from gaussian_wrapping_addon.core.masks.making import (
     RANGES,
     USUAL_SIDE_PX,
     SegmentationModel,
     as_shares,
 )
-from gaussian_wrapping_addon.core.processes.helper_process import run_helper
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.worker.helper_process import run_helper
 from tests.core.masks import onnx_files
 
 pytest.importorskip("onnxruntime")

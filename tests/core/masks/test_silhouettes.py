@@ -8,11 +8,10 @@ import math
 import numpy as np
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.masks.cleaning import THRESHOLD, cleaned
-from gaussian_wrapping_addon.core.masks.silhouettes import silhouettes
+from gaussian_wrapping_addon.core.masks.making import THRESHOLD, cleaned, silhouettes
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.render.scenes import look_at
 from tests.core.training.small_scene import sphere_gaussians
 

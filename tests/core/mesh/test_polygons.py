@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.core.mesh.polygons import (
+from gaussian_wrapping_addon.core.mesh.textured_mesh import (
     JoinedMesh,
     Polygons,
     join_triangles,

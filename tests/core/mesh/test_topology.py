@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.mesh.topology import (
+from gaussian_wrapping_addon.core.mesh.surface_mesh import (
     area_vectors,
     edge_keys,
     edge_lengths,

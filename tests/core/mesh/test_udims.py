@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.mesh.udims import FIRST_UDIM, LAST_UDIM, udim_uvs
+from gaussian_wrapping_addon.core.mesh.textured_mesh import FIRST_UDIM, LAST_UDIM, udim_uvs
 
 
 def test_uvs_move_to_the_tiles_of_their_atlases() -> None:

@@ -7,16 +7,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyResult
+from gaussian_wrapping_addon.core.field.vacancy import VacancyResult
 from gaussian_wrapping_addon.core.field.vector_field import VectorFieldResult
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_statistics import (
-    MeshStatistics,
-    mesh_statistics,
-)
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.meshing.checks import MeshStatistics, mesh_statistics
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.field.field_scenes import camera_at, make_arrays
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing import pivot_meshing
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
-from gaussian_wrapping_addon.core.meshing.cleanup.open_boundary import without_caps
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
+from gaussian_wrapping_addon.core.meshing.clean_up import without_caps
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import BRACKET_SHARE, mesh_by_pivots
-from gaussian_wrapping_addon.core.meshing.points.pivots import PIVOTS, pivot_rule
+from gaussian_wrapping_addon.core.meshing.pivots import PIVOTS, pivot_rule
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.field.field_scenes import make_arrays
 from tests.core.meshing.meshing_scenes import (

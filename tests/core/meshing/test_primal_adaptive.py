@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError, ResourceError, UsageError
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyResult
+from gaussian_wrapping_addon.core.field.vacancy import VacancyResult
+from gaussian_wrapping_addon.core.mesh.sampling import sample_triangles
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles
-from gaussian_wrapping_addon.core.meshing.points import surface_points
-from gaussian_wrapping_addon.core.meshing.points.resolution import MIN_VERTICES
+from gaussian_wrapping_addon.core.meshing import surface_points
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
+from gaussian_wrapping_addon.core.meshing.surface_points import MIN_VERTICES
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.field.field_scenes import camera_at
 from tests.core.meshing.meshing_scenes import (
     Distance,

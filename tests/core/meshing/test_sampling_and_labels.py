@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles, thin
-from gaussian_wrapping_addon.core.meshing.points.pivots import (
-    representative_gaussians,
-)
-from gaussian_wrapping_addon.core.meshing.tetrahedra.classification import regularised
+from gaussian_wrapping_addon.core.mesh.sampling import sample_triangles, thin
+from gaussian_wrapping_addon.core.meshing.classification import regularised
+from gaussian_wrapping_addon.core.meshing.pivots import representative_gaussians
 from tests.core.field.field_scenes import random_arrays
 
 

@@ -8,13 +8,12 @@ import functools
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.field.vacancy.brute_force import brute_force_vacancy
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField, brute_force_vacancy
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.field.field_scenes import cameras_around, shell_arrays, unit_sphere
 from tests.core.meshing.meshing_scenes import assert_closed_manifold, cube, settings
 

@@ -14,21 +14,20 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import MeshingError
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyResult
+from gaussian_wrapping_addon.core.field.vacancy import VacancyResult
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_statistics import mesh_statistics
+from gaussian_wrapping_addon.core.meshing.checks import mesh_statistics
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import (
     made_manifold,
     mesh_region,
     simplified,
     small_handles_closed,
 )
-from gaussian_wrapping_addon.core.meshing.tiles.border_faces import BorderFaces
 from gaussian_wrapping_addon.core.meshing.tiles.plan import Field
 from gaussian_wrapping_addon.core.meshing.tiles.store import load_surface, save_surface
-from gaussian_wrapping_addon.core.meshing.tiles.tile_faces import tile_faces
+from gaussian_wrapping_addon.core.meshing.tiles.tile import BorderFaces, tile_faces
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 
 from .meshing_scenes import (

@@ -9,32 +9,32 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import MeshingError
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyResult
+from gaussian_wrapping_addon.core.field.vacancy import VacancyResult
+from gaussian_wrapping_addon.core.mesh.sampling import sample_triangles
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles
-from gaussian_wrapping_addon.core.meshing.points.candidate_surface import CandidateSurface
-from gaussian_wrapping_addon.core.meshing.points.region_caps import no_caps
-from gaussian_wrapping_addon.core.meshing.points.spacing import Spacing
-from gaussian_wrapping_addon.core.meshing.points.surface_points import SurfacePoints
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
-from gaussian_wrapping_addon.core.meshing.tiles.border_faces import BorderFaces
-from gaussian_wrapping_addon.core.meshing.tiles.plan import Field, TilePlan
-from gaussian_wrapping_addon.core.meshing.tiles.steiner_points import (
+from gaussian_wrapping_addon.core.meshing.surface_points import (
+    CandidateSurface,
+    Spacing,
+    SurfacePoints,
+    no_caps,
+)
+from gaussian_wrapping_addon.core.meshing.tiles.plan import (
     CLEARANCE_RADII,
+    Field,
+    TilePlan,
     steiner_lattice,
 )
-from gaussian_wrapping_addon.core.meshing.tiles.tile_faces import (
-    local_tetrahedra,
-    tile_faces,
-)
-from gaussian_wrapping_addon.core.meshing.tiles.tile_points import (
+from gaussian_wrapping_addon.core.meshing.tiles.tile import (
+    BorderFaces,
     GatheredPoints,
     gather,
+    local_tetrahedra,
     pieces_in_box,
+    tile_faces,
 )
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.tiling import Tiling
+from gaussian_wrapping_addon.core.regions.shapes import Region, Tiling
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.proofs import first_then_proofs
 

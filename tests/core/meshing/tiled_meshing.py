@@ -9,22 +9,24 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.field.depth_samples import DepthSamples
+from gaussian_wrapping_addon.core.field.samples import DepthSamples
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.tiles.border_faces import BorderFaces
 from gaussian_wrapping_addon.core.meshing.tiles.plan import Field, TilePlan
-from gaussian_wrapping_addon.core.meshing.tiles.tile_faces import TileFaces, tile_faces
-from gaussian_wrapping_addon.core.meshing.tiles.tile_points import (
+from gaussian_wrapping_addon.core.meshing.tiles.tile import (
+    BorderFaces,
     GatheredPoints,
+    TileFaces,
+    TileSurface,
     gather,
+    tile_faces,
     tile_points,
+    tile_surface,
 )
-from gaussian_wrapping_addon.core.meshing.tiles.tile_surface import TileSurface, tile_surface
 from gaussian_wrapping_addon.core.meshing.tiles.tiled_mesh import join_tiles, plan_tiles
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.core.evaluation.layouts.mesh_input import is_cloud
-from gaussian_wrapping_addon.core.ply.header import MAX_HEADER_BYTES, read_ply_header
-from gaussian_wrapping_addon.core.ply.table import read_vertices
+from gaussian_wrapping_addon.core.evaluation.layouts import is_cloud
+from gaussian_wrapping_addon.core.ply import MAX_HEADER_BYTES, read_ply_header, read_vertices
 
 HEADER = """ply
 format binary_big_endian 1.0

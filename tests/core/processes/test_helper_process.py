@@ -20,8 +20,8 @@ from gaussian_wrapping_addon.core.errors import (
     WorkerError,
     WrapError,
 )
-from gaussian_wrapping_addon.core.processes import helper_entry, helper_process, peak_memory
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.worker import helper_entry, helper_process
 
 HELPERS = {
     "good": "emit(fraction=0.5, message='half'); (folder / 'out').write_text('1')",
@@ -52,10 +52,10 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         body = (
             "import os, sys, time\nfrom pathlib import Path\n"
             f"sys.path.insert(0, {str(Path(__file__).resolve().parents[3])!r})\n"
-            "from gaussian_wrapping_addon.core.processes import helper_entry\n"
+            "from gaussian_wrapping_addon.core.worker import helper_entry\n"
             "from gaussian_wrapping_addon.core import errors\n"
             "from gaussian_wrapping_addon.core.errors import DatasetError\n"
-            "from gaussian_wrapping_addon.core.processes.helper_process import emit\n"
+            "from gaussian_wrapping_addon.core.worker.helper_process import emit\n"
             "import types, importlib\n"
             "def main(folder):\n"
             f"    {HELPERS[name]}\n"
@@ -203,16 +203,16 @@ def test_packages_without_room_in_memory_are_a_shortage(run) -> None:
 def test_the_peak_is_the_helpers_own_and_the_largest_is_kept(
     run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(peak_memory, "_largest_helper_bytes", 0)
-    assert peak_memory.largest_helper_bytes() == 0
+    monkeypatch.setattr(helper_process, "_largest_helper_bytes", 0)
+    assert helper_process.largest_helper_bytes() == 0
     parents_bytes = b"x" * (600 * 2**20)
     run("good")
-    small_bytes = peak_memory.largest_helper_bytes()
+    small_bytes = helper_process.largest_helper_bytes()
     run("large")
-    large_bytes = peak_memory.largest_helper_bytes()
+    large_bytes = helper_process.largest_helper_bytes()
     assert small_bytes + 140 * 2**20 < large_bytes < len(parents_bytes)
     run("good")
-    assert peak_memory.largest_helper_bytes() == large_bytes
+    assert helper_process.largest_helper_bytes() == large_bytes
 
 
 def test_entry_module_has_the_signature_that_worker_main_calls() -> None:

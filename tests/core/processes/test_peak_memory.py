@@ -9,13 +9,13 @@ import sys
 
 import pytest
 
-from gaussian_wrapping_addon.core.processes.peak_memory import peak_memory_bytes
-from gaussian_wrapping_addon.core.processes.spawn import child_environment
+from gaussian_wrapping_addon.core.worker.helper_process import peak_memory_bytes
+from gaussian_wrapping_addon.core.worker.spawn import child_environment
 
 PRINT_PEAKS = (
     "import json, sys\n"
     "sys.path[:0] = json.loads(sys.argv[1])\n"
-    "from gaussian_wrapping_addon.core.processes.peak_memory import peak_memory_bytes\n"
+    "from gaussian_wrapping_addon.core.worker.helper_process import peak_memory_bytes\n"
     "print(json.dumps(peak_memory_bytes()))\n"
 )
 

@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
-from gaussian_wrapping_addon.core.processes.helper_process import child_command
-from gaussian_wrapping_addon.core.processes.process_identity import (
+from gaussian_wrapping_addon.core.worker.helper_process import child_command
+from gaussian_wrapping_addon.core.worker.spawn import (
     CALLER_OPTION,
     Caller,
     caller_option,

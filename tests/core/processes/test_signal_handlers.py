@@ -37,14 +37,14 @@ sys.exit(40 + len(asked) + 10 * len(failed))
 """
 PYCOLMAP = """
 def load():
-    from gaussian_wrapping_addon.core.dataset.lenses.undistort import _native
-    from gaussian_wrapping_addon.core.dataset.readers.source_model import LensCamera
+    from gaussian_wrapping_addon.core.readers.lenses import _native
+    from gaussian_wrapping_addon.core.readers.source_model import LensCamera
     _native(LensCamera("PINHOLE", 8, 8, (1.0, 1.0, 4.0, 4.0)))
 """
 IMPOLITE = """
 def load():
     import ctypes
-    from gaussian_wrapping_addon.core.processes.signal_handlers import kept_signal_handlers
+    from gaussian_wrapping_addon.core.worker.spawn import kept_signal_handlers
     with kept_signal_handlers():
         ctypes.CDLL(None).signal(15, 0)
         ctypes.CDLL(None).signal(2, 0)
@@ -62,7 +62,7 @@ def test_the_handlers_of_a_worker_stay(load: str, threads: int) -> None:
 
 
 def test_handlers_that_python_sets_itself_stay_as_they_were() -> None:
-    from gaussian_wrapping_addon.core.processes.signal_handlers import kept_signal_handlers
+    from gaussian_wrapping_addon.core.worker.spawn import kept_signal_handlers
 
     before = {number: signal.getsignal(number) for number in signal.valid_signals()}
     with kept_signal_handlers():

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.processes import spawn as module
-from gaussian_wrapping_addon.core.processes.spawn import (
+from gaussian_wrapping_addon.core.worker import spawn as module
+from gaussian_wrapping_addon.core.worker.spawn import (
     child_environment,
     group_options,
     kill_group,

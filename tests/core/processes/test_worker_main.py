@@ -7,8 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from gaussian_wrapping_addon.core.processes.helper_process import child_command
-from gaussian_wrapping_addon.core.processes.spawn import child_environment
+from gaussian_wrapping_addon.core.worker.helper_process import child_command
+from gaussian_wrapping_addon.core.worker.spawn import child_environment
 
 
 def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[bytes]:

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import MeshingError
-from gaussian_wrapping_addon.core.regions.automatic_region import automatic_region, whole_region
+from gaussian_wrapping_addon.core.regions.scene_regions import automatic_region, whole_region
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from tests.core.field.field_scenes import make_arrays
 from tests.synthetic import look_at
 

@@ -12,10 +12,11 @@ from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.regions.box import (
     CUBE_CORNERS,
     CUBE_TRIANGLES,
+    FLAT_SHARE,
     box_matrix,
+    check_volume,
     hull_edges,
 )
-from gaussian_wrapping_addon.core.regions.volume import FLAT_SHARE, check_volume
 
 
 def random_rotation(random: np.random.Generator) -> np.ndarray:

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError, MeshingError, ParseError
 from gaussian_wrapping_addon.core.limits import MAX_NAME_BYTES
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.region import read_region, write_region
-from gaussian_wrapping_addon.core.regions.region_file import read_region_file
+from gaussian_wrapping_addon.core.regions.files import read_region_file
+from gaussian_wrapping_addon.core.regions.scene_regions import read_region, write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 
 TURN = Rotation.from_euler("xyz", [20, 30, 50], degrees=True).as_matrix()
 UTM = np.array([5e5, 4e6, 120.0])

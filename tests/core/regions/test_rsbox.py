@@ -12,12 +12,13 @@ import pytest
 
 from gaussian_wrapping_addon import batch
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
-from gaussian_wrapping_addon.core.regions.region_file import read_region_file, write_region_file
-from gaussian_wrapping_addon.core.regions.rsbox import (
+from gaussian_wrapping_addon.core.regions.files import (
     MAX_BYTES,
     angles_of,
+    read_region_file,
     read_rsbox,
     rotation_of,
+    write_region_file,
     write_rsbox,
 )
 

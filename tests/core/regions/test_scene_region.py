@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.quaternion import rotation_from_quaternion
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.scene_region import on_scene_grid, region_in_scene
+from gaussian_wrapping_addon.core.regions.scene_regions import on_scene_grid, region_in_scene
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Similarity, rotation_from_quaternion
 
 TURN = rotation_from_quaternion(np.array([0.3, -0.8, 0.5, 0.2]))
 assert TURN is not None

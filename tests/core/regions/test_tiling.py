@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.regions.tiling import Tiling, split_evenly
+from gaussian_wrapping_addon.core.regions.shapes import Tiling, split_evenly
 
 
 def grid_tiling(places: tuple[float, ...]) -> Tiling:

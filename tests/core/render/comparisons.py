@@ -14,12 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.reference.reference import render_reference
+from gaussian_wrapping_addon.core.render.reference import render_reference
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.images import Render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .first_principles import IMAGES, TRAINED, FirstPrinciples, Truth
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import mpmath
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 Exact = dict[str, list[mpmath.mpf]]
 

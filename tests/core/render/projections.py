@@ -6,14 +6,14 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection.projection import (
+from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     ScreenGaussians,
     project_gaussians,
 )
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .scenes import isotropic, look_at
 

@@ -9,19 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection.projection import (
-    RawArrays,
-    RawGradients,
-    project_backward,
-)
-from gaussian_wrapping_addon.core.render.query.depth_query import (
+from gaussian_wrapping_addon.core.render.depth_query import (
     add_query_gradients,
     query_view,
     solve_depths,
 )
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.projection import RawArrays, RawGradients, project_backward
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits")
 

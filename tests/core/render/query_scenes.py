@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .scenes import look_at, random_gaussians
 

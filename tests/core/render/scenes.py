@@ -8,8 +8,8 @@ import math
 import numpy as np
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.poses import look_at_pose
 
 

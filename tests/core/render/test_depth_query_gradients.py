@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.query.depth_query import query_view, solve_depths
-from gaussian_wrapping_addon.core.render.reference.reference import reference_depth_at
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.depth_query import query_view, solve_depths
+from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.reference import reference_depth_at
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 
 from .comparisons import leaves, relative_l2
 from .query_autograd import query_depth

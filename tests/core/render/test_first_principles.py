@@ -16,12 +16,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.reference.reference import render_reference
-from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.reference import reference_projection, render_reference
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .comparisons import gradients_of, images_of, random_weights, relative_l2
 from .first_principles import IMAGES, TRAINED, FirstPrinciples, Truth
@@ -265,9 +264,7 @@ def test_chunks_and_order_of_storage_do_not_matter(monkeypatch: pytest.MonkeyPat
     camera = look_at((2.4, 0.2, 0.4), width=11, height=9, focal=13.0)
     whole = images(gaussians, camera)
     shuffled = images(gaussians.select(torch.randperm(30, generator=torch.manual_seed(0))), camera)
-    monkeypatch.setattr(
-        "gaussian_wrapping_addon.core.render.reference.reference._ELEMENTS_PER_CHUNK", 1000
-    )
+    monkeypatch.setattr("gaussian_wrapping_addon.core.render.reference._ELEMENTS_PER_CHUNK", 1000)
     chunked = images(gaussians, camera)
     for name in IMAGES:
         np.testing.assert_allclose(shuffled[name], whole[name], atol=1e-13)

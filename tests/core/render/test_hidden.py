@@ -10,18 +10,17 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection.projection import (
+from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     project_arrays,
     project_gaussians,
 )
-from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
-from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.reference import reference_projection
+from gaussian_wrapping_addon.core.render.types import ImageGradients, RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .scenes import look_at, random_gaussians
 
@@ -65,7 +64,7 @@ def test_kernel_and_definition_hide_the_same(camera: Camera) -> None:
     px, py, r, s, t = params[:, 5:10].T
     den = 1.0 + 2.0 * (px * x + py * y) + r * x * x + s * x * y + t * y * y
     with np.errstate(divide="ignore"):
-        reach = 2.0 * np.log(params[:, 11] / tolerances.ALPHA_MIN)
+        reach = 2.0 * np.log(params[:, 11] / limits.ALPHA_MIN)
     meets = usable & (qa * x * x + qb * x * y + qc * y * y < 0.9 * reach * den)
     assert screen.visible[meets].all()
     assert meets.sum() > 500
@@ -160,15 +159,15 @@ def test_sane_extremes_stay(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "at"),
     [
-        ("z", tolerances.FINITE_Z_MIN),
-        ("z", tolerances.FINITE_Z_MAX),
-        ("offset", tolerances.FINITE_OFFSET_PX),
-        ("sigma_z", tolerances.FINITE_SIGMA_Z),
-        ("color", tolerances.FINITE_COLOR),
-        ("spread", tolerances.FINITE_SPREAD),
-        ("pull", tolerances.FINITE_PULL),
-        ("num", tolerances.FINITE_NUM),
-        ("den", tolerances.FINITE_DEN),
+        ("z", limits.FINITE_Z_MIN),
+        ("z", limits.FINITE_Z_MAX),
+        ("offset", limits.FINITE_OFFSET_PX),
+        ("sigma_z", limits.FINITE_SIGMA_Z),
+        ("color", limits.FINITE_COLOR),
+        ("spread", limits.FINITE_SPREAD),
+        ("pull", limits.FINITE_PULL),
+        ("num", limits.FINITE_NUM),
+        ("den", limits.FINITE_DEN),
     ],
 )
 def test_each_limit_is_where_it_is_said_to_be(name: str, at: float) -> None:
@@ -179,7 +178,7 @@ def test_each_limit_is_where_it_is_said_to_be(name: str, at: float) -> None:
         screen = project_gaussians(RawArrays.from_gaussians(gaussians), camera, OPTIONS)
         assert bool(screen.visible.all()) == usable
         seen.append(usable)
-    assert seen == ([False, True] if at == tolerances.FINITE_Z_MIN else [True, False])
+    assert seen == ([False, True] if at == limits.FINITE_Z_MIN else [True, False])
 
 
 def at_limit(name: str, value: float) -> tuple[OrientedGaussians, Camera]:

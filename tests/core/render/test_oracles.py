@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.reference.reference import render_reference
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.reference import render_reference
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.render.scenes import isotropic, look_at, random_gaussians
 
 EYES = [(2.0, 0.6, 0.9), (-0.3, -2.2, 1.4)]

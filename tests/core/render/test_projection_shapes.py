@@ -9,13 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection.projection import (
-    RawArrays,
-    RawGradients,
-    project_backward,
-)
+from gaussian_wrapping_addon.core.render.projection import RawArrays, RawGradients, project_backward
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .exact_projection import EXACT_COLUMNS, exact_columns, exact_gradient, exact_values
 from .first_principles import TRAINED

@@ -11,11 +11,7 @@ import llvmlite.binding
 import numba
 import pytest
 
-from gaussian_wrapping_addon.core.render.projection import (
-    projection_activation,
-    projection_backward,
-    projection_kernels,
-)
+from gaussian_wrapping_addon.core.render import projection, projection_kernels
 
 ARITHMETIC = r"\bv(?:fn?m(?:add|sub)\d+|mul|add|sub|div|sqrt)"
 PACKED = re.compile(ARITHMETIC + r"pd\b.*%[yz]mm")
@@ -37,10 +33,10 @@ def _this_processor() -> None:
     ("kernel", "with_camera", "fused"),
     [
         # Fused operations that the formulas need at least; each stands for a whole block.
-        (projection_activation.activate_block, True, 60),
+        (projection_kernels.activate_block, True, 60),
         (projection_kernels._project_shapes, True, 80),
-        (projection_backward._shape_gradients, True, 120),
-        (projection_backward._raw_gradients, False, 50),
+        (projection._shape_gradients, True, 120),
+        (projection._raw_gradients, False, 50),
     ],
 )
 def test_blocks_are_packed(kernel: Any, with_camera: bool, fused: int) -> None:

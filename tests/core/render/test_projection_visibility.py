@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
+from gaussian_wrapping_addon.core.render.reference import reference_projection
 
 from .projections import AXIS, CAMERA, OPTIONS, project, single
 from .scenes import isotropic, random_gaussians

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 
 from .comparisons import images_of, leaves, narrowed
 from .first_principles import FirstPrinciples

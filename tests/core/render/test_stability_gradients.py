@@ -13,18 +13,17 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection.projection import (
+from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     RawGradients,
     project_backward,
     project_gaussians,
 )
-from gaussian_wrapping_addon.core.render.reference.reference import render_reference
-from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
+from gaussian_wrapping_addon.core.render.reference import reference_projection, render_reference
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .comparisons import (
     gradients_of,

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.render.query.depth_query_gradient import query_gradient_range
-from gaussian_wrapping_addon.core.render.query.depth_query_kernels import query_range
-from gaussian_wrapping_addon.core.render.raster import raster_backward, raster_forward
+from gaussian_wrapping_addon.core.render import raster
+from gaussian_wrapping_addon.core.render.depth_query import query_gradient_range
+from gaussian_wrapping_addon.core.render.query_kernels import query_range
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.simd.raster_math import aligned_zeros, vector_lanes
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.simd import aligned_zeros, vector_lanes
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 
 from .comparisons import leaves
 from .query_autograd import query_depth
@@ -62,24 +62,22 @@ def _compiled() -> None:
 
 
 def test_blending_is_packed() -> None:
-    packed, single = fused_instructions(raster_forward.forward_kernel(vector_lanes(), False, False))
+    packed, single = fused_instructions(raster.forward_kernel(vector_lanes(), False, False))
     # Nine channels, six for the exponential, four for the conic and the quadratic.
     assert packed >= 19
     assert single < packed
 
 
 def test_gradient_is_packed() -> None:
-    packed, single = fused_instructions(
-        raster_backward.backward_kernel(vector_lanes(), True, False)
-    )
+    packed, single = fused_instructions(raster.backward_kernel(vector_lanes(), True, False))
     # Two exponentials, the conic, nine products with the loss, and most of the sums.
     assert packed >= 40
     assert single < packed
 
 
 def test_isosurface_is_packed() -> None:
-    blending, _ = fused_instructions(raster_forward.forward_kernel(vector_lanes(), False, False))
-    packed, single = fused_instructions(raster_forward.forward_kernel(vector_lanes(), True, False))
+    blending, _ = fused_instructions(raster.forward_kernel(vector_lanes(), False, False))
+    packed, single = fused_instructions(raster.forward_kernel(vector_lanes(), True, False))
     # Blending in three loops, and the solver's exponential and products.
     assert packed >= 3 * 19 + 9
     assert packed > blending
@@ -100,8 +98,8 @@ def test_no_reference_is_counted_in_the_inner_loops() -> None:
     # numba's reference counts are atomic and clobber all vector registers; a branch around an
     # inlined helper is enough to bring them back into the loops.
     for kernel in (
-        raster_backward.backward_kernel(vector_lanes(), True, False),
-        raster_forward.forward_kernel(vector_lanes(), True, False),
+        raster.backward_kernel(vector_lanes(), True, False),
+        raster.forward_kernel(vector_lanes(), True, False),
     ):
         blocks = re.split(r"^\.L\w+:|^\w+:", listing_of(kernel), flags=re.MULTILINE)
         hot = [block for block in blocks if len(PACKED.findall(block)) >= 10]

@@ -9,15 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
+from gaussian_wrapping_addon.core.render.projection import RawArrays
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients, VisibleGradients
-from gaussian_wrapping_addon.core.render.types.images import RenderStatistics
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import (
+    ImageGradients,
+    RenderOptions,
+    RenderStatistics,
+    VisibleGradients,
+)
 from gaussian_wrapping_addon.core.render.view_renderer import ViewPass, ViewRenderer
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from .scenes import isotropic, look_at, random_gaussians
 

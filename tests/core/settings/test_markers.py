@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.settings.markers import (
+from gaussian_wrapping_addon.core.settings.job import (
     MARKER_DICTIONARIES,
     MarkerSpec,
     are_markers,

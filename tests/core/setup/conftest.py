@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.processes.worker_environment import DATA_VARIABLE
-from gaussian_wrapping_addon.core.setup.commands import SetupRequest
-from gaussian_wrapping_addon.core.setup.pythons import probe
+from gaussian_wrapping_addon.core.jobs.install import SetupRequest, probe
+from gaussian_wrapping_addon.core.worker.environment import DATA_VARIABLE
 from tests.core.setup.wheels import write_wheel
 
 

@@ -20,17 +20,16 @@ from gaussian_wrapping_addon.core.errors import (
     MissingExtraError,
     UsageError,
 )
-from gaussian_wrapping_addon.core.processes import worker_extras
-from gaussian_wrapping_addon.core.processes.worker_extras import EXTRAS, Extra
-from gaussian_wrapping_addon.core.processes.worker_requirements import (
+from gaussian_wrapping_addon.core.jobs import install
+from gaussian_wrapping_addon.core.jobs.install import FoundPython, SetupRequest, SetupTask
+from gaussian_wrapping_addon.core.worker import environment
+from gaussian_wrapping_addon.core.worker.environment import (
+    EXTRAS,
+    Extra,
     Requirement,
     read_requirements,
     requirements_file,
 )
-from gaussian_wrapping_addon.core.setup import commands, install
-from gaussian_wrapping_addon.core.setup.commands import SetupRequest
-from gaussian_wrapping_addon.core.setup.install import SetupTask
-from gaussian_wrapping_addon.core.setup.pythons import FoundPython
 from tests.core.setup.wheels import write_wheel
 
 PYTHON = FoundPython("/usr/bin/python3.12", (3, 12, 1))
@@ -40,7 +39,7 @@ PLAY = Extra("play", (Requirement("gw-delta", "==2.1"),), "gw_delta", "Play", "p
 @pytest.fixture
 def play(monkeypatch: pytest.MonkeyPatch) -> Extra:
     """An extra of a tiny wheel in the table."""
-    monkeypatch.setattr(worker_extras, "EXTRAS", (*EXTRAS, PLAY))
+    monkeypatch.setattr(environment, "EXTRAS", (*EXTRAS, PLAY))
     return PLAY
 
 
@@ -59,7 +58,7 @@ def test_the_table_is_sound() -> None:
     for extra in EXTRAS:
         assert re.fullmatch(r"[a-z]+", extra.name)
         assert all(p.versions.startswith("==") and p.name not in ours for p in extra.packages)
-        path = worker_extras.extra_hashes_file(requirements_file(), extra)
+        path = environment.extra_hashes_file(requirements_file(), extra)
         assert path is not None, "run python -m tools.worker_hashes --extras"
         entries = re.split(r"\n(?=\w)", path.read_text().partition("\n\n")[0])
         listed = [e.split(" ")[0] for e in entries if not e.startswith("#")]
@@ -82,25 +81,25 @@ def test_the_tests_have_the_extras_of_the_table() -> None:
     [("", ()), ("heif", ("heif",)), ("raw, heif", ("heif", "raw")), ("raw,raw,", ("raw",))],
 )
 def test_names_are_read_in_the_order_of_the_table(text: str, names: tuple[str, ...]) -> None:
-    assert worker_extras.read_extra_names(text) == names
+    assert environment.read_extra_names(text) == names
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(UsageError, match=r"no extra jpeg\. Give .*heif, raw"):
-        worker_extras.read_extra_names("heif,jpeg")
+        environment.read_extra_names("heif,jpeg")
 
 
 def test_extras_are_installed_by_their_hashes() -> None:
     ours = requirements_file()
     request = SetupRequest("/w", "/p", str(ours), "cpu", extras=("heif", "raw"))
-    found = commands.all_commands(request, PYTHON)
-    assert len(commands.all_commands(replace(request, extras=()), PYTHON)) == len(found) - 2
+    found = install.all_commands(request, PYTHON)
+    assert len(install.all_commands(replace(request, extras=()), PYTHON)) == len(found) - 2
     for command, name in zip(found[-3:-1], ("heif", "raw"), strict=True):
         hashes = str(ours.with_name(f"requirements-worker-{name}-hashes.txt"))
         assert command[-4:] == ("--no-deps", "--require-hashes", "-r", hashes)
         assert {"--only-binary", ":all:"} <= set(command)
     assert found[-1][-1] == "check"
-    wheels = commands.all_commands(replace(request, find_links="/wheels"), PYTHON)
+    wheels = install.all_commands(replace(request, find_links="/wheels"), PYTHON)
     assert wheels[-2][-6:] == (
         ":all:", "--no-index", "--find-links", "/wheels", "--no-deps", "rawpy==0.28.0",
     )  # fmt: skip
@@ -130,7 +129,7 @@ def test_an_extra_is_added_to_what_is_there(quick: SetupRequest, play: Extra) ->
     assert {versions[name] for name in ("gw_delta", "gwalpha")} == {"2.1", "1.2"}
     after = {p: p.stat().st_mtime_ns for p in environment.folder.rglob("*") if p.is_file()}
     assert {p: after[p] for p in before} == before, "what was there is not touched"
-    assert not (environment.root / commands.TEMPORARY).exists()
+    assert not (environment.root / install.TEMPORARY).exists()
 
     # A wheel that is missing leaves all as it is; another version replaces the present one.
     (wheels / "gw_delta-2.1-py3-none-any.whl").unlink()
@@ -179,7 +178,7 @@ def test_the_command_line(
 
 def test_a_missing_extra_names_files_and_next_step(play: Extra) -> None:
     with pytest.raises(MissingExtraError) as caught:
-        worker_extras.load_extra("play", "a.played and 3 others")
+        environment.load_extra("play", "a.played and 3 others")
     assert caught.value.message == (
         "a.played and 3 others: the worker has no package for played files yet."
     )

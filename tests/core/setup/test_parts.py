@@ -12,15 +12,14 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import ResourceError, UsageError, WorkerError
 from gaussian_wrapping_addon.core.jobs import client as job_client
-from gaussian_wrapping_addon.core.processes import worker_requirements
-from gaussian_wrapping_addon.core.processes.worker_environment import interpreter_of
-from gaussian_wrapping_addon.core.processes.worker_requirements import (
+from gaussian_wrapping_addon.core.jobs import install
+from gaussian_wrapping_addon.core.jobs.install import FoundPython, SetupRequest
+from gaussian_wrapping_addon.core.worker import environment
+from gaussian_wrapping_addon.core.worker.environment import (
     Requirement,
+    interpreter_of,
     read_requirements,
 )
-from gaussian_wrapping_addon.core.setup import commands, install, pythons
-from gaussian_wrapping_addon.core.setup.commands import SetupRequest
-from gaussian_wrapping_addon.core.setup.pythons import FoundPython
 
 
 def fake_python(folder: Path, version: str, name: str = "python3", bits: int = 64) -> str:
@@ -43,27 +42,27 @@ def fake_python(folder: Path, version: str, name: str = "python3", bits: int = 6
 def test_pythons_that_are_refused(tmp_path: Path, version: str, bits: int, words: str) -> None:
     path = fake_python(tmp_path, version, bits=bits)
     with pytest.raises(UsageError, match=words):
-        pythons.probe(path)
-    assert pythons.find_pythons(paths=[path]) == []
+        install.probe(path)
+    assert install.find_pythons(paths=[path]) == []
 
 
 def test_blender_is_no_python(tmp_path: Path) -> None:
     path = fake_python(tmp_path, "[3, 11, 1]", "blender-4.3")
     with pytest.raises(UsageError, match="is Blender"):
-        pythons.probe(path)
-    assert path not in pythons.candidates(path)
+        install.probe(path)
+    assert path not in install.candidates(path)
 
 
 def test_pythons_with_wheels_come_first(tmp_path: Path) -> None:
     paths = [fake_python(tmp_path, f"[3, {n}, 0]", f"python3.{n}") for n in (14, 11, 13, 10)]
-    found = pythons.find_pythons(paths=paths)
+    found = install.find_pythons(paths=paths)
     assert [p.version[1] for p in found] == [11, 13, 14], "3.14 last, 3.10 not at all"
 
 
 def test_the_running_python_is_found() -> None:
-    real = pythons.probe(sys.executable)
+    real = install.probe(sys.executable)
     assert real.version == sys.version_info[:3]
-    assert real.path in [p.path for p in pythons.find_pythons(sys.executable)]
+    assert real.path in [p.path for p in install.find_pythons(sys.executable)]
 
 
 def test_the_words_of_the_launcher() -> None:
@@ -71,7 +70,7 @@ def test_the_words_of_the_launcher() -> None:
         " -V:3.12 *        C:\\Program Files\\Python312\\python.exe\r\n"
         " -3.11-64    C:\\Users\\Zo\xeb\\Python311\\python.exe\r\nnothing\r\n"
     )
-    assert pythons.paths_of_launcher(text) == [
+    assert install.paths_of_launcher(text) == [
         "C:\\Program Files\\Python312\\python.exe",
         "C:\\Users\\Zo\xeb\\Python311\\python.exe",
     ]
@@ -79,32 +78,32 @@ def test_the_words_of_the_launcher() -> None:
 
 @pytest.mark.parametrize(
     ("choice", "system", "index"),
-    [("cpu", "Linux", commands.CPU_INDEX), ("cuda", "Linux", ""), ("cpu", "Windows", ""),
-     ("cuda", "Windows", commands.CUDA_INDEX), ("cpu", "Darwin", ""), ("index", "Linux", ""),
+    [("cpu", "Linux", install.CPU_INDEX), ("cuda", "Linux", ""), ("cpu", "Windows", ""),
+     ("cuda", "Windows", install.CUDA_INDEX), ("cpu", "Darwin", ""), ("index", "Linux", ""),
      ("index", "Windows", "")],
 )  # fmt: skip
 def test_where_torch_comes_from(choice: str, system: str, index: str) -> None:
-    assert commands.torch_index(choice, system) == index
+    assert install.torch_index(choice, system) == index
 
 
 def test_no_cuda_on_macos() -> None:
     with pytest.raises(UsageError, match="no CUDA"):
-        commands.torch_index("cuda", "Darwin")
+        install.torch_index("cuda", "Darwin")
 
 
 PYTHON = FoundPython("/usr/bin/python3.12", (3, 12, 1))
 
 
 def test_commands_are_shown_as_they_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(commands.platform, "system", lambda: "Linux")
+    monkeypatch.setattr(install.platform, "system", lambda: "Linux")
     request = SetupRequest("/a b/w", PYTHON.path, "/r.txt", "cpu")
-    venv, pip, check = commands.all_commands(request, PYTHON)
-    assert commands.as_line(venv) == "/usr/bin/python3.12 -I -m venv --clear '/a b/w/env'"
+    venv, pip, check = install.all_commands(request, PYTHON)
+    assert install.as_line(venv) == "/usr/bin/python3.12 -I -m venv --clear '/a b/w/env'"
     assert pip[:4] == ("/a b/w/env/bin/python", "-I", "-m", "pip")
-    assert pip[-4:] == ("--extra-index-url", commands.CPU_INDEX, "-r", "/r.txt")
+    assert pip[-4:] == ("--extra-index-url", install.CPU_INDEX, "-r", "/r.txt")
     assert check[-1] == "check"
     offline = SetupRequest("/a b/w", PYTHON.path, "/r.txt", "cpu", "/wheels")
-    _, pip, _ = commands.all_commands(offline, PYTHON)
+    _, pip, _ = install.all_commands(offline, PYTHON)
     assert {"--isolated", "--no-index", "--find-links", "/wheels"} <= set(pip)
     assert not [word for word in pip if "http" in word]
 
@@ -114,11 +113,11 @@ def test_commands_are_shown_as_they_run(monkeypatch: pytest.MonkeyPatch) -> None
 def test_files_are_installed_by_their_hashes(
     monkeypatch: pytest.MonkeyPatch, torch: str, has_venv: bool
 ) -> None:
-    monkeypatch.setattr(commands.platform, "system", lambda: "Linux")
-    ours = worker_requirements.requirements_file()
-    hashes = str(ours.with_name(worker_requirements.HASHES_NAME))
+    monkeypatch.setattr(install.platform, "system", lambda: "Linux")
+    ours = environment.requirements_file()
+    hashes = str(ours.with_name(environment.HASHES_NAME))
     python = replace(PYTHON, has_venv=has_venv)
-    found = commands.all_commands(SetupRequest("/w", "/p", str(ours), torch), python)
+    found = install.all_commands(SetupRequest("/w", "/p", str(ours), torch), python)
     first, second = (c for c in found if "install" in c)
     assert first[first.index("--require-hashes") :][:3] == ("--require-hashes", "-r", hashes)
     assert not [word for word in first if "index" in word]
@@ -127,12 +126,12 @@ def test_files_are_installed_by_their_hashes(
     assert ("--no-deps" in second) == (torch == "cpu")
     assert all(("--target" in c) != has_venv for c in (first, second))
     wheels = SetupRequest("/w", "/p", str(ours), torch, "/wheels")
-    assert not [c for c in commands.all_commands(wheels, python) if "--require-hashes" in c]
+    assert not [c for c in install.all_commands(wheels, python) if "--require-hashes" in c]
 
 
 def test_the_list_with_hashes_is_that_of_our_requirements() -> None:
-    ours = worker_requirements.requirements_file()
-    text = ours.with_name(worker_requirements.HASHES_NAME).read_text()
+    ours = environment.requirements_file()
+    text = ours.with_name(environment.HASHES_NAME).read_text()
     first = re.search(r"^[\w-]+==", text, re.MULTILINE)
     assert first is not None
     entries = re.split(r"\n(?=\w)", text[first.start() :].strip())
@@ -150,7 +149,7 @@ def test_the_list_with_hashes_is_that_of_our_requirements() -> None:
 def test_a_python_without_venv_installs_into_a_folder() -> None:
     """Blender's own on Windows."""
     plain = FoundPython("/p", (3, 11, 2), has_venv=False)
-    (pip,) = commands.all_commands(SetupRequest("/w", "/p", "/r.txt", "index"), plain)
+    (pip,) = install.all_commands(SetupRequest("/w", "/p", "/r.txt", "index"), plain)
     assert pip[:4] == ("/p", "-I", "-m", "pip")
     assert pip[-2:] == ("--target", "/w/env")
 
@@ -158,7 +157,7 @@ def test_a_python_without_venv_installs_into_a_folder() -> None:
 def test_a_python_with_nothing_is_refused() -> None:
     bare = FoundPython("/p", (3, 11, 2), has_venv=False, pip=())
     with pytest.raises(UsageError, match=r"neither venv nor pip.*python3\.11-venv"):
-        commands.all_commands(SetupRequest("/w", "/p", "/r.txt"), bare)
+        install.all_commands(SetupRequest("/w", "/p", "/r.txt"), bare)
 
 
 @pytest.mark.parametrize(
@@ -172,7 +171,7 @@ def test_versions(versions: str, version: str, answer: bool) -> None:
 
 
 def test_our_list_is_read() -> None:
-    found = read_requirements(worker_requirements.requirements_file())
+    found = read_requirements(environment.requirements_file())
     assert {"numpy", "torch", "xatlas"} <= {r.name for r in found}
     assert all(r.versions for r in found)
 

@@ -23,17 +23,13 @@ from gaussian_wrapping_addon.core.errors import (
     UsageError,
 )
 from gaussian_wrapping_addon.core.jobs import client as job_client
+from gaussian_wrapping_addon.core.jobs import install
 from gaussian_wrapping_addon.core.jobs.commands.doctor import find_and_diagnose
+from gaussian_wrapping_addon.core.jobs.install import SetupRequest, SetupTask
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.processes.helper_process import child_command
-from gaussian_wrapping_addon.core.processes.process_identity import process_alive
-from gaussian_wrapping_addon.core.processes.worker_environment import (
-    WorkerEnvironment,
-    interpreter_of,
-)
-from gaussian_wrapping_addon.core.setup import commands, install, pythons
-from gaussian_wrapping_addon.core.setup.commands import SetupRequest
-from gaussian_wrapping_addon.core.setup.install import SetupTask
+from gaussian_wrapping_addon.core.worker.environment import WorkerEnvironment, interpreter_of
+from gaussian_wrapping_addon.core.worker.helper_process import child_command
+from gaussian_wrapping_addon.core.worker.spawn import process_alive
 from tests.core.setup.wheels import write_wheel
 
 DEADLINE_S = 100.0
@@ -179,7 +175,7 @@ def test_no_command_outlives_the_one_who_asked(tmp_path: Path, end: str) -> None
     asker_code = (
         f"import sys; sys.path.insert(0, {str(Path(install.__file__).parents[3])!r})\n"
         "import io, pathlib, threading\n"
-        "from gaussian_wrapping_addon.core.setup import commands, install\n"
+        "from gaussian_wrapping_addon.core.jobs import install as commands, install\n"
         f"root = pathlib.Path({str(tmp_path)!r}); (root / 'tmp').mkdir()\n"
         "task = install.SetupTask(commands.SetupRequest(str(root), '', ''))\n"
         "threading.Thread(target=lambda: sys.stdin.read() or task.cancel(), daemon=True).start()\n"
@@ -288,8 +284,8 @@ def test_without_a_venv_only_the_child_sees_packages(quick: SetupRequest) -> Non
 def test_the_pip_that_ensurepip_carries_will_do(
     request_: SetupRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = pythons.probe(sys.executable)
-    bundled = ("-c", pythons._BUNDLED_PIP)
+    real = install.probe(sys.executable)
+    bundled = ("-c", install._BUNDLED_PIP)
     bare = replace(real, has_venv=False, pip=bundled)
     monkeypatch.setattr(install, "probe", lambda _path: bare)
     assert finish(request_).state == "DONE"
@@ -374,7 +370,7 @@ def test_the_build_for_cuda_is_offered_where_there_is_a_driver(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(commands, "cuda_present", lambda: driver)
+    monkeypatch.setattr(install, "cuda_present", lambda: driver)
     words = ["set-up-worker", "--dry-run", "--python", sys.executable, "--torch", torch]
     assert batch.main([*words, "--to", str(tmp_path / "env")]) == 0
     told = capfd.readouterr()

@@ -10,10 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap, estimate_depth_maps
 from tests.core.training.small_scene import PhotosInMemory
 from tests.synthetic import (

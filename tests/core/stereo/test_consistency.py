@@ -6,14 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.stereo.consistency import (
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.stereo.matching import (
     GAIN,
     LEAST_TOLERANCE_LEVELS,
     NO_BRIGHTNESS,
     RATE,
+    MatchingLevel,
 )
-from gaussian_wrapping_addon.core.stereo.matching_level import MatchingLevel
 from tests.core.stereo.textured_plane import cameras, level_of, plane_photos, true_planes
 
 

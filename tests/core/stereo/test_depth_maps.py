@@ -9,9 +9,9 @@ import functools
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.stereo import depth_maps as depth_maps_module
 from gaussian_wrapping_addon.core.stereo.depth_maps import (
     MOST_PIXELS,
@@ -21,8 +21,7 @@ from gaussian_wrapping_addon.core.stereo.depth_maps import (
     estimate_depth_maps,
     matching_divisor,
 )
-from gaussian_wrapping_addon.core.stereo.matching_cost import WORST_COST
-from gaussian_wrapping_addon.core.stereo.source_views import in_image
+from gaussian_wrapping_addon.core.stereo.matching import WORST_COST, in_image
 from tests.core.stereo.ball_scene import (
     SIDE_PX,
     ball_maps,

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap
-from gaussian_wrapping_addon.core.stereo.depth_priors import (
+from gaussian_wrapping_addon.core.stereo.depth_maps import (
     FILE_NAME,
     PLANE_SHARE,
     PLANE_STEP_PX,
+    DepthMap,
     load_priors,
     planar_pixels,
     priors_of,

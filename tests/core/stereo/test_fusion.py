@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.stereo.fusion import fuse, lifted, merged
+from gaussian_wrapping_addon.core.stereo.depth_maps import fuse, lifted, merged
 from tests.core.stereo.ball_scene import (
     arc_cameras,
     ball_maps,

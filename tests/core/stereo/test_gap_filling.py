@@ -8,10 +8,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap
-from gaussian_wrapping_addon.core.stereo.fusion import fuse
-from gaussian_wrapping_addon.core.stereo.gap_filling import count_views, fill_gaps, seen_through
-from gaussian_wrapping_addon.core.stereo.open_cells import shown_open
+from gaussian_wrapping_addon.core.stereo.depth_maps import (
+    DepthMap,
+    count_views,
+    fill_gaps,
+    fuse,
+    seen_through,
+    shown_open,
+)
 from tests.core.stereo.ball_scene import arc_cameras, exact_map, surface_distance
 
 EXACT = [exact_map(camera) for camera in arc_cameras()[4:8]]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.stereo.matching_cost import (
+from gaussian_wrapping_addon.core.stereo.matching import (
     AT_X,
     AT_Y,
     SAMPLES,

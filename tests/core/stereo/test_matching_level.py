@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.stereo.matching_level import MatchingLevel, grey_levels
+from gaussian_wrapping_addon.core.stereo.matching import MatchingLevel, grey_levels
 from tests.core.stereo.textured_plane import (
     HEIGHT,
     WIDTH,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.stereo.planar_prior import (
+from gaussian_wrapping_addon.core.stereo.depth_maps import (
     plane_normals,
     points_in_view,
     triangle_planes,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.stereo.plane_kernels import (
+from gaussian_wrapping_addon.core.stereo.matching import (
     MAX_BACK_ERROR_PX,
     back_error_px,
     normal_of,

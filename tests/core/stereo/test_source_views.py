@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.stereo.source_views import MOST_SOURCES, in_image, source_views
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.stereo.matching import MOST_SOURCES, in_image, source_views
 from tests.synthetic import look_at
 
 POINTS = np.random.default_rng(0).uniform(-0.4, 0.4, (300, 3))

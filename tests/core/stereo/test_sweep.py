@@ -6,9 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.stereo.matching_cost import WORST_COST
-from gaussian_wrapping_addon.core.stereo.matching_level import MatchingLevel
-from gaussian_wrapping_addon.core.stereo.sweep import GOOD_COST
+from gaussian_wrapping_addon.core.stereo.matching import GOOD_COST, WORST_COST, MatchingLevel
 from tests.core.stereo.textured_plane import (
     cameras,
     grey_photo,

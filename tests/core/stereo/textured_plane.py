@@ -7,8 +7,8 @@ import functools
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.stereo.matching_level import MatchingLevel
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.stereo.matching import MatchingLevel
 from tests.synthetic import look_at
 
 WIDTH, HEIGHT = 64, 48

@@ -24,20 +24,20 @@ from benchmarks.known_texture import (
     true_albedo,
 )
 from gaussian_wrapping_addon.core import limits
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import EXIT_RESOURCES, ResourceError
-from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import TexturedRenderer
+from gaussian_wrapping_addon.core.evaluation.mesh_rendering import TexturedRenderer
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.cost.texture_memory import (
+from gaussian_wrapping_addon.core.texture.files import write_textured
+from gaussian_wrapping_addon.core.texture.levels_of_detail import levels_of_detail
+from gaussian_wrapping_addon.core.texture.size import (
     fit_into_memory,
+    plan_textures,
     texture_memory_bytes,
 )
-from gaussian_wrapping_addon.core.texture.cost.texture_size import plan_textures
-from gaussian_wrapping_addon.core.texture.detail.levels_of_detail import levels_of_detail
-from gaussian_wrapping_addon.core.texture.files.textured_files import write_textured
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
 from tests.proofs import first_then_proofs
@@ -119,7 +119,7 @@ def test_several_atlases_bring_the_texture_back_as_one_does(
 
 @pytest.mark.parametrize("atlases", first_then_proofs([2, 3]))
 def test_what_two_photos_show_is_baked(atlases: int, baked: Bakes, photos: RenderedPhotos) -> None:
-    from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
+    from gaussian_wrapping_addon.core.texture.atlas import raster_atlas
 
     textured = baked[atlases]
     for number, maps in enumerate(textured.atlases):

@@ -35,7 +35,7 @@ from gaussian_wrapping_addon.core.jobs.commands.export_files import ExportReques
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.names import file_stem
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.atlas import raster_atlas
 from gaussian_wrapping_addon.core.texture.unwrap import charts
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import Unwrap, unwrap
 from tests.core.jobs.commands.test_export_files import write_result
@@ -188,7 +188,7 @@ def test_48_memory(tmp_path: Path) -> None:
     script = (
         "import resource, sys\n"
         "from pathlib import Path\n"
-        "from gaussian_wrapping_addon.core.jobs.commands.worker_call import run_command\n"
+        "from gaussian_wrapping_addon.core.jobs.commands.run_in_worker import run_command\n"
         "from tests.core.texture.test_texture_mesh import run\n"
         "from tests.core.texture.texture_scenes import *\n"
         "photos = photograph(ring(2, 3.0, 0.0), [(sphere_hit, waves)])\n"

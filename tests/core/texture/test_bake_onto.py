@@ -10,13 +10,13 @@ import pytest
 import trimesh
 
 from gaussian_wrapping_addon.core.errors import MeshingError
-from gaussian_wrapping_addon.core.mesh.exchange.mesh_reader import FileMesh
-from gaussian_wrapping_addon.core.mesh.simplification.decimation import decimate
+from gaussian_wrapping_addon.core.mesh.exchange import FileMesh
+from gaussian_wrapping_addon.core.mesh.simplification import decimate
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.atlas import raster_atlas
 from gaussian_wrapping_addon.core.texture.bake_onto import BakeChoices, bake_onto, welded
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 from tests.core.texture.texture_scenes import (

@@ -18,10 +18,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
-from gaussian_wrapping_addon.core.texture.files.glb import glb_bytes
-from gaussian_wrapping_addon.core.texture.files.textured_files import write_textured
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.texture.files import glb_bytes, write_textured
 from tests.core.texture.detail_scenes import bumpy_ball, flat_uvs
 from tests.core.texture.files.test_textured_files import UTM, cube
 

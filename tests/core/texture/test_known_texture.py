@@ -27,8 +27,8 @@ from benchmarks.known_texture import (
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
-from gaussian_wrapping_addon.core.texture.bake import bake
+from gaussian_wrapping_addon.core.texture import bake
+from gaussian_wrapping_addon.core.texture.atlas import raster_atlas
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 
 SIZE_PX = 512

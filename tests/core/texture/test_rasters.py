@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.imaging.trilinear import pyramid
+from gaussian_wrapping_addon.core.filters import pyramid
 from gaussian_wrapping_addon.core.mesh.depth_buffer import NEAR_DEPTH, depth_buffer
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas, texel_corners
-from gaussian_wrapping_addon.core.texture.bake.visibility import MAX_CLEARANCE_PX, photo_visibility
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.texture.atlas import raster_atlas, texel_corners
+from gaussian_wrapping_addon.core.texture.photo_samples import MAX_CLEARANCE_PX, photo_visibility
 from tests.core.texture.texture_scenes import box, joined, look_at, sphere
 
 SQUARE = np.array(

@@ -11,22 +11,16 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError, UsageError
-from gaussian_wrapping_addon.core.mesh.face_graph import FaceGraph, face_graph
+from gaussian_wrapping_addon.core.mesh.components import FaceGraph, face_graph
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
-from gaussian_wrapping_addon.core.texture.bake.bake import BakedColors
-from gaussian_wrapping_addon.core.texture.bake.coverage_statistics import CoverageStatistics
-from gaussian_wrapping_addon.core.texture.bake.fill import surface_positions
-from gaussian_wrapping_addon.core.texture.bake.photo_gains import solve_gains
-from gaussian_wrapping_addon.core.texture.bake.photo_samples import SurfaceArrays, SurfacePoints
-from gaussian_wrapping_addon.core.texture.cost.texture_size import (
-    gutter_for,
-    plan_textures,
-    required_side,
-)
+from gaussian_wrapping_addon.core.texture.atlas import raster_atlas
+from gaussian_wrapping_addon.core.texture.bake import BakedColors, CoverageStatistics, solve_gains
+from gaussian_wrapping_addon.core.texture.fill import surface_positions
+from gaussian_wrapping_addon.core.texture.photo_samples import SurfaceArrays, SurfacePoints
+from gaussian_wrapping_addon.core.texture.size import gutter_for, plan_textures, required_side
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import Unwrap
 from tests.core.texture.texture_scenes import (

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from tests.poses import look_at_pose
 
 Pattern = Callable[[np.ndarray], np.ndarray]

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.training.losses.multi_view import _ViewPair
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.training.multi_view import _ViewPair
 from tests.core.render.scenes import look_at
 
 NORMAL = np.array([0.0, 0.0, 1.0])

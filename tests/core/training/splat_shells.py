@@ -8,9 +8,8 @@ import math
 import numpy as np
 import torch
 
-from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import fibonacci_directions
-from gaussian_wrapping_addon.core.gaussians.initialisation import SH_C0
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.model import SH_C0, OrientedGaussians
+from gaussian_wrapping_addon.core.loading.other_inputs import fibonacci_directions
 
 AXES = (1.0, 0.8, 0.6)
 """Half axes of the ellipsoid."""

@@ -6,15 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.core.gaussians.initialisation import gaussians_at
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians, gaussians_at
+from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
-from gaussian_wrapping_addon.core.training.backdrop import with_backdrop
-from gaussian_wrapping_addon.core.training.initialisation.far_shell import LEAST_REACH
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.training.start import LEAST_REACH
+from gaussian_wrapping_addon.core.training.trainer import with_backdrop
 from tests.synthetic import look_at
 
 WIDTH, HEIGHT = 72, 48

@@ -15,16 +15,15 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import trainer
-from gaussian_wrapping_addon.core.training.cancellation import CancellablePhotos, cancellable
-from gaussian_wrapping_addon.core.training.density.contribution import contributions
-from gaussian_wrapping_addon.core.training.density.wrapping import (
+from gaussian_wrapping_addon.core.training.adam import Adam
+from gaussian_wrapping_addon.core.training.density import contributions
+from gaussian_wrapping_addon.core.training.harmonics_selection import TrialView, select_harmonics
+from gaussian_wrapping_addon.core.training.state import CancellablePhotos, cancellable
+from gaussian_wrapping_addon.core.training.wrapping import (
     WrapView,
     normal_errors,
     start_orientation,
 )
-from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
-from gaussian_wrapping_addon.core.training.selection.harmonics_selection import select_harmonics
-from gaussian_wrapping_addon.core.training.selection.harmonics_trial import TrialView
 from tests.core.training.small_scene import sphere_gaussians, sphere_scene
 
 VIEWS = 5

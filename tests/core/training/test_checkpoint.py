@@ -15,13 +15,13 @@ import torch
 from gaussian_wrapping_addon.core.errors import ParseError, UsageError
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.checkpoint import (
+from gaussian_wrapping_addon.core.training.state import (
+    TrainingState,
     fingerprint,
     load_checkpoint,
     remove_checkpoints,
     save_checkpoint,
 )
-from gaussian_wrapping_addon.core.training.state import TrainingState
 from tests.core.render.scenes import random_gaussians
 from tests.core.training.small_scene import sphere_scene
 

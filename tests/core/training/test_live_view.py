@@ -17,13 +17,12 @@ from gaussian_wrapping_addon.core.gaussians.preview_points import (
     VISIBLE_OPACITY,
     parse_points,
 )
-from gaussian_wrapping_addon.core.imaging.view_metrics import psnr
+from gaussian_wrapping_addon.core.image_metrics import psnr
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.render.reference.reference import render_reference
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.reference import render_reference
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import live_view
-from gaussian_wrapping_addon.core.training.cancellation import cancellable
 from gaussian_wrapping_addon.core.training.live_view import (
     GAP_PX,
     PIXELS_FILE,
@@ -31,6 +30,7 @@ from gaussian_wrapping_addon.core.training.live_view import (
     LiveView,
     measure_held_out,
 )
+from gaussian_wrapping_addon.core.training.state import cancellable
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
 
 SETTINGS = TrainingSettings(preview_every_s=10.0)

@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.imaging import ssim_kernels
-from gaussian_wrapping_addon.core.training.losses import loss_kernels
-from gaussian_wrapping_addon.core.training.losses.losses import color_loss, normal_losses
-from gaussian_wrapping_addon.core.training.optimizer import adam_kernels
-from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
+from gaussian_wrapping_addon.core import image_metrics
+from gaussian_wrapping_addon.core.training import adam, losses
+from gaussian_wrapping_addon.core.training.adam import Adam
+from gaussian_wrapping_addon.core.training.losses import color_loss, normal_losses
 from tests.core.render.scenes import look_at, random_gaussians
 from tests.core.render.test_vectorised import PACKED, SINGLE
 from tests.core.training.optimizer.test_adam import all_rates, random_gradients
@@ -52,7 +51,7 @@ def _compiled() -> None:
 
 
 def test_windows_are_filtered_and_compared_in_packs() -> None:
-    listing = single_precision_listing(ssim_kernels.compare_rows)
+    listing = single_precision_listing(image_metrics.compare_rows)
     packed, single = len(PACKED.findall(listing)), len(SINGLE.findall(listing))
     # Six products a window along, twelve for two windows across in each of six turns of the ring.
     assert packed >= 2 * 6 + 2 * 6 * 12 - 14
@@ -61,14 +60,14 @@ def test_windows_are_filtered_and_compared_in_packs() -> None:
 
 
 def test_normals_are_compared_in_packs() -> None:
-    listing = single_precision_listing(loss_kernels.agreement_rows)
+    listing = single_precision_listing(losses.agreement_rows)
     assert len(PACKED.findall(listing)) >= 40
     assert re.search(r"\bvr?sqrt(14)?ps\b.*%[yz]mm", listing)
     assert "gather" not in listing
 
 
 def test_rows_are_stepped_in_packs() -> None:
-    listing = single_precision_listing(adam_kernels.adam_rows)
+    listing = single_precision_listing(adam.adam_rows)
     # One run of the small tensors, one of the harmonics; as many pieces as registers are wide.
     for operation in ("sqrt", "div"):
         assert len(re.findall(rf"\bv{operation}ps\b.*%[yz]mm", listing)) >= 2

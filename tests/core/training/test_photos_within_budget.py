@@ -14,14 +14,14 @@ import pytest
 import torch
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.photos import decoded_file
-from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.processes.peak_memory import own_peak_bytes
+from gaussian_wrapping_addon.core.photos import store as decoded_file
+from gaussian_wrapping_addon.core.photos.store import PhotoStore
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training.trainer import train
+from gaussian_wrapping_addon.core.worker.helper_process import own_peak_bytes
 from tests.core.training.small_scene import ring_cameras, sphere_scene
 
 SETTINGS = TrainingSettings(

@@ -10,21 +10,17 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.stereo.depth_priors import DepthPrior
-from gaussian_wrapping_addon.core.training.devices.cpu_backend import CpuBackend
+from gaussian_wrapping_addon.core.stereo.depth_maps import DepthPrior
+from gaussian_wrapping_addon.core.training.cpu_backend import CpuBackend
 from gaussian_wrapping_addon.core.training.iteration import Stepper, is_oriented
+from gaussian_wrapping_addon.core.training.model_selection import Decision, ModelSelection
 from gaussian_wrapping_addon.core.training.rounds import Rounds
 from gaussian_wrapping_addon.core.training.schedule import Schedule
-from gaussian_wrapping_addon.core.training.selection.model_selection import (
-    Decision,
-    ModelSelection,
-)
 from gaussian_wrapping_addon.core.training.state import TrainingState
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gaussian_wrapping_addon.core.limits import SCENE_RADIUS
 from gaussian_wrapping_addon.core.settings import PRESETS, TrainingSettings, preset
-from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
 from gaussian_wrapping_addon.core.training.schedule import (
     FIRST_BUDGET,
     POSITION_RATE,

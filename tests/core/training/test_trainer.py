@@ -13,16 +13,15 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, UsageError, WrapError
+from gaussian_wrapping_addon.core.gaussians.files import write_splat_ply
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.gaussians.splat_ply import write_splat_ply
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training import iteration, live_view, rounds, trainer
-from gaussian_wrapping_addon.core.training.devices import cpu_backend
-from gaussian_wrapping_addon.core.training.result import TrainingResult
+from gaussian_wrapping_addon.core.training import cpu_backend, iteration, live_view, rounds, trainer
+from gaussian_wrapping_addon.core.training.state import TrainingResult
 from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.quaternion import quaternion_from_rotation
+from gaussian_wrapping_addon.core.scene.camera import quaternion_from_rotation
 from tests.core.dataset.model_writers import Model, ring_model, write_binary, write_text
 from tests.hostile.case import Build, Case, Group, Variant, Way
 from tests.hostile.inputs import (

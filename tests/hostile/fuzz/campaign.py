@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from gaussian_wrapping_addon.core.errors import WrapError
-from gaussian_wrapping_addon.core.processes.peak_memory import own_peak_bytes
+from gaussian_wrapping_addon.core.worker.helper_process import own_peak_bytes
 from tests.hostile.fuzz.targets import Target
 from tests.hostile.run_case import (
     MEMORY_LIMIT_BYTES,

@@ -14,22 +14,21 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.loading.check import check_input
-from gaussian_wrapping_addon.core.dataset.photos.photo_exif import read_lens_exif
-from gaussian_wrapping_addon.core.dataset.photos.photo_file import read_mask, read_photo
-from gaussian_wrapping_addon.core.dataset.photos.photo_header import read_photo_header
-from gaussian_wrapping_addon.core.dataset.readers.colmap_reader import read_colmap
-from gaussian_wrapping_addon.core.dataset.readers.transforms_reader import read_transforms
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.errors import WrapError
-from gaussian_wrapping_addon.core.gaussians.foreign_splat import read_foreign_splat
-from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
+from gaussian_wrapping_addon.core.gaussians.files import load_gaussians, read_foreign_splat
 from gaussian_wrapping_addon.core.jobs.commands.export_files import ExportRequest, export_files
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.rollback import finished_job, roll_back
-from gaussian_wrapping_addon.core.regions.region import read_region
-from gaussian_wrapping_addon.core.regions.region_file import read_region_file
+from gaussian_wrapping_addon.core.loading.check import check_input
+from gaussian_wrapping_addon.core.photos.exif import read_lens_exif
+from gaussian_wrapping_addon.core.photos.formats import read_photo_header
+from gaussian_wrapping_addon.core.photos.photo_file import read_mask, read_photo
+from gaussian_wrapping_addon.core.readers.colmap import read_colmap
+from gaussian_wrapping_addon.core.readers.transforms import read_transforms
+from gaussian_wrapping_addon.core.regions.files import read_region_file
+from gaussian_wrapping_addon.core.regions.scene_regions import read_region
+from gaussian_wrapping_addon.core.scene.scene import load_saved_scene
 from tests.hostile.case import Build
 from tests.hostile.cases.splats import splat
 from tests.hostile.fuzz.mutations import BYTES, JSON, TEXT, Mutation, revalued

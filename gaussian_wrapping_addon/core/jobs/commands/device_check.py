@@ -12,9 +12,9 @@ from typing import Any
 
 from ...devices import choose_device, reject_absent_gpu
 from ...errors import DeviceError, WorkerError, WrapError
-from ...processes.helper_process import child_command, emit
-from ...processes.spawn import run_to_end
-from ...processes.worker_requirements import not_started
+from ...worker.environment import not_started
+from ...worker.helper_process import child_command, emit
+from ...worker.spawn import run_to_end
 from ..client import worker_python
 
 CHECK_DEADLINE_S = 120.0

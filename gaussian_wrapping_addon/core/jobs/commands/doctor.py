@@ -16,10 +16,9 @@ from typing import Any
 
 from ...errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError, WrapError
 from ...machine import total_memory_bytes
-from ...processes.helper_process import child_command, emit
-from ...processes.spawn import run_to_end
-from ...processes.worker_extras import EXTRAS
-from ...processes.worker_requirements import not_started, read_requirements, requirements_file
+from ...worker.environment import EXTRAS, not_started, read_requirements, requirements_file
+from ...worker.helper_process import child_command, emit
+from ...worker.spawn import run_to_end
 
 MIN_PYTHON = (3, 11)
 MIN_MEMORY_BYTES = 4 * 2**30
@@ -120,7 +119,7 @@ def _build(module: Any) -> str:
 def _devices() -> list[Diagnosis]:
     """Return where jobs compute, and the GPUs; a GPU that cannot be used prevents no job."""
     try:
-        from ...devices.card import gpu_findings
+        from ...devices.choice import gpu_findings
 
         found = gpu_findings()
     except ImportError:  # reported by the findings about the packages

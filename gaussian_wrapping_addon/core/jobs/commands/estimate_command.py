@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 from ...devices import choose_device
 from ...errors import DatasetError
 from ...files import real_path
-from ...report_warning import ReportWarning
+from ...progress import ReportWarning
 from ...settings import JobSettings
 from ..store.job_file import JobFile
-from .worker_call import run_command
+from .run_in_worker import run_command
 
 if TYPE_CHECKING:
-    from ...training.cost.training_estimate import SceneFacts
+    from ...training.estimate import SceneFacts
 
 
 def main(arguments: list[str]) -> int:
@@ -28,15 +28,18 @@ def main(arguments: list[str]) -> int:
 
 
 def _estimate(job: JobFile) -> list[str | ReportWarning]:
-    from ...kernels.parallel import default_threads
-    from ...training.cost.blocks_estimate import block_estimates, estimate_training, memory_warnings
-    from ...training.cost.machine_speed import renderer_is_compiled, speeds
-    from ...training.cost.training_estimate import (
+    from ...parallel import default_threads
+    from ...training.estimate import (
         MESH_AND_TEXTURE_SHARE,
+        block_estimates,
+        estimate_training,
+        memory_warnings,
+        renderer_is_compiled,
+        speeds,
         this_machine,
     )
-    from ...training.initialisation.splat_start import wrapping_settings
-    from ..stages.splat_scene import start_splat_of
+    from ...training.splat_start import wrapping_settings
+    from ..stages.cameras import start_splat_of
 
     facts = input_facts(Path(job.source), job.settings)
     device = choose_device(job.settings.device)
@@ -88,15 +91,14 @@ def input_facts(source: Path, settings: JobSettings | None = None) -> SceneFacts
     DatasetError
         The input holds no photo that can be read.
     """
-    from ...dataset.loading.panorama_input import takes_for_panoramas
-    from ...dataset.loading.source_kind import SPLAT, VIDEO, read_poses, source_kind
-    from ...dataset.loading.splat_cameras import FAR_VIEWS, NEAR_VIEWS, PHOTO_SIDE_PX
-    from ...dataset.panoramas.panorama_views import VIEWS, view_lens
-    from ...dataset.photos.photo_file import photo_header
-    from ...dataset.photos.photo_finder import PhotoIndex, find_mask, list_photos, photo_root
-    from ...dataset.readers.splat_header import read_splat_header
-    from ...training.cost.training_estimate import SceneFacts
-    from ..stages.splat_scene import MAX_START_POINTS
+    from ...loading.other_inputs import FAR_VIEWS, NEAR_VIEWS, PHOTO_SIDE_PX, takes_for_panoramas
+    from ...loading.source_kind import SPLAT, VIDEO, read_poses, source_kind
+    from ...photos.finder import PhotoIndex, find_mask, list_photos, photo_root
+    from ...photos.photo_file import photo_header
+    from ...poses.panoramas import VIEWS, view_lens
+    from ...readers.point_files import read_splat_header
+    from ...training.estimate import SceneFacts
+    from ..stages.cameras import MAX_START_POINTS
 
     kind = source_kind(real_path(source))
     if kind.kind == SPLAT:
@@ -143,9 +145,9 @@ def input_facts(source: Path, settings: JobSettings | None = None) -> SceneFacts
 
 def _video_facts(video: Path, settings: JobSettings) -> SceneFacts:
     """Return the most photos that a video may give, and their size."""
-    from ...dataset.video.choose_frames import MOST_FRAMES
-    from ...dataset.video.probe import probed
-    from ...training.cost.training_estimate import SceneFacts
+    from ...photos.video import probed
+    from ...photos.video_frames import MOST_FRAMES
+    from ...training.estimate import SceneFacts
 
     found = probed(video)
     count = settings.video_frames

@@ -12,20 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import MeshingError, UsageError
-from ...kernels.parallel import default_threads
 from ...names import AUTOMATIC_REGIONS
-from ...progress import Progress
-from ...report_warning import ReportWarning
+from ...parallel import default_threads
+from ...progress import Progress, ReportWarning
 from ...settings import MeshingSettings, from_json
-from ..stages.cameras_stage import scene_stage_name
-from ..stages.region_field import field_views
-from ..stages.region_meshing import estimate_region_mesh, estimate_region_pivots, free_bytes
-from ..store.continue_training import no_finished_training
+from ..stages.cameras import scene_stage_name
+from ..stages.meshing import estimate_region_mesh, estimate_region_pivots, field_views, free_bytes
 from ..store.job_file import read_job
-from ..store.job_folder import JobFolder
-from ..store.rollback import finished_job
-from ..store.stage_folder import read_done
-from .worker_call import run_command
+from ..store.job_folder import JobFolder, read_done
+from ..store.rollback import finished_job, no_finished_training
+from .run_in_worker import run_command
 
 MAX_VIEWS = 24
 """Maximum number of cameras that sample the surface: more cover little more of it."""
@@ -47,16 +43,20 @@ def _newest_stage(stages: Path, name: str) -> Path:
 
 
 def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
-    from ...dataset.frames.scene_grid import snapped_length
-    from ...dataset.photos.photo_store import PhotoStore
-    from ...dataset.refined_scene import load_refined_scene
-    from ...field.depth_samples import sample_depth_maps
-    from ...field.vacancy.vacancy import VacancyField
-    from ...gaussians.gaussian_file import load_gaussians
-    from ...meshing.points.resolution import checked_request
-    from ...regions.automatic_region import automatic_region, whole_region
-    from ...regions.region import read_region
-    from ...regions.scene_region import on_scene_grid, region_in_scene
+    from ...field.samples import sample_depth_maps
+    from ...field.vacancy import VacancyField
+    from ...gaussians.files import load_gaussians
+    from ...meshing.surface_points import checked_request
+    from ...photos.store import PhotoStore
+    from ...regions.scene_regions import (
+        automatic_region,
+        on_scene_grid,
+        read_region,
+        region_in_scene,
+        whole_region,
+    )
+    from ...scene.frames import snapped_length
+    from ...scene.scene import load_refined_scene
 
     folder = JobFolder(Path(request["out"]))
     if not folder.is_job():

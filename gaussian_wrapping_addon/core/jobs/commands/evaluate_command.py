@@ -14,29 +14,24 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...errors import (
-    DatasetError,
-    ParseError,
-    UsageError,
-    unwritable_error,
-)
+from ...errors import DatasetError, ParseError, UsageError, unwritable_error
 from ...files import read_json, write_json
 from ...names import JOB_MARKER
-from ...processes.helper_process import emit
+from ...worker.helper_process import emit
 from ..store.job_folder import JobFolder
-from .worker_call import run_command
+from .run_in_worker import run_command
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ...dataset.camera import Camera
     from ...progress import Progress
+    from ...scene.camera import Camera
 
 
 def main(arguments: list[str]) -> int:
     """Evaluate ``arguments = [request as JSON]`` in this process; return the exit code."""
 
-    from ...texture.files.file_checks import write_errors
+    from ...texture.file_checks import write_errors
 
     def work() -> list[str]:
         request = json.loads(arguments[0])
@@ -64,11 +59,11 @@ def _check_output(out: Path) -> None:
 
 def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return the report and its table."""
-    from ...evaluation.layouts.mesh_input import read_mesh
-    from ...kernels.parallel import default_threads
+    from ...evaluation.layouts import read_mesh
     from ...machine import describe_machine
-    from ...processes.peak_memory import peak_memory_bytes
+    from ...parallel import default_threads
     from ...progress import Progress, ProgressEvent
+    from ...worker.helper_process import peak_memory_bytes
 
     begun_s, begun_unix_s = time.monotonic(), time.time()
     threads = given["threads"] or default_threads()
@@ -239,8 +234,7 @@ def job_cameras(folder: Path) -> list[Camera]:
     ParseError
         The file is not in the format that jobs write.
     """
-    from ...dataset.camera import Camera
-    from ...dataset.similarity import Similarity
+    from ...scene.camera import Camera, Similarity
 
     JobFolder(folder).check_entries()
     path = JobFolder(folder).result / "scene.json"

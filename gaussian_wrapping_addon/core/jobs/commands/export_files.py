@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The ``export`` command in the worker's Python: GLB, OBJ, PLY and splat files with sidecars.
 
-Needs no Blender (USD and FBX do: ``ops/export/export_objects.py``). Writes one JSON object per
+Needs no Blender (USD and FBX do: ``ops/export.py``). Writes one JSON object per
 line to stdout, in the protocol of :mod:`~.run_in_worker`.
 """
 
@@ -16,19 +16,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...array_file import read_arrays
-from ...dataset.frames.file_frame import FileFrame, file_offset
-from ...dataset.frames.placement_file import FILE_NAME, read_placement
-from ...dataset.photos.image_formats import open_image, without_warnings
-from ...dataset.similarity import Similarity
 from ...errors import DatasetError, ParseError, UsageError, WrapError
-from ...export_formats import EXPORT_FORMATS, SHADINGS, WORKER_FORMATS
-from ...files import read_json, real_path, write_bytes
-from ...names import JOB_MARKER, SPLAT_STEM, file_stems
-from ...regular_files import reject_foreign_entries
-from ...texture.files.file_checks import atlas_file
-from ..store.sidecar import write_sidecar
-from .worker_call import run_command
+from ...files import read_arrays, read_json, real_path, reject_foreign_entries, write_bytes
+from ...names import EXPORT_FORMATS, JOB_MARKER, SHADINGS, SPLAT_STEM, WORKER_FORMATS, file_stems
+from ...photos.formats import open_image, without_warnings
+from ...scene.camera import Similarity
+from ...scene.frames import FileFrame, file_offset
+from ...scene.placement import FILE_NAME, read_placement
+from ...texture.file_checks import atlas_file
+from ..store.job_file import write_sidecar
+from .run_in_worker import run_command
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -132,7 +129,7 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
     ResourceError
         The folder cannot be written.
     """
-    from ...texture.files.file_checks import write_errors
+    from ...texture.file_checks import write_errors
 
     for name, known in (("formats", WORKER_FORMATS), ("shading", SHADINGS)):
         given = getattr(request, name)
@@ -194,7 +191,7 @@ def _levels(folder: Path) -> Iterator[tuple[int, Path]]:
 
 
 def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
-    from ...texture.files.file_checks import validate_face_atlas, validate_for_export
+    from ...texture.file_checks import validate_face_atlas, validate_for_export
 
     path = folder / "mesh.npz"
     kinds = {"vertices": "f8", "faces": "i4", "corner_uvs": "f4"}
@@ -223,9 +220,8 @@ def _write_mesh(
     world_from_scene: Similarity,
     blender_from_scene: Similarity,
 ) -> Path:
-    from ...texture.files.file_checks import write_errors
-    from ...texture.files.mesh_ply import vertex_colors, write_mesh_ply
-    from ...texture.files.textured_files import write_glb, write_obj
+    from ...texture.file_checks import vertex_colors, write_errors, write_mesh_ply
+    from ...texture.files import write_glb, write_obj
 
     target_from_scene = blender_from_scene if request.placed else world_from_scene
     frame = FileFrame(format, target_from_scene)
@@ -313,9 +309,9 @@ def _splat_of(result: Path) -> Path:
 def _write_splat(
     request: ExportRequest, world_from_scene: Similarity, blender_from_scene: Similarity
 ) -> Path:
-    from ...gaussians.splat_ply import read_splat_ply, write_viewer_ply
-    from ...texture.files.file_checks import write_errors
-    from ...training.initialisation.splat_transform import transform_gaussians
+    from ...gaussians.files import read_splat_ply, write_viewer_ply
+    from ...texture.file_checks import write_errors
+    from ...training.splat_start import transform_gaussians
 
     found = read_splat_ply(_splat_of(request.result))
     target_from_scene = blender_from_scene if request.placed else world_from_scene

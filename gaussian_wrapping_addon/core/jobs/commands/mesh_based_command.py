@@ -12,13 +12,13 @@ from ...errors import DatasetError, ParseError, UsageError
 from ...files import read_json
 from ...names import JOB_MARKER
 from ...progress import Progress
-from ..stages.cameras_stage import MASKED
+from ..stages.cameras import MASKED
 from ..store.job_folder import JobFolder
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from ...dataset.scene import Scene
+    from ...scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ def evaluate_mesh_based(
     DatasetError, ParseError
         Photos or cameras cannot be used.
     """
-    from ...evaluation.views.mesh_based_rendering import MeshBasedSettings, mesh_based_rendering
-    from ...evaluation.views.photo_views import LONG_SIDE_PX, folder_scene, photo_views
-    from ...imaging.lpips import lpips_if_ready
+    from ...evaluation.mesh_based_rendering import MeshBasedSettings, mesh_based_rendering
+    from ...evaluation.photo_views import LONG_SIDE_PX, folder_scene, photo_views
+    from ...image_metrics import lpips_if_ready
 
     longest = request.max_image_px or LONG_SIDE_PX
     with tempfile.TemporaryDirectory() as temporary:
@@ -112,9 +112,7 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
     """
     import numpy as np
 
-    from ...dataset.refined_scene import with_poses
-    from ...dataset.scene import MASKS_MADE
-    from ...dataset.scene_file import SCENE_NAME, load_saved_scene
+    from ...scene.scene import MASKS_MADE, SCENE_NAME, load_saved_scene, with_poses
 
     job = JobFolder(folder)
     job.check_entries()

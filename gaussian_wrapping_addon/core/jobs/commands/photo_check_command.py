@@ -12,10 +12,10 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-from ...dataset.quality.photo_findings import photo_findings
-from ...processes.helper_process import emit
+from ...loading.photo_quality import photo_findings
 from ...progress import Progress, ProgressEvent
-from .worker_call import run_command
+from ...worker.helper_process import emit
+from .run_in_worker import run_command
 
 
 def main(arguments: list[str]) -> int:

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Start a command in the worker's Python and log what it says; the parent needs no packages.
-
-The child writes one JSON object per line to stdout: ``{"message"}`` for progress, ``{"line"}`` for
-a table, ``{"warning", "code"}``, and ``{"error", "hint"}`` at the end.
-"""
+"""A command run in the worker's Python."""
 
 from __future__ import annotations
 
@@ -11,12 +7,31 @@ import json
 import logging
 import os
 import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable
 from typing import Any
 
-from ...errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER, WorkerError
-from ...processes.helper_process import child_command
-from ...processes.spawn import kill_group, spawn
-from ...processes.worker_requirements import not_started
+from ...errors import (
+    EXIT_CANCELLED,
+    EXIT_DONE,
+    EXIT_OTHER,
+    EXIT_RESOURCES,
+    MissingExtraError,
+    WorkerError,
+    WrapError,
+    known_error,
+)
+from ...progress import ReportWarning
+from ...worker.environment import not_started, package_error
+from ...worker.helper_process import child_command, emit
+from ...worker.spawn import Caller, kill_group, spawn
+
+# -- Start a command in the worker's Python and log what it says; the parent needs no packages ----
+#
+# The child writes one JSON object per line to stdout: ``{"message"}`` for progress, ``{"line"}``
+# for a table, ``{"warning", "code"}``, and ``{"error", "hint"}`` at the end.
+
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -103,3 +118,67 @@ def _log_line(values: dict[str, Any]) -> bool:
     else:
         return False
     return True
+
+
+# -- Run a command of the command line in the worker's Python and report lines or an error --------
+#
+# Writes one JSON object per line to stdout, which :mod:`.run_in_worker` reads.
+
+
+PARENT_POLL_S = 1.0
+
+
+def run_command(
+    work: Callable[[], Iterable[str | ReportWarning]], memory_hint: str = "Close other programs.",
+    leave: Callable[[], object] | None = None,
+) -> int:  # fmt: skip
+    """Emit the lines and warnings of ``work`` as they come, or its error; return the exit code.
+
+    The process ends when its caller does.
+
+    Parameters
+    ----------
+    leave : callable, optional
+        Called in another thread before the process ends with its caller: takes away what ``work``
+        has left elsewhere.
+    """
+    watched = (Caller(),) if leave is None else (Caller(), leave)
+    threading.Thread(target=exit_with_caller, args=watched, daemon=True).start()
+    try:
+        for line in work():
+            if isinstance(line, ReportWarning):
+                emit(warning=line.text, code=line.code)
+            else:
+                emit(line=line)
+    except MissingExtraError as error:
+        emit(error=error.message, hint=error.hint, extras=error.extras)
+        return error.exit_code
+    except WrapError as error:
+        emit(error=error.message, hint=error.hint)
+        return error.exit_code
+    except MemoryError:
+        emit(error="Not enough memory.", hint=memory_hint)
+        return EXIT_RESOURCES
+    except ImportError as error:
+        missing = package_error(error)
+        if missing is None:
+            raise
+        emit(error=missing.message, hint=missing.hint)
+        return missing.exit_code
+    except OSError as error:
+        known = known_error(error) or package_error(error)
+        if known is not None:
+            emit(error=known.message, hint=known.hint)
+            return known.exit_code
+        emit(error=f"{error}.", hint="Check the path and its permissions.")
+        return EXIT_OTHER
+    return EXIT_DONE
+
+
+def exit_with_caller(caller: Caller, leave: Callable[[], object] | None = None) -> None:
+    """End this process when its caller has ended: nothing reads the output any more."""
+    while not caller.ended():
+        time.sleep(PARENT_POLL_S)
+    if leave is not None:
+        leave()
+    os._exit(EXIT_CANCELLED)

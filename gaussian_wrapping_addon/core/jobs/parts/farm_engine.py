@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from ... import limits
-from ...cluster.dask_tasks import DaskTasks, request_of
-from ...kernels.parallel import default_threads
-from ...processes.helper_process import child_command
+from ...farm.dask import DaskTasks, request_of
+from ...parallel import default_threads
 from ...settings import JobSettings
-from ...settings.farm import LOCAL
-from .engine import Outcome
+from ...settings.job import LOCAL
+from ...worker.helper_process import child_command
 from .graph import Part
+from .runner import Outcome
 
 MODULE = "jobs.part_process"
 
@@ -32,7 +32,7 @@ class FarmEngine:
     Raises
     ------
     MissingExtraError, UsageError, WorkerError
-        As :class:`~...cluster.dask_tasks.DaskTasks`.
+        As :class:`~.dask.DaskTasks`.
     """
 
     trusts_states = True

@@ -1,18 +1,214 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The parts of a job, what each needs, and ``parts.json`` (docs/file-formats.md, Parts)."""
+"""A job as parts: planned, with a state each."""
 
 from __future__ import annotations
 
+import hashlib
+import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+import time
+import uuid
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ... import limits
-from ...errors import ParseError, UsageError
-from ...files import read_json, write_json
+from ...errors import (
+    EXIT_CANCELLED,
+    EXIT_DONE,
+    EXIT_RESOURCES,
+    DeviceError,
+    ParseError,
+    UsageError,
+    WorkerError,
+    WrapError,
+)
+from ...farm import child
+from ...files import overwrite_json, read_json, resolve_inside, write_json
+from ...names import FACES, GATHER, POINTS, region_names
+from ...settings import key_values
+from ...worker.spawn import host_and_pid_namespace, process_start_ticks
+from ..store.job_file import JobFile, read_job
+from ..store.job_folder import STAGE_VERSIONS, JobFolder, stage_key
+
+# -- Exit codes of ``run-part``: what an engine may do with a part that is not done ---------------
+
+
+DONE = EXIT_DONE
+NEVER = 1
+"""Bad data: it fails wherever it is run."""
+MAY_WORK_ELSEWHERE = 2
+"""Memory, disk, a device, a killed helper: elsewhere or later it may work."""
+OTHER_CODE = child.OTHER_CODE
+"""This computer has another version of the program than the one that planned."""
+CANCELLED = EXIT_CANCELLED
+
+
+def part_exit_code(error: WrapError) -> int:
+    """Return the exit code of a part that ended with an error."""
+    if error.exit_code == EXIT_CANCELLED:
+        return CANCELLED
+    elsewhere = error.exit_code == EXIT_RESOURCES or isinstance(error, WorkerError | DeviceError)
+    return MAY_WORK_ELSEWHERE if elsewhere else NEVER
+
+
+# -- The version of the code that runs parts: two computers must have the same --------------------
+
+
+_CORE = Path(__file__).resolve().parents[2]
+_DIGITS = 12
+
+
+@cache
+def code_version() -> str:
+    """Return a hash of all files of ``core``, whatever the line ends of their checkout."""
+    hashed = hashlib.sha256()
+    for path in sorted(_CORE.rglob("*.py"), key=lambda path: path.relative_to(_CORE).as_posix()):
+        hashed.update(path.relative_to(_CORE).as_posix().encode())
+        hashed.update(path.read_bytes().replace(b"\r\n", b"\n"))
+    return hashed.hexdigest()[:_DIGITS]
+
+
+# -- The state of each part of a job: ``parts/NAME.json``, written by the process that runs it ----
+
+
+STATES_FOLDER = "parts"
+STATES = ("RUNNING", "DONE", "FAILED")
+
+
+@dataclass(frozen=True)
+class PartState:
+    """What is known of a part that was begun."""
+
+    state: str
+    plan: str
+    """Hash of the plan that it was run for."""
+    place: str = ""
+    """Where the pid is one: host, boot and namespace."""
+    pid: int = 0
+    pid_started: int = 0
+    token: str = ""
+    """Differs between two runs of the same part."""
+    begun_s: float = 0.0
+    """Unix time, by the clock of that computer."""
+    heartbeat_s: float = 0.0
+    """Unix time of the last sign of life, by the same clock."""
+    fraction: float = 0.0
+    message: str = ""
+    attempts: int = 1
+    error: str = ""
+    hint: str = ""
+    exit_code: int | None = None
+    seconds: float = 0.0
+    """How long it took, in this attempt."""
+    peak_memory_bytes: int = 0
+    figures: dict[str, float] = field(default_factory=dict)
+    """Live figures, such as ``iteration`` and ``psnr`` of a training."""
+    outputs: tuple[str, ...] = ()
+    """Files and folders, relative to the job folder; of a stage first its own folder."""
+
+    @property
+    def host(self) -> str:
+        """The computer, for people."""
+        return self.place.split(" ")[0]
+
+    def done_in(self, root: Path, plan: str) -> bool:
+        """Return whether the part is done for a plan, and what it has made is still there."""
+        return (
+            self.state == "DONE"
+            and self.plan == plan
+            and all(
+                (path := resolve_inside(root, output)) is not None and path.exists()
+                for output in self.outputs
+            )
+        )
+
+
+def states_folder(root: Path) -> Path:
+    """Return the folder of the states in a job folder."""
+    return root / STATES_FOLDER
+
+
+def state_path(root: Path, name: str) -> Path:
+    """Return the state file of a part."""
+    return root / STATES_FOLDER / f"{name}.json"
+
+
+def write_state(root: Path, name: str, state: PartState) -> None:
+    """Write the state of a part, atomically."""
+    states_folder(root).mkdir(exist_ok=True)
+    write_json(state_path(root, name), _values_of(state))
+
+
+def overwrite_state(root: Path, name: str, state: PartState) -> None:
+    """Write the state of a part over the earlier one, where there is no room for another file."""
+    overwrite_json(state_path(root, name), _values_of(state))
+
+
+def _values_of(state: PartState) -> dict[str, Any]:
+    return {**asdict(state), "outputs": list(state.outputs)}
+
+
+def read_state(root: Path, name: str) -> PartState | None:
+    """Return the state of a part; ``None`` where there is none, or it is damaged."""
+    try:
+        values = read_json(state_path(root, name), most_bytes=limits.MAX_PART_STATE_BYTES)
+        return _state_of(values)
+    except (OSError, ParseError, TypeError, ValueError, KeyError, OverflowError):
+        return None
+
+
+_TEXTS = ("state", "plan", "place", "token", "message", "error", "hint")
+_NUMBERS = ("begun_s", "heartbeat_s", "fraction", "seconds")
+_WHOLE = ("pid", "pid_started", "attempts", "peak_memory_bytes")
+
+
+def _state_of(values: Any) -> PartState:
+    known: dict[str, Any] = {f.name: values[f.name] for f in fields(PartState)}
+    code, outputs = known["exit_code"], known["outputs"]
+    good = (
+        all(isinstance(known[name], str) for name in _TEXTS)
+        and all(_is_number(known[name], int | float) for name in _NUMBERS)
+        and all(_is_number(known[name], int) for name in _WHOLE)
+        and (code is None or _is_number(code, int))
+        and isinstance(outputs, list)
+        and all(isinstance(output, str) for output in outputs)
+        and known["state"] in STATES
+        and isinstance(known["figures"], dict)
+        and all(_is_number(figure, int | float) for figure in known["figures"].values())
+    )
+    if not good:
+        raise TypeError("a value has the wrong type")
+    numbers = {name: float(known[name]) for name in _NUMBERS}
+    return PartState(**{**known, **numbers, "outputs": tuple(outputs)})
+
+
+def _is_number(value: Any, kinds: Any) -> bool:
+    return isinstance(value, kinds) and not isinstance(value, bool)
+
+
+def new_state(plan: str, attempt: int) -> PartState:
+    """Return the state of a part that begins in this process."""
+    pid, now_s = os.getpid(), time.time()
+    return PartState(
+        "RUNNING", plan, host_and_pid_namespace(), pid, process_start_ticks(pid),
+        uuid.uuid4().hex, now_s, now_s, attempts=attempt,
+    )  # fmt: skip
+
+
+def keep_states(root: Path, names: Collection[str]) -> None:
+    """Remove the states of all parts of a job but some."""
+    folder = states_folder(root)
+    for path in folder.glob("*.json") if folder.is_dir() else ():
+        if path.stem not in names:
+            path.unlink(missing_ok=True)
+
+
+# -- The parts of a job, what each needs, and ``parts.json`` (docs/file-formats.md, Parts) --------
+
 
 VERSION = 1
 PARTS_NAME = "parts.json"
@@ -215,3 +411,171 @@ def _check_order(path: Path, parts: Sequence[Part]) -> None:
     except CycleError as error:
         circle = ", ".join(sorted(set(error.args[1]))[:3])
         raise ParseError(path, "parts", f"{circle} wait for each other.", _AGAIN) from None
+
+
+# -- Plan the parts of a job: those of its stages, and those of tiles once they are known ---------
+
+
+# Shares of a job's time: measured on the demo scene, 2 cores.
+STAGE_SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
+MASKS_SHARE = 0.1
+"""Of the time of a training that masks are made for."""
+BAKE_BEGINS = 0.02
+"""Share of a bake's time before the bake itself."""
+_IN_BLOCKS = {"coarse": 0.12, "block": 0.68, "train": 0.2}
+"""Shares of a training in blocks: the coarse one, all blocks, joining."""
+_TILED = {"plan": 0.2, POINTS: 0.3, GATHER: 0.03, FACES: 0.37, "mesh": 0.1}
+"""Shares of the mesh stage of a region in tiles."""
+
+
+@dataclass(frozen=True)
+class PlannedTiles:
+    """What is known of a region in tiles."""
+
+    count: int
+    memory_bytes: int | None = None
+    """Of a process that makes one of its parts."""
+    seconds: float | None = None
+    """Of the whole mesh."""
+
+
+def plan_hash(job: JobFile) -> str:
+    """Return the hash of what a job is to do, wherever it runs."""
+    return stage_key(
+        "parts", STAGE_VERSIONS, {**job.to_json(), "settings": key_values(job.settings)}
+    )
+
+
+def plan_parts(folder: Path, job: JobFile, tiles: Mapping[str, PlannedTiles]) -> PartsGraph:
+    """Return the parts of a job, in an order in which they can be run one after another.
+
+    Parameters
+    ----------
+    folder : Path
+        The job folder.
+    tiles : mapping
+        By region, those that are known to be meshed in tiles.
+    """
+    parts = _begin(job)
+    last = parts[-1].name
+    if job.command == "bake":
+        parts.append(Part("bake", "bake", (last,), ("baked/*",), 1.0 - BAKE_BEGINS))
+    else:
+        names = region_names(job.settings.regions, job.region_bodies)
+        share = 1.0 / len(names)
+        for name in names:
+            parts += _of_region(name, last, share, tiles.get(name))
+        textures = tuple(f"texture-{name}" for name in names)
+        parts.append(
+            Part("export", "export", textures, ("result/report.json",), STAGE_SHARES["export"])
+        )
+    return PartsGraph(code_version(), plan_hash(job), _relative(job.source, folder), tuple(parts))
+
+
+def fixed_tiles(job: JobFile) -> dict[str, PlannedTiles]:
+    """Return the regions whose number of tiles is a setting: known before anything is run."""
+    names = region_names(job.settings.regions, job.region_bodies)
+    known = {}
+    for request, name in zip(job.settings.regions, names, strict=True):
+        meshing = job.meshing_of(request)
+        if meshing.method == "pam" and meshing.tiles not in ("auto", "off"):
+            known[name] = PlannedTiles(int(meshing.tiles))
+    return known
+
+
+def plan_if_missing(folder: JobFolder) -> PartsGraph:
+    """Return the parts of a job folder; plan them if that was never done, or for another job.
+
+    Raises
+    ------
+    UsageError, ParseError
+        There is no job, or a file is damaged.
+    """
+    job = read_job(folder.job_path)
+    if (folder.root / PARTS_NAME).exists():
+        graph = read_parts(folder.root)
+        if graph.plan == plan_hash(job):
+            return graph
+    graph = plan_parts(folder.root, job, fixed_tiles(job))
+    write_parts(folder.root, graph)
+    return graph
+
+
+def _begin(job: JobFile) -> list[Part]:
+    """Return the parts up to the training."""
+    train = STAGE_SHARES["train"]
+    cameras = STAGE_SHARES["cameras"]
+    if job.command == "bake":  # both are finished
+        cameras = train = BAKE_BEGINS / 2
+    parts = [Part("cameras", "cameras", (), ("stages/cameras-*/scene.json",), cameras)]
+    if job.settings.masks_are_made:
+        made = train * MASKS_SHARE
+        train -= made
+        parts.append(Part("masks", "masks", ("cameras",), ("stages/masked-*/scene.json",), made))
+    needs: tuple[str, ...] = (parts[-1].name,)
+    blocks = job.settings.training.blocks
+    if blocks > 1 and job.command != "bake":
+        of = {kind: train * share for kind, share in _IN_BLOCKS.items()}
+        stage = "stages/blocks-*"
+        parts.append(Part("coarse", "coarse", needs, (f"{stage}/blocks.json",), of["coarse"]))
+        trained = [
+            Part(
+                f"block-{number:04d}", "block", ("coarse",),
+                (f"{stage}/block-{number:04d}/gaussians.npz",), of["block"] / blocks, block=number,
+            )
+            for number in range(blocks)
+        ]  # fmt: skip
+        parts += trained
+        needs, train = tuple(part.name for part in trained), of["train"]
+    return [*parts, Part("train", "train", needs, ("stages/train-*/gaussians.npz",), train)]
+
+
+def _of_region(name: str, after: str, share: float, tiles: PlannedTiles | None) -> list[Part]:
+    """Return the parts of a region. ``plan`` also makes the whole mesh if tiles are not needed."""
+    whole = share * STAGE_SHARES["mesh"]
+    stage = f"stages/mesh-{name}-*"
+    mesh = (f"{stage}/mesh.npz",)
+
+    def part(kind: str, needs: tuple[str, ...], outputs: tuple[str, ...], of: float) -> Part:
+        return Part(f"{kind}-{name}", kind, needs, outputs, of, name)
+
+    plan, joined = f"plan-{name}", f"mesh-{name}"
+    if tiles is None:
+        parts = [
+            part("plan", (after,), mesh, 0.9 * whole),
+            part("mesh", (plan,), mesh, 0.1 * whole),
+        ]
+    else:
+        count = tiles.count
+
+        def tile(kind: str, number: int, needs: tuple[str, ...]) -> Part:
+            of = _TILED[kind]
+            seconds = None if tiles.seconds is None else tiles.seconds * of / count
+            return Part(
+                f"{kind}-{name}-{number:04d}", kind, needs,
+                (f"{stage}/tiles/{kind}-{number:04d}.npz",), whole * of / count, name, number,
+                tiles.memory_bytes, seconds,
+            )  # fmt: skip
+
+        points = [tile(POINTS, number, (plan,)) for number in range(count)]
+        gather = part(
+            GATHER, tuple(p.name for p in points), (f"{stage}/tiles/points.npz",),
+            whole * _TILED[GATHER],
+        )  # fmt: skip
+        faces = [tile(FACES, number, (gather.name,)) for number in range(count)]
+        parts = [
+            part("plan", (after,), (f"{stage}/tiles/tiles.json",), whole * _TILED["plan"]),
+            *points,
+            gather,
+            *faces,
+            part("mesh", tuple(p.name for p in faces), mesh, whole * _TILED["mesh"]),
+        ]
+    textured = (f"stages/texture-{name}-*/files/mesh.npz",)
+    return [*parts, part("texture", (joined,), textured, share * STAGE_SHARES["texture"])]
+
+
+def _relative(source: str, folder: Path) -> str:
+    try:
+        return Path(os.path.relpath(source, folder)).as_posix()
+    except ValueError:  # another drive of Windows
+        return ""

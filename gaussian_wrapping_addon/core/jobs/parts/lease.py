@@ -21,18 +21,10 @@ from pathlib import Path
 from ... import limits
 from ...errors import Cancelled, WorkerError
 from ...files import seconds_since_written
-from ...processes.helper_process import emit
-from ...processes.peak_memory import own_peak_bytes
-from ...processes.process_identity import is_here, owner_alive
 from ...progress import ProgressEvent
-from .part_state import (
-    PartState,
-    new_state,
-    overwrite_state,
-    read_state,
-    state_path,
-    write_state,
-)
+from ...worker.helper_process import emit, own_peak_bytes
+from ...worker.spawn import is_here, owner_alive
+from .graph import PartState, new_state, overwrite_state, read_state, state_path, write_state
 
 _logger = logging.getLogger(__name__)
 

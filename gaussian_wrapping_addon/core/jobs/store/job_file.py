@@ -1,24 +1,135 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The job file: command, input, settings and regions, the same for button and command line."""
+"""The job file and the sidecar of a result."""
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import json
+import logging
 import math
 import os
+import platform
+import stat
+import sys
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
 
-from ...errors import DatasetError, ParseError, SettingError, UsageError
-from ...files import read_json, real_path, write_json
+import numpy as np
+
+from ...errors import DatasetError, ParseError, SettingError, UsageError, WrapError
+from ...files import finite_json, read_json, real_path, write_json
 from ...limits import SHORTEST_EDGE
-from ...masks.model_file import check_model_file
-from ...names import AUTOMATIC_REGIONS, region_name, region_names
-from ...regions.region_file import parse_region_file, read_region_body
-from ...settings import JobSettings, MeshingSettings, from_json, to_json
-from .bake_request import BakeRequest
+from ...masks.mask_folder import check_model_file
+from ...names import AUTOMATIC_REGIONS, RESULT_FORMATS, file_stem, region_name, region_names
+from ...regions.files import parse_region_file, read_region_body
+from ...scene.camera import Similarity
+from ...scene.frames import FileFrame
+from ...settings import (
+    UP_AXES,
+    UV_CHOICES,
+    JobSettings,
+    MeshingSettings,
+    TextureSettings,
+    from_json,
+    key_values,
+    to_json,
+)
+from ...units.georeference import metric_from_world
+from .job_folder import stage_key
+
+# -- What a job bakes the photos onto: the entry ``bake`` of the job file -------------------------
+#
+# Standard library only.
+
+
+MAX_FACES = 100_000_000
+MIN_FACES = 4
+"""No closed surface has fewer."""
+
+
+@dataclass(frozen=True)
+class BakeRequest:
+    """One mesh to bake onto."""
+
+    mesh: str
+    """Absolute path of the mesh: a file, or what Blender hands over."""
+    name: str
+    """Folder of the result below ``baked/``."""
+    sidecar: str = ""
+    """Absolute path of the sidecar of the file that the mesh was made from; may be empty."""
+    up: str = "auto"
+    """Up axis of the files: one of :data:`UP_AXES`."""
+    uvs: str = "auto"
+    """One of :data:`UV_CHOICES`."""
+    faces: int = 0
+    """Faces to decimate to; 0 keeps all."""
+    dense: str = ""
+    """Absolute path of the mesh whose detail goes into the normal map; may be empty."""
+    texture: TextureSettings = field(default_factory=TextureSettings)
+    export: tuple[str, ...] = ("glb",)
+
+    def validated(self) -> BakeRequest:
+        """Return self with a safe name, or raise.
+
+        Raises
+        ------
+        UsageError
+            A choice is unknown or out of range, or contradicts another one.
+        DatasetError
+            A file does not exist.
+        """
+        files = ((self.mesh, "mesh"), (self.sidecar, "sidecar"), (self.dense, "dense mesh"))
+        for path, what in files:
+            if (path or what == "mesh") and not os.path.isfile(path):
+                raise DatasetError(f"The {what} {path} does not exist.", "Check the path.")
+        for value, known in ((self.uvs, UV_CHOICES), (self.up, UP_AXES)):
+            if value not in known:
+                raise UsageError(f"{value!r} is no choice.", f"Give one of {', '.join(known)}.")
+        if self.faces and not MIN_FACES <= self.faces <= MAX_FACES:
+            raise UsageError(
+                f"A mesh cannot have {self.faces} faces.",
+                f"Give 0 (all) or from {MIN_FACES} to {MAX_FACES} faces.",
+            )
+        if self.faces and self.uvs == "own":
+            raise UsageError(
+                "A mesh with fewer faces cannot keep its UVs.",
+                "Leave out --uvs own, or decimate the mesh before.",
+            )
+        if not set(self.export) <= set(RESULT_FORMATS):
+            raise UsageError(
+                "A format cannot be written by a bake.", f"Use {', '.join(RESULT_FORMATS)}."
+            )
+        if self.texture.lods:
+            raise UsageError("Baking makes no levels of detail.", "Leave out --lods.")
+        JobSettings(texture=self.texture).validated()
+        return replace(self, name=file_stem(self.name, 0))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return to_json(self)
+
+    @classmethod
+    def from_json(cls, values: Any) -> BakeRequest:
+        """Build from :meth:`to_json`'s values.
+
+        Raises
+        ------
+        UsageError
+            An entry is missing, unknown, of the wrong type or out of range.
+        """
+        try:
+            request: BakeRequest = from_json(cls, values, "bake")
+        except TypeError:
+            raise UsageError("job.json: bake names no mesh.", "Start the bake again.") from None
+        return request
+
+
+# -- The job file: command, input, settings and regions, the same for button and command line -----
+
 
 SCHEMA_VERSION = 1
 COMMANDS = ("wrap", "mesh", "more", "bake")
@@ -348,3 +459,183 @@ def read_job(path: Path) -> JobFile:
 def write_job(path: Path, job: JobFile) -> None:
     """Write ``job.json`` atomically."""
     write_json(path, job.to_json())
+
+
+# -- Keys of trainings: the hashes that name their folders ----------------------------------------
+
+
+def start_fingerprint(path: str) -> list[Any]:
+    """Return path, size and time of the start splat for the stage key; empty for none.
+
+    Raises
+    ------
+    DatasetError
+        The file does not exist, or is a pipe or a device.
+    """
+    if not path:
+        return []
+    hint = "Put the file back, or start the job without it."
+    try:
+        state = Path(path).stat()
+    except (OSError, ValueError) as error:
+        raise DatasetError(
+            f"The start splat {path} cannot be read: {getattr(error, 'strerror', error)}.", hint
+        ) from None
+    if not stat.S_ISREG(state.st_mode):
+        raise DatasetError(f"The start splat {path} is not a regular file.", hint)
+    return [path, state.st_size, state.st_mtime_ns]
+
+
+def training_keys(version: int, cameras_key: str, job: JobFile) -> tuple[str, str]:
+    """Return the stage's key, and the key without the extra iterations."""
+    described = key_values(job.settings.training)
+    start = start_fingerprint(job.settings.start_splat)
+    parts = (version, cameras_key, job.settings.seed, *([start] if start else []))
+    key = stage_key(*parts, described)
+    described.pop("extra_iterations")
+    return key, stage_key(*parts, described)
+
+
+def blocks_key(version: int, cameras_key: str, job: JobFile) -> str:
+    """Return the key of the blocks of a training: without what follows when they are joined."""
+    described = key_values(job.settings.training)
+    described.pop("extra_iterations")
+    described.pop("polish", None)  # a key has no setting of its default
+    return stage_key("blocks", version, cameras_key, job.settings.seed, described)
+
+
+# -- Write the JSON sidecar of an exported file: its coordinate frame and how it was made ---------
+#
+# Exports are shared with others, so that it holds names and no paths of this machine.
+
+
+_logger = logging.getLogger("gaussian_wrapping")
+
+VERSION = 1
+_PACKAGE = Path(__file__).resolve().parents[3]
+_MANIFEST = "blender_manifest.toml"
+
+
+def sidecar_path(path: Path) -> Path:
+    """Return the path of an exported file's sidecar, such as ``auto.glb.json`` of ``auto.glb``."""
+    return path.with_name(path.name + ".json")
+
+
+def write_sidecar(
+    path: Path,
+    frame: FileFrame,
+    world_from_scene: Similarity,
+    blender_from_scene: Similarity,
+    *,
+    placed: bool,
+    result: Path,
+    contents: dict[str, Any],
+) -> None:
+    """Write the sidecar of ``path``.
+
+    Parameters
+    ----------
+    path : Path
+        The exported file.
+    frame : FileFrame
+        Frame of its coordinates.
+    placed : bool
+        Whether the target of ``frame`` is the scene as placed, else the world of the input.
+    result : Path
+        The result folder of the job; entries missing there are left out.
+    contents : dict
+        Content of the file: region, level, shading, number of vertices and faces, textures.
+    """
+    units = _units(result, frame, world_from_scene)
+    in_metres = units is not None and units["applied"]
+    unit = "metre" if in_metres else "unit of the input"
+    values = {
+        "version": VERSION,
+        "file": path.name,
+        "format": frame.format,
+        "placed": placed,
+        "unit": "metre, as placed in Blender" if placed else unit,
+        **frame.to_json(world_from_scene, blender_from_scene),
+        **({} if units is None else {"georeference": units}),
+        **contents,
+        **_source(result, contents.get("region")),
+        "made_with": _versions(),
+    }
+    write_json(sidecar_path(path), finite_json(values))
+
+
+def _units(result: Path, frame: FileFrame, world_from_scene: Similarity) -> dict[str, Any] | None:
+    """Return the result's entry ``georeference``, with the way there from the file."""
+    try:
+        record = read_json(result / "scene.json").get("georeference")
+    except (OSError, WrapError, AttributeError):
+        return None
+    metric = metric_from_world(record)
+    if metric is None:
+        return None
+    metric_from_scene = metric.after(world_from_scene)
+    metric_from_file = metric_from_scene.after(frame.file_from_scene().inverse())
+    applied = bool(record.get("applied"))
+    return {**record, "applied": applied, "metric_from_file": metric_from_file.to_json()}
+
+
+def _source(result: Path, region: Any) -> dict[str, Any]:
+    """Return the job and the region's file, as far as they exist."""
+    out: dict[str, Any] = {"job": None, "region_body": None, "training": None}
+    try:
+        job_path, region_path = result.parent / "job.json", result / str(region) / "region.json"
+        if job_path.is_file():
+            job = read_job(job_path)
+            settings = to_json(job.settings)
+            settings["regions"] = [_name(r) for r in job.settings.regions]
+            settings["start_splat"] = _name(job.settings.start_splat)
+            settings["mask_model"] = _name(job.settings.mask_model)
+            settings["control_points"] = _name(job.settings.control_points)
+            out["job"] = {
+                "name": result.parent.name, "command": job.command, "source": _name(job.source),
+                "settings": settings,
+            }  # fmt: skip
+        if region is not None and region_path.is_file():
+            out["region_body"] = read_json(region_path)
+        figures_path = result / str(region) / "figures.json"
+        if region is not None and figures_path.is_file():
+            out["training"] = read_json(figures_path).get("training")
+    except WrapError as error:
+        # The mesh is valid all the same: an incomplete sidecar is better than no export.
+        _logger.warning("the sidecar is incomplete: %s", error)
+    return out
+
+
+def _name(text: str) -> str:
+    return text if text in AUTOMATIC_REGIONS else Path(text).name
+
+
+def _versions() -> dict[str, str | None]:
+    bpy = sys.modules.get("bpy")
+    return {
+        "add_on": add_on_version(),
+        "code": code_fingerprint(),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "blender": None if bpy is None else str(bpy.app.version_string),
+    }
+
+
+@functools.cache
+def add_on_version() -> str:
+    """Return the version in the manifest; ``"unknown"`` if there is none beside the package."""
+    for folder in (_PACKAGE, _PACKAGE.parent):
+        path = folder / _MANIFEST
+        if path.is_file():
+            return str(tomllib.loads(path.read_text(encoding="utf-8")).get("version", "unknown"))
+    return "unknown"
+
+
+@functools.cache
+def code_fingerprint() -> str:
+    """Return a hash of all code files, 12 hexadecimal digits."""
+    digest = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
+        digest.update(path.read_bytes() + b"\0")
+    return digest.hexdigest()[:12]

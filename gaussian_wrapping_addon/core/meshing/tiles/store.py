@@ -12,19 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from ...array_file import read_arrays
 from ...errors import ParseError
-from ...files import read_json, write_bytes, write_json
-from ...regions.convex_region import Region
-from ...regions.tiling import Tiling
-from ...report_warning import read_warnings
-from ..points.candidate_surface import CandidateSurface
-from ..points.region_caps import Caps
-from ..points.spacing import Spacing
-from ..points.surface_points import SurfacePoints
+from ...files import read_arrays, read_json, write_bytes, write_json
+from ...progress import read_warnings
+from ...regions.shapes import Region, Tiling
+from ..surface_points import CandidateSurface, Caps, Spacing, SurfacePoints
 from .plan import TilePlan
-from .tile_points import GatheredPoints
-from .tile_surface import TileSurface
+from .tile import GatheredPoints, TileSurface
 
 LIST_NAME = "tiles.json"
 VERSION = 3

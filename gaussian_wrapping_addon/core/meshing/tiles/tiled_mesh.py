@@ -9,26 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from ...dataset.camera import Camera
 from ...errors import MeshingError
-from ...field.depth_samples import DepthSamples
+from ...field.samples import DepthSamples
 from ...gaussians.model import GaussianArrays
 from ...mesh.components import compacted, without_floaters
-from ...mesh.simplification.vertex_selection import merge_vertices
+from ...mesh.simplification import merge_vertices
 from ...mesh.surface_mesh import SurfaceMesh
 from ...progress import Progress
-from ...regions.convex_region import Region
+from ...regions.shapes import Region
+from ...scene.camera import Camera
 from ...settings import MeshingSettings
-from ..cleanup.degenerate import remove_degenerate
-from ..points.candidate_surface import candidate_surface
-from ..points.resolution import checked_request
 from ..primal_adaptive import residuals_on_surface, small_handles_closed, vertex_counts
-from .growing_mesh import Joined
-from .join import LoadTile, joined, overview
+from ..repair import remove_degenerate
+from ..surface_points import candidate_surface, checked_request
+from .join import Joined, LoadTile, flip_by_tiles, joined, overview
 from .plan import Field, TilePlan, make_plan
-from .tile_flips import flip_by_tiles
-from .tile_points import KIND_STEINER
-from .tile_surface import cost_units, longest_edge
+from .tile import KIND_STEINER, cost_units, longest_edge
 
 _logger = logging.getLogger(__name__)
 

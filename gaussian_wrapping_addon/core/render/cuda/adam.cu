@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Adam steps of the Gaussians that a view has seen, all tensors at once: the formulas and the
-// columns of adam_kernels.py. One warp a Gaussian, so that a row's moments are read in one piece.
+// columns of adam.py. One warp a Gaussian, so that a row's moments are read in one piece.
 
 // Where a column of the moments lies in the tensors: its values and gradients.
 struct AdamColumn {

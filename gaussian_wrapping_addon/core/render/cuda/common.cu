@@ -2,7 +2,7 @@
 // Shared by all kernels: threads of a tile, one Gaussian evaluated on a ray, warp reductions.
 //
 // One source for NVRTC and, with a shim that defines CUDA's keywords, for a host compiler. The
-// constants in capitals are prepended by source.py.
+// constants in capitals are prepended by kernels.py.
 
 typedef long long int64;
 

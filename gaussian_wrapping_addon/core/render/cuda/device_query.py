@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Isosurface depth of a view at sub-pixel positions on the GPU, and its gradient.
 
-The same definition and results as :mod:`..query.depth_query`. Nothing is copied to the host but
+The same definition and results as :mod:`.depth_query`. Nothing is copied to the host but
 the number of tile intersections of each query.
 """
 
@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ... import tolerances
-from ...dataset.camera import Camera
+from ... import limits
 from ...errors import ResourceError, UsageError
 from ...gaussians.model import OrientedGaussians
-from ..query.fine_screen import fine_scale
-from ..types.options import RenderOptions
+from ...scene.camera import Camera
+from ..query_kernels import fine_scale
+from ..types import RenderOptions
+from .device_view import MAX_INTERSECTIONS, ROW_VALUES, WARPS, DeviceScreen, RawTensors, offsets
 from .kernels import Kernels
-from .tile_lists import MAX_INTERSECTIONS, ROW_VALUES, WARPS, DeviceScreen, RawTensors, offsets
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits")
 
@@ -263,7 +263,7 @@ def project_query_gradients(
 
 
 def _tile_counts(camera: Camera) -> tuple[int, int]:
-    tile = tolerances.TILE_PX
+    tile = limits.TILE_PX
     return -(-camera.width // tile), -(-camera.height // tile)
 
 
@@ -272,7 +272,7 @@ def _sort_points(positions: Tensor, camera: Camera) -> SortedPoints:
     x, y = positions.unbind(1)
     # False for NaN.
     inside = (x >= 0.0) & (y >= 0.0) & (x <= camera.width) & (y <= camera.height)  # (m,)
-    cells = torch.where(inside[:, None], positions, 0.0).div_(tolerances.TILE_PX).int()
+    cells = torch.where(inside[:, None], positions, 0.0).div_(limits.TILE_PX).int()
     column, row = cells.unbind(1)
     tile = row.clamp(max=tiles_y - 1) * tiles_x + column.clamp(max=tiles_x - 1)
     keys = torch.where(inside, tile, tiles_x * tiles_y).int()

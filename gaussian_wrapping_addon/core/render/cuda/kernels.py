@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Launch CUDA kernels by name with torch tensors as arguments; check CUDA availability."""
+"""The text of all kernels, and their compiled form."""
 
 from __future__ import annotations
 
 import ctypes
 import functools
+import math
 from abc import ABC, abstractmethod
 from pathlib import Path
 
@@ -12,11 +13,183 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ... import image_metrics, limits
 from ...errors import DeviceError
-from ..projection.projection_kernels import CAMERA_VALUES
-from .compiler import compile_text, find_nvrtc
-from .driver import DriverModule, load_driver
-from .source import KERNELS, THREADS_PER_BLOCK, cuda_source
+from ..projection_kernels import CAMERA_VALUES
+from ..query_kernels import BOX_END
+from ..simd import FLOAT32_MAX, FRONT_SIGMAS
+from .compiler import DriverModule, compile_text, find_nvrtc, load_driver
+
+# -- CUDA C source of all kernels: the constants of the method, followed by the ``.cu`` files -----
+
+
+PARTS = (
+    "common.cu",
+    "projection.cu",
+    "projection_backward.cu",
+    "binning.cu",
+    "raster.cu",
+    "isosurface.cu",
+    "raster_backward.cu",
+    "vacancy.cu",
+    "losses.cu",
+    "adam.cu",
+    "query.cu",
+    "multi_view.cu",
+)
+
+KERNELS = (
+    "project_gaussians",
+    "project_backward",
+    "count_pairs",
+    "list_pairs",
+    "forward_tiles",
+    "forward_tiles_weights",
+    "sum_weights",
+    "isosurface_tiles",
+    "backward_tiles",
+    "backward_tiles_depth",
+    "backward_tiles_absolute",
+    "backward_tiles_depth_absolute",
+    "sum_pairs",
+    "finish_params",
+    "locate_points",
+    "transmittance_tiles",
+    "ssim_maps",
+    "color_gradient",
+    "agree_normals",
+    "gather_depth",
+    "prior_depths",
+    "adam_rows",
+    "project_finely",
+    "bound_points",
+    "count_areas",
+    "list_areas",
+    "solve_points",
+    "query_gradients",
+    "position_gradients",
+    "grey_pixels",
+    "measure_pixels",
+    "pick_pixels",
+    "lift_points",
+    "return_points",
+    "compare_patches",
+    "finish_pixels",
+)
+"""Names of the kernels (entry points)."""
+
+THREADS_PER_BLOCK = 256
+
+_SINGLE = {
+    "ALPHA_MIN": limits.ALPHA_MIN,
+    "ALPHA_MAX": limits.ALPHA_MAX,
+    "TRANSMITTANCE_MIN": limits.TRANSMITTANCE_MIN,
+    "ISO_LEVEL": limits.ISO_LEVEL,
+    "DENOMINATOR_MIN": limits.DENOMINATOR_MIN,
+    "FRONT_SIGMAS": float(FRONT_SIGMAS),
+    "SLOPE_FLOOR": limits.SLOPE_FLOOR,
+    "TINY": 1e-30,
+    "FARTHEST": 3e38,
+    "FLOAT32_LARGE": 3.0e38,  # every smaller magnitude is a usable float32
+    # Ellipses above this half width take every row of their box: rows are narrowed in float32,
+    # whose rounding at this size stays a tenth of the margin.
+    "NARROW_PX": 2048.0,
+    "NARROW_MARGIN": 0.05,
+    # As in query_kernels.py, where they are explained.
+    "NEGLIGIBLE": 30.0,
+    "FALL_END": 22.4,
+    "SOLVER_STEP_SIGMAS": 5e-4,
+    "SOLVER_LEVEL_MARGIN": 3e-7,  # as in isosurface.py
+    "SOLVER_BRACKET_SHARE": 1.25e-7,
+    "SOLVER_LEAST_SHARE": 1.25e-7,
+    "SOLVER_POLISH_SIGMAS": 3e-3,
+    "SOLVER_LEVEL_FAR": 0.05,
+    "SOLVER_FLAT": 0.02,
+    "SOLVER_LEAST_SLOPE": 1e-12,
+    "FLOAT_MARGIN": 4e-6,  # as in query_kernels.py
+    # As in core/field/vacancy_kernels.py.
+    "FACTOR_MIN": 1e-7,
+    "TRANSMITTANCE_LOST": 1e-4,
+    **{f"SSIM_W{tap}": weight for tap, weight in enumerate(image_metrics.WEIGHTS[:6])},
+    "SSIM_C1": image_metrics.C1,
+    "SSIM_C2": image_metrics.C2,
+    # As in core/training: losses.py, adam.py.
+    "MIN_NORMAL_SQ": 1e-30,
+    "ADAM_BETA1": 0.9,
+    "ADAM_BETA2": 0.999,
+    "ADAM_EPSILON": 1e-15,
+}
+_DOUBLE = {
+    "ALPHA_MIN_WIDE": limits.ALPHA_MIN,
+    "QUATERNION_MIN_NORM": limits.QUATERNION_MIN_NORM,
+    "DIRECTION_MIN_NORM": limits.DIRECTION_MIN_NORM,
+    "FINITE_OFFSET_PX": limits.FINITE_OFFSET_PX,
+    "FINITE_NUM": limits.FINITE_NUM,
+    "FINITE_DEN": limits.FINITE_DEN,
+    "FINITE_SPREAD": limits.FINITE_SPREAD,
+    "FINITE_PULL": limits.FINITE_PULL,
+    "FINITE_Z_MIN": limits.FINITE_Z_MIN,
+    "FINITE_Z_MAX": limits.FINITE_Z_MAX,
+    "FINITE_SIGMA_Z": limits.FINITE_SIGMA_Z,
+    "FINITE_COLOR": limits.FINITE_COLOR,
+    "FLOAT32_MAX": FLOAT32_MAX,
+    # As in projection.py.
+    "GRADIENT_MAX": 1e38,
+    "BASIS_MAX": 3.0,
+    # As in projection_kernels.py and tile_kernels.py.
+    "PLANE_MARGIN": 1e-12,
+    # As in core/training/losses.py.
+    "PRIOR_TOLERANCE": 0.01,
+    "PRIOR_OUTLIER": 0.03,
+    "FLOAT32_STEP": 2.0**-23,
+    "FARTHEST_PX": 1.0e9,
+    "SHARE_MARGIN": 1e-6,
+    "STRIP_MARGIN": 0.02,
+    # As in query_kernels.py.
+    "BOX_END": BOX_END,
+    "PATCH_STEP_PX": limits.PATCH_STEP_PX,
+    "MAX_NOISE_PX": limits.MAX_NOISE_PX,
+    "MIN_NOISE_PX": limits.MIN_NOISE_PX,
+    "SPREAD_PRODUCT": limits.SPREAD_PRODUCT,
+    "MAX_PATCH_ERROR": limits.MAX_PATCH_ERROR,
+    "MIN_PLANE_NORMAL": limits.MIN_PLANE_NORMAL,
+    "MIN_PLANE_FACING": limits.MIN_PLANE_FACING,
+    "SH_C0": 0.5 / math.sqrt(math.pi),
+    "SH_C1": math.sqrt(3.0 / (4.0 * math.pi)),
+    "SH_C2A": math.sqrt(15.0 / (4.0 * math.pi)),
+    "SH_C2B": math.sqrt(5.0 / (16.0 * math.pi)),
+    "SH_C2C": math.sqrt(15.0 / (16.0 * math.pi)),
+    "SH_C3A": math.sqrt(35.0 / (32.0 * math.pi)),
+    "SH_C3B": math.sqrt(105.0 / (4.0 * math.pi)),
+    "SH_C3C": math.sqrt(21.0 / (32.0 * math.pi)),
+    "SH_C3D": math.sqrt(7.0 / (16.0 * math.pi)),
+    "SH_C3E": math.sqrt(105.0 / (16.0 * math.pi)),
+}
+_INTEGER = {
+    "TILE": limits.TILE_PX,
+    "SOLVER_NEWTON_STEPS": 8,
+    "SOLVER_MAX_STEPS": 80,
+    "HALF_PATCH": limits.HALF_PATCH,
+    "PATCH_SKIPPED": limits.PATCH_SKIPPED,
+    "PATCH_KEPT": limits.PATCH_KEPT,
+    "PATCH_BROKEN": limits.PATCH_BROKEN,
+}
+
+
+@functools.cache
+def cuda_source() -> str:
+    """Return the whole source; compiler errors name the file and line of each part."""
+    folder = Path(__file__).resolve().parent
+    lines = [f"#define {name} {value}" for name, value in _INTEGER.items()]
+    lines += [f"#define {name} {value!r}" for name, value in _DOUBLE.items()]
+    lines += [f"#define {name} {value!r}f" for name, value in _SINGLE.items()]
+    lines.append("#define INFINITE __int_as_float(0x7f800000)")
+    for part in PARTS:
+        lines += [f'#line 1 "{part}"', (folder / part).read_text(encoding="utf-8")]
+    return "\n".join(lines)
+
+
+# -- Launch CUDA kernels by name with torch tensors as arguments; check CUDA availability ---------
 
 
 class CameraValues(ctypes.Structure):

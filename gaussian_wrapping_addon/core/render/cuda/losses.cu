@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Losses on images and their gradients (docs/method.md, section 3): colour with SSIM, agreement of
-// normals, confirmed depths. Formulas of ssim_kernels.py, loss_kernels.py and depth_prior_loss.py.
+// normals, confirmed depths. Formulas of image_metrics.py, losses.py and losses.py.
 
 #define SSIM_RADIUS 5
 #define SSIM_TAPS 11

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Multi-view terms between two views: pixel choice, reprojection, patch comparison; the formulas
-// of multi_view_kernels.py and pixel_choice.py, where they are explained.
+// of multi_view.py and multi_view.py, where they are explained.
 //
 // Arrays of sampled pixels have a fixed length, so that their number need not be known: an entry
 // of -1 is no pixel. `camera` is the reference camera; `pair` is the other one, its pose relative

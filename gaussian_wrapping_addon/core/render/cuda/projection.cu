@@ -42,7 +42,7 @@ __device__ __forceinline__ void to_camera(const CameraValues& camera, const doub
             + camera.v[3 * row + 2] * m[2] + camera.v[9 + row];
 }
 
-// Sums over the axes that all outputs depend on; names as in projection_backward.py.
+// Sums over the axes that all outputs depend on; names as in projection.py.
 struct ShapeSums {
     double a0, hx, hy, hz, bxx, bxy, byy, fxx, fxy, fyy;
     double cov_xx, cov_xy, cov_yy, cov_xz, cov_yz, cov_zz;
@@ -78,7 +78,7 @@ __device__ __forceinline__ ShapeSums shape_sums(const double* axes, const double
     return s;
 }
 
-// Real spherical harmonics, order and signs of harmonics_kernels.py.
+// Real spherical harmonics, order and signs of projection_kernels.py.
 __device__ __forceinline__ void harmonics(int degree, double x, double y, double z, double* out) {
     out[0] = SH_C0;
     if (degree < 1) return;

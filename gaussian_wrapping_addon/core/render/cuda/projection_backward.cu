@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Gradient of the projection, one thread per Gaussian, in float64: the formulas of
-// projection_backward.py, where they are derived. Column 22 (a bound) carries no gradient.
+// projection.py, where they are derived. Column 22 (a bound) carries no gradient.
 
 // From the gradient on one row of params to axes, effective log scales and mean, camera frame.
 __device__ __forceinline__ void shape_gradient(

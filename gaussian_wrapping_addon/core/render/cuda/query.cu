@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Isosurface depth of a view at sub-pixel positions, and its gradient: definitions of
-// depth_query.py, formulas of isosurface.cu and depth_query_gradient.py.
+// depth_query.py, formulas of isosurface.cu and depth_query.py.
 //
 // A tile's list holds the Gaussians that reach the rectangle around the tile's points, not its
 // pixel centres; with few points a tile it is hardly longer than the list of contributors.
 
 // -- projection and lists -------------------------------------------------------------------------
 
-// Scale a row from a screen `scale` times as fine to pixels, see fine_screen.py; return false where
+// Scale a row from a screen `scale` times as fine to pixels, see query_kernels.py; return false where
 // rendering would overflow float32.
 __device__ __forceinline__ bool shrink_row(
     const CameraValues& camera, double scale, float* row, float* box, float* skew) {
@@ -128,7 +128,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) bound_points(
     areas[tile] = area;
 }
 
-// An ellipse prepared for many tests in float32, as in query_spans.py. At height t (in half heights)
+// An ellipse prepared for many tests in float32, as in query_kernels.py. At height t (in half heights)
 // it spans skew t +- across sqrt(1 - t^2).
 struct Ellipse {
     float center_x, center_y, skew, extreme, inverse, across, margin;

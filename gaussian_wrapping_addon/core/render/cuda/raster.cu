@@ -15,7 +15,7 @@ struct WeightShared {
 };
 
 // Bits of the warps' 8 x 4 pixels that an ellipse reaches in the tile at (left, top). Within the 8
-// columns of each half the rows are narrowed as in block_masks.py, here in float32: only for
+// columns of each half the rows are narrowed as in tile_kernels.py, here in float32: only for
 // ellipses near the tile's size, where the margin covers its rounding.
 __device__ __forceinline__ unsigned reached_warps(float4 box, float skew, int left, int top) {
     const float x0 = box.x - left, y0 = box.y - top, x1 = box.z - left, y1 = box.w - top;

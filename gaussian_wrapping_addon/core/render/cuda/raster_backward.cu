@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Gradient of blending and depth, front to back, one block per tile: the formulas of
-// raster_backward.py. Each warp sums its pixels, each block its warps in order, each intersection
+// raster.py. Each warp sums its pixels, each block its warps in order, each intersection
 // writes its own slot, each Gaussian sums its slots in order: no atomics, bitwise reproducible.
 
 #define BACKWARD_BATCH 16

@@ -1,25 +1,590 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Find charts of a mesh with xatlas in a helper process, without folds, and pack them."""
+"""Charts: made by xatlas in chunks, scaled and relaxed to the shape of the mesh."""
 
 from __future__ import annotations
 
+import heapq
 import logging
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse.linalg import splu
 
-from ...errors import DatasetError, MemoryShortageError, ResourceError, WorkerError
-from ...mesh.face_graph import face_graph, uv_charts
-from ...processes.helper_process import run_helper
+from ...compiled import kernel
+from ...errors import DatasetError, MemoryShortageError, MeshingError, ResourceError, WorkerError
+from ...mesh.components import FaceGraph, face_graph, uv_charts
+from ...mesh.surface_mesh import area_vectors, half_edges
 from ...progress import Progress
-from .chart_boxes import chart_extents, packing_scale, packing_square, split_wide_charts
-from .chart_overlaps import signed_areas, split_overlaps
-from .chart_shapes import chart_points, equalise_density, flatten_faces, relax, smooth_vertices
-from .chunks import split_into_chunks
-from .stretch import Stretch, texture_stretch
-from .whole_polygons import join_polygons, set_cut_apart
+from ...worker.helper_process import run_helper
+from .overlaps import find_overlaps, join_polygons, set_cut_apart, signed_areas, split_overlaps
+
+# -- Texture stretch of an unwrap -----------------------------------------------------------------
+
+
+COLLAPSED_UV_AREA = 1e-14
+"""Faces with less area in UVs (a hundredth of a texel is 1e-10 at 8192) have no measurable
+direction; the unwrap collapses flat ones to a point."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """L2 texture stretch: 1 if a texel covers as much surface as on average, in all directions.
+
+    Root mean square over directions of the distance on the surface per unit step in the texture.
+    """
+
+    mean: float
+    """Mean over the surface."""
+    p95: float
+    """95th percentile over the surface."""
+    collapsed_share: float
+    """Share of the surface that has no area in the texture."""
+
+
+def texture_stretch(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray) -> Stretch:
+    """Measure the stretch of each face, weighted by its area (Sander and others, 2001).
+
+    Parameters
+    ----------
+    vertices : (v, 3) float64
+    faces : (f, 3) int32
+    corner_uvs : (f, 3, 2) float32
+
+    Raises
+    ------
+    MeshingError
+        No face has an area in the texture.
+    """
+    corners = np.asarray(vertices, np.float64)[faces]  # (f, 3, 3)
+    uvs = np.asarray(corner_uvs, np.float64)
+    edge_one, edge_two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    uv_one, uv_two = uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
+    areas = 0.5 * np.linalg.norm(np.cross(edge_one, edge_two), axis=1)
+    double = uv_one[:, 0] * uv_two[:, 1] - uv_one[:, 1] * uv_two[:, 0]
+    spread = 0.5 * np.abs(double) > COLLAPSED_UV_AREA
+    total = float(areas.sum())
+    if not spread.any():
+        raise MeshingError("No face has an area in the texture.", "Mesh the region again.")
+    inverse = 1.0 / double[spread, None]
+    one, two = uv_one[spread], uv_two[spread]
+    along_u = (edge_one[spread] * two[:, 1:] - edge_two[spread] * one[:, 1:]) * inverse
+    along_v = (edge_two[spread] * one[:, :1] - edge_one[spread] * two[:, :1]) * inverse
+    length = np.sqrt(0.5 * ((along_u**2).sum(axis=1) + (along_v**2).sum(axis=1)))
+    weight = areas[spread]
+    scale = np.sqrt(weight.sum() / (0.5 * np.abs(double[spread])).sum())
+    stretch = length / scale
+    order = np.argsort(stretch)
+    running = np.cumsum(weight[order])
+    at = int(np.searchsorted(running, 0.95 * running[-1]))
+    return Stretch(
+        float((weight * stretch).sum() / weight.sum()),
+        float(stretch[order[min(at, len(order) - 1)]]),
+        1.0 - float(weight.sum()) / total,
+    )
+
+
+# -- Packing scale of charts, estimated from their bounding boxes ---------------------------------
+
+
+MAX_PACKING_PX = 1024
+"""The cost of packing grows with the texels: a smaller square is used, with scaled gutters."""
+ROUNDING_TEXELS = 2
+"""Texels added to a box: sizes are rounded up, and touched texels belong to the chart."""
+FILL_SHARE = 0.8
+"""Share of the square covered by the boxes of charts with gutters when they just fit."""
+SCALE_STEPS = 30
+WIDE_SHARE = 0.45
+"""Share of a square's side: with several squares, wider charts are split to fill each square."""
+USED_SHARE = 0.6
+"""Approximate share of a square used after packing."""
+MAX_CUTS = 12
+"""Rounds of halving."""
+MIN_SCALE_SHARE = 0.01
+"""Share of the scale at which the largest chart fills the square: minimum if gutters do not fit."""
+
+
+def packing_square(size_px: int, gutter_px: float) -> tuple[int, int]:
+    """Return the side and the padding for packing, in whole texels."""
+    side_px = min(size_px, MAX_PACKING_PX)
+    return side_px, math.ceil(gutter_px * side_px / size_px)
+
+
+def chart_extents(points: np.ndarray, corners: np.ndarray, charts: np.ndarray) -> np.ndarray:
+    """Return (c, 2) width and height of charts.
+
+    Parameters
+    ----------
+    points : (n, 2) float
+    corners : (f, 3) int
+        Index of the point at each corner.
+    charts : (f,) int
+        Labels from 0.
+    """
+    labels = charts.astype(np.int64)
+    count = int(labels.max()) + 1
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    for corner in range(3):
+        at = points[corners[:, corner]]
+        np.minimum.at(low, labels, at)
+        np.maximum.at(high, labels, at)
+    return high - low
+
+
+def packing_scale(extents: np.ndarray, side_px: int, padding_px: int, squares: int = 1) -> float:
+    """Return the texels per unit at which boxes with padding fill most of the squares."""
+    low, high = 0.0, side_px / max(float(extents.max()), 1e-30)
+    largest = high
+    for _ in range(SCALE_STEPS):
+        middle = 0.5 * (low + high)
+        boxes = float(np.prod(extents * middle + padding_px + ROUNDING_TEXELS, axis=1).sum())
+        low, high = (middle, high) if boxes < FILL_SHARE * squares * side_px**2 else (low, middle)
+    return max(low, MIN_SCALE_SHARE * largest)
+
+
+def split_wide_charts(
+    corner_uvs: np.ndarray,
+    charts: np.ndarray,
+    squares: int,
+    polygons: np.ndarray | None = None,
+) -> np.ndarray:
+    """Split charts that are too wide for several squares.
+
+    A chart cannot be larger than a square: if one chart holds most of the surface, several squares
+    would give no more resolution than one.
+
+    Parameters
+    ----------
+    corner_uvs : (f, 3, 2) float64
+        All charts at the same scale.
+    charts : (f,) int
+        Labels from 0.
+    squares : int
+    polygons : (f,) int, optional
+        Polygon of each face: those within one chart are not cut.
+
+    Returns
+    -------
+    (f,) int32
+        New labels; pieces of one label need not be connected.
+    """
+    labels = charts.astype(np.int64)
+    edge_one, edge_two = (corner_uvs[:, k] - corner_uvs[:, 0] for k in (1, 2))
+    double = edge_one[:, 0] * edge_two[:, 1] - edge_one[:, 1] * edge_two[:, 0]
+    side = math.sqrt(0.5 * float(np.abs(double).sum()) / (USED_SHARE * squares))
+    centres = corner_uvs.mean(axis=1)  # (f, 2)
+    if polygons is not None:
+        centres = _centres_of_polygons(centres, labels, polygons)
+    rows = np.arange(len(labels))
+    corners = np.arange(3 * len(labels)).reshape(-1, 3)
+    for _ in range(MAX_CUTS):
+        count = int(labels.max()) + 1
+        extents = chart_extents(corner_uvs.reshape(-1, 2), corners, labels)
+        low = np.full((count, 2), np.inf)
+        np.minimum.at(low, labels, corner_uvs.min(axis=1))
+        wide = extents.max(axis=1) > WIDE_SHARE * side
+        axis = extents.argmax(axis=1)
+        middle = (low + 0.5 * extents)[np.arange(count), axis]
+        beyond = wide[labels] & (centres[rows, axis[labels]] > middle[labels])
+        if not beyond.any():
+            break
+        labels[beyond] += count
+        labels = np.unique(labels, return_inverse=True)[1].ravel()
+    return labels.astype(np.int32)
+
+
+def _centres_of_polygons(
+    centres: np.ndarray, charts: np.ndarray, polygons: np.ndarray
+) -> np.ndarray:
+    """Return (f, 2) one centre for all faces of a polygon that are in the same chart."""
+    pairs = np.stack([charts, polygons], axis=1)
+    part = np.unique(pairs, axis=0, return_inverse=True)[1].ravel()
+    sums = np.stack([np.bincount(part, centres[:, axis]) for axis in range(2)], axis=1)
+    return np.asarray((sums / np.bincount(part)[:, None])[part])
+
+
+# -- Geometry of charts: smoothing of the mesh before charting, ARAP relaxation of charts ---------
+
+
+SMOOTHING_STEPS = 2
+"""More give more charts again (the copy shrinks into folds); one leaves 0.3 edges of noise."""
+MAX_MOVE_SHARE = 0.5
+"""Share of the mean length of a vertex's edges."""
+MIN_AREA_SHARE = 0.03
+"""With a smaller share of its area, a face is crushed; xatlas hung on a wire three faces around."""
+RELAXATIONS = 6
+"""After six rounds, the stretch of charts changes by less than 0.1 %."""
+MAX_ROUNDS_BACK = 30
+"""Maximum number of rounds: restoring a point may fold its neighbours, so all are tested again."""
+MIN_HEIGHT_SHARE = 0.02
+"""Minimum height of needles relative to their longest edge, so that their weights stay bounded."""
+ANCHOR_WEIGHT = 1e-6
+"""Weight that fixes the position of a chart, relative to the mean weight of a vertex."""
+
+
+def smooth_vertices(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Move vertices towards the mean of their neighbours, by at most half an edge.
+
+    xatlas splits charts at noisy or badly shaped faces; smoothing reduces both.
+
+    Returns
+    -------
+    (v, 3) float64
+    """
+    start = np.asarray(vertices, np.float64)
+    centre = start[faces].mean(axis=(0, 1))
+    start = start - centre
+    begin, end = half_edges(faces)
+    rows, columns = np.concatenate([begin, end]), np.concatenate([end, begin])
+    count = len(start)
+    degree = np.maximum(np.bincount(rows, minlength=count), 1)
+    length = np.linalg.norm(start[rows] - start[columns], axis=1)
+    limit = MAX_MOVE_SHARE * np.bincount(rows, length, count) / degree
+    adjacency = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    isolated = np.bincount(rows, minlength=count) == 0
+    points = start.copy()
+    for _ in range(SMOOTHING_STEPS):
+        move = (adjacency @ points) / degree[:, None] - start
+        move[isolated] = 0.0
+        far = np.linalg.norm(move, axis=1)
+        points = start + move * np.minimum(1.0, limit / np.maximum(far, 1e-300))[:, None]
+    return np.asarray(_restore_crushed_faces(points, start, faces) + centre)
+
+
+def _restore_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Restore the vertices of faces that lost most of their area, so that thin tubes stay open."""
+    before = np.linalg.norm(area_vectors(start, faces), axis=1)
+    points = points.copy()
+    while True:
+        crushed = np.linalg.norm(area_vectors(points, faces), axis=1) < MIN_AREA_SHARE * before
+        back = np.unique(faces[crushed])
+        back = back[(points[back] != start[back]).any(axis=1)]
+        if len(back) == 0:
+            return points
+        points[back] = start[back]
+
+
+def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index the distinct points of each chart.
+
+    Parameters
+    ----------
+    corner_uvs : (f, 3, 2) float32
+    charts : (f,) int
+
+    Returns
+    -------
+    corners : (f, 3) int64
+        Index of a point for each corner; charts share no points.
+    first : (n,) int64
+        A corner ``3 * face + k`` at each point.
+    """
+    bits = np.ascontiguousarray(corner_uvs, np.float32).reshape(-1, 2) + np.float32(0.0)
+    bits = bits.view(np.uint32).astype(np.int64)  # (3 f, 2); + 0.0 maps -0.0 to 0.0
+    order = np.lexsort((bits[:, 1], bits[:, 0], np.repeat(charts, 3)))
+    keys = np.column_stack([np.repeat(charts, 3), bits])[order]
+    fresh = np.concatenate([[True], (keys[1:] != keys[:-1]).any(axis=1)])
+    corners = np.empty(len(order), np.int64)
+    corners[order] = np.cumsum(fresh) - 1
+    return corners.reshape(-1, 3), order[fresh]
+
+
+def equalise_density(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.ndarray:
+    """Scale each chart to the area of its faces, and move its lower corner to the origin.
+
+    Parameters
+    ----------
+    shapes : (f, 3, 2) float64
+        True shape of each face, see :func:`flatten_faces`.
+    """
+    count = int(charts.max()) + 1
+    uvs = np.asarray(corner_uvs, np.float64)
+    low = np.full((count, 2), np.inf)
+    high = np.full((count, 2), -np.inf)
+    for corner in range(3):
+        np.minimum.at(low, charts, uvs[:, corner])
+        np.maximum.at(high, charts, uvs[:, corner])
+    true = np.bincount(charts, np.abs(signed_areas(shapes)), count)
+    flat = np.bincount(charts, np.abs(signed_areas(uvs)), count)
+    # A chart without area must not grow beyond its edges.
+    extent = np.maximum(np.linalg.norm(high - low, axis=1), 1e-300)
+    edges = np.bincount(charts, np.linalg.norm(shapes[:, 1] - shapes[:, 0], axis=1), count)
+    scale = np.minimum(np.sqrt(true / np.maximum(flat, 1e-300)), 2.0 * edges / extent)
+    return np.asarray((uvs - low[charts][:, None, :]) * scale[charts][:, None, None])
+
+
+def flatten_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Flatten each face to the plane: (f, 3, 2) float64, counter-clockwise, first corner at 0."""
+    corners = np.asarray(vertices, np.float64)[faces]
+    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    length = np.maximum(np.linalg.norm(one, axis=1), 1e-300)
+    along = (one * two).sum(axis=1) / length
+    height = np.linalg.norm(np.cross(one, two), axis=1) / length
+    flat = np.zeros((len(faces), 3, 2))
+    flat[:, 1, 0] = length
+    flat[:, 2, 0], flat[:, 2, 1] = along, height
+    return flat
+
+
+def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.ndarray:
+    """Relax charts towards the true shapes of their faces (as rigid as possible).
+
+    Rounds of two steps (Liu and others 2008, "A Local/Global Approach to Mesh Parameterization"):
+    the best rotation of each face, then the least-squares points for all rotated faces. Points of
+    faces that flip or overlap as a result are restored.
+
+    Parameters
+    ----------
+    corner_uvs : (f, 3, 2) float
+        Charts of uniform density, counter-clockwise.
+    charts : (f,) int
+    shapes : (f, 3, 2) float64
+
+    Returns
+    -------
+    (f, 3, 2) float64
+    """
+    start = np.asarray(corner_uvs, np.float64)
+    corners, first = chart_points(corner_uvs.astype(np.float32), charts)
+    points = start.reshape(-1, 2)[first]
+    shapes = _widen_needles(shapes)
+    weights = _cotangents(shapes)  # (f, 3) for the edge from corner k to k + 1
+    size = len(points)
+    begin, end = half_edges(corners)
+    weight = weights.ravel()
+    off = coo_matrix((-weight, (begin, end)), shape=(size, size)).tocsr()
+    off = off + off.T
+    total = -np.asarray(off.sum(axis=1)).ravel()
+    anchor = ANCHOR_WEIGHT * float(np.mean(np.abs(total)))
+    solve = splu((off + diags(total + anchor)).tocsc(), permc_spec="MMD_AT_PLUS_A").solve
+    edges = shapes - np.roll(shapes, -1, axis=1)  # (f, 3, 2)
+    for _ in range(RELAXATIONS):
+        now = points[corners]
+        moved = now - np.roll(now, -1, axis=1)
+        cosine = (weights * (moved * edges).sum(axis=2)).sum(axis=1)
+        cross = edges[..., 0] * moved[..., 1] - edges[..., 1] * moved[..., 0]
+        sine = (weights * cross).sum(axis=1)
+        length = np.maximum(np.hypot(cosine, sine), 1e-300)
+        cosine, sine = cosine / length, sine / length
+        turned = np.stack(
+            [
+                cosine[:, None] * edges[..., 0] - sine[:, None] * edges[..., 1],
+                sine[:, None] * edges[..., 0] + cosine[:, None] * edges[..., 1],
+            ],
+            axis=2,
+        )
+        edge_targets = (weights[..., None] * turned).reshape(-1, 2)
+        right_side = anchor * points
+        for axis in range(2):
+            right_side[:, axis] += np.bincount(begin, edge_targets[:, axis], size)
+            right_side[:, axis] -= np.bincount(end, edge_targets[:, axis], size)
+        points = np.asarray(solve(right_side))
+    if not np.isfinite(points).all():
+        return start
+    return _restore_folded_faces(points, start.reshape(-1, 2)[first], corners, charts)
+
+
+def _restore_folded_faces(
+    points: np.ndarray, start: np.ndarray, corners: np.ndarray, charts: np.ndarray
+) -> np.ndarray:
+    """Restore the points of faces that flipped or overlap since the start.
+
+    Returns
+    -------
+    (f, 3, 2) float64
+    """
+    count = int(charts.max()) + 1
+    before = start[corners]
+    was_up = signed_areas(before) > 0.0
+    folded = np.bincount(charts[find_overlaps(before, charts)[:, 0]], minlength=count)
+    points = points.copy()
+    for _ in range(MAX_ROUNDS_BACK):
+        now = points[corners]
+        pairs = find_overlaps(now, charts)
+        pairs = pairs[
+            folded[charts[pairs[:, 0]]] == 0
+        ]  # charts that overlapped before are split later
+        bad = was_up & (signed_areas(now) <= 0.0)
+        bad[pairs] = True
+        back = np.unique(corners[bad])
+        back = back[(points[back] != start[back]).any(axis=1)]
+        if len(back) == 0:
+            return now
+        points[back] = start[back]
+    still_folded = np.bincount(charts, bad, count) > 0
+    return np.where(still_folded[charts][:, None, None], before, points[corners])
+
+
+def _widen_needles(shapes: np.ndarray) -> np.ndarray:
+    longest = np.linalg.norm(shapes - np.roll(shapes, -1, axis=1), axis=2).max(axis=1)
+    longest = np.maximum(longest, 1e-300)
+    double = 2.0 * np.abs(signed_areas(shapes))
+    base = np.maximum(shapes[:, 1, 0], MIN_HEIGHT_SHARE * longest)
+    wanted = np.maximum(double, MIN_HEIGHT_SHARE * longest**2)
+    result = shapes.copy()
+    result[:, 1, 0] = base
+    result[:, 2, 1] = wanted / base
+    return result
+
+
+def _cotangents(shapes: np.ndarray) -> np.ndarray:
+    """Return (f, 3) half cotangents of the angle opposite to the edge from corner k to k + 1."""
+    result = np.empty((len(shapes), 3))
+    for k in range(3):
+        apex = shapes[:, (k + 2) % 3]
+        one, two = shapes[:, k] - apex, shapes[:, (k + 1) % 3] - apex
+        cross = np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+        result[:, k] = 0.5 * (one * two).sum(axis=1) / np.maximum(cross, 1e-300)
+    return result
+
+
+# -- Split a mesh into chunks of connected faces, small enough for xatlas -------------------------
+
+
+MAX_CHUNK_FACES = 1500
+"""xatlas 0.0.11 crashes on 82k faces at once and is fast and stable at 1-2k."""
+SMALL_CHUNK_SHARE = 0.125
+MERGED_CHUNK_SHARE = 1.3
+NORMAL_COST = 1.5
+"""Cost of deviating normals relative to the cost of one chunk radius of distance."""
+
+
+def split_into_chunks(graph: FaceGraph, max_faces: int = MAX_CHUNK_FACES) -> np.ndarray:
+    """Label faces by chunk.
+
+    Chunks grow from a seed over shared edges, by distance and deviation of normals; small chunks
+    are merged with the neighbour with which they share most edges; isolated small pieces are
+    bundled.
+
+    Returns
+    -------
+    (f,) int32
+        Labels from 0; every chunk has at most ``1.3 * max_faces`` faces.
+    """
+    radius = float(np.sqrt(max(graph.areas.mean(), 1e-300) * max_faces / np.pi))
+    neighbours = np.where(graph.opposite >= 0, graph.opposite // 3, -1).astype(np.int32)
+    labels = _grow(neighbours, graph.centroids, graph.normals, radius, max_faces)
+    return _merge_small(labels, neighbours, max_faces)
+
+
+@kernel(fast=False)
+def _grow(
+    neighbours: Any, centroids: Any, normals: Any, radius: float, max_faces: int
+) -> np.ndarray:
+    count = len(neighbours)
+    labels = np.full(count, -1, np.int32)
+    # Seeds from the border of finished chunks keep the next chunk adjacent to them.
+    border = np.empty(count, np.int32)
+    border_begin, border_end = 0, 0
+    queued = np.zeros(count, np.bool_)
+    label = 0
+    scan = 0
+    while True:
+        seed = -1
+        while border_begin < border_end and seed < 0:
+            if labels[border[border_begin]] < 0:
+                seed = border[border_begin]
+            border_begin += 1
+        while seed < 0 and scan < count:
+            if labels[scan] < 0:
+                seed = scan
+            scan += 1
+        if seed < 0:
+            break
+        heap = [(0.0, np.int64(seed))]
+        size = 0
+        while len(heap) > 0 and size < max_faces:
+            face = heapq.heappop(heap)[1]
+            if labels[face] >= 0:
+                continue
+            labels[face] = label
+            size += 1
+            for k in range(3):
+                other = np.int64(neighbours[face, k])
+                if other < 0 or labels[other] >= 0:
+                    continue
+                distance2 = 0.0
+                alike = 0.0
+                for axis in range(3):
+                    distance2 += (centroids[other, axis] - centroids[seed, axis]) ** 2
+                    alike += normals[other, axis] * normals[seed, axis]
+                cost = np.sqrt(distance2) / radius + NORMAL_COST * (1.0 - alike)
+                heapq.heappush(heap, (cost, other))
+        for entry in heap:
+            other = entry[1]
+            if labels[other] < 0 and not queued[other]:
+                queued[other] = True
+                border[border_end] = other
+                border_end += 1
+        label += 1
+    return labels
+
+
+def _merge_small(labels: np.ndarray, neighbours: np.ndarray, max_faces: int) -> np.ndarray:
+    count = int(labels.max()) + 1
+    sizes = np.bincount(labels, minlength=count)
+    face, corner = np.nonzero(neighbours >= 0)
+    one, other = labels[face], labels[neighbours[face, corner]]
+    crossing = one != other
+    pairs, shared = np.unique(
+        one[crossing].astype(np.int64) * count + other[crossing], return_counts=True
+    )
+    touching: dict[int, dict[int, int]] = {}
+    for pair, edges in zip(pairs.tolist(), shared.tolist(), strict=True):
+        touching.setdefault(pair // count, {})[pair % count] = edges
+    target = np.arange(count)
+    limit = MERGED_CHUNK_SHARE * max_faces
+    small = np.flatnonzero(sizes < SMALL_CHUNK_SHARE * max_faces)
+    for chunk in small[np.argsort(sizes[small], kind="stable")].tolist():
+        shared_with: dict[int, int] = {}
+        for neighbour, edges in touching.get(chunk, {}).items():
+            root = _root(target, neighbour)
+            shared_with[root] = shared_with.get(root, 0) + edges
+        own = _root(target, chunk)
+        options = [
+            (edges, -root)
+            for root, edges in shared_with.items()
+            if root != own and sizes[root] + sizes[own] <= limit
+        ]
+        if options:
+            root = -max(options)[1]
+            target[own] = root
+            sizes[root] += sizes[own]
+            sizes[own] = 0
+    labels = np.array([_root(target, c) for c in range(count)])[labels]
+    return _bundle(labels, max_faces)
+
+
+def _root(target: np.ndarray, chunk: int) -> int:
+    while target[chunk] != chunk:
+        chunk = int(target[chunk])
+    return chunk
+
+
+def _bundle(labels: np.ndarray, max_faces: int) -> np.ndarray:
+    """Bundle chunks that are still small (isolated pieces) until a chunk is full."""
+    kept, inverse, sizes = np.unique(labels, return_inverse=True, return_counts=True)
+    bundle = np.empty(len(kept), np.int32)
+    current, filled, used = -1, max_faces, 0
+    for index, size in enumerate(sizes.tolist()):
+        if size >= SMALL_CHUNK_SHARE * max_faces:
+            bundle[index] = used
+            used += 1
+            continue
+        if filled + size > max_faces:
+            current, filled = used, 0
+            used += 1
+        bundle[index] = current
+        filled += size
+    return bundle[inverse]
+
+
+# -- Find charts of a mesh with xatlas in a helper process, without folds, and pack them ----------
+
 
 _logger = logging.getLogger(__name__)
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ...errors import DatasetError
-from ...processes.helper_process import emit
-from .chart_boxes import chart_extents, packing_scale, packing_square
+from ...worker.helper_process import emit
+from .charts import chart_extents, packing_scale, packing_square
 
 GROWTH = 1.1
 MAX_GROWTHS = 8

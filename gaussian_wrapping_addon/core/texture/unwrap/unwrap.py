@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""UV unwrap: charts and packing by xatlas, validated, with a box projection as fallback."""
+"""UVs of a mesh: charts and packing, or the mesh's own."""
 
 from __future__ import annotations
 
@@ -11,21 +11,175 @@ from pathlib import Path
 
 import numpy as np
 
+from ... import limits
 from ...errors import (
     DISK_FULL_ERRNOS,
     DatasetError,
     MemoryShortageError,
+    MeshingError,
     ResourceError,
     WorkerError,
     unwritable_error,
 )
-from ...mesh.face_graph import FaceGraph, face_graph, uv_charts
-from ...mesh.surface_mesh import SurfaceMesh
-from ...mesh.topology import edge_lengths
-from ...progress import Progress
-from ..atlas.atlas_raster import AtlasRaster, raster_atlas
-from .box_unwrap import box_unwrap
-from .charts import find_charts, pack_charts
+from ...mesh.components import FaceGraph, components, face_graph, uv_charts
+from ...mesh.surface_mesh import SurfaceMesh, edge_lengths
+from ...mesh.textured_mesh import FIRST_UDIM, TILE_COLUMNS, TILE_ROWS
+from ...progress import Progress, ReportWarning
+from ..atlas import AtlasRaster, raster_atlas
+from .charts import find_charts, pack_charts, split_wide_charts
+from .overlaps import split_overlaps
+
+# -- Fallback unwrap: box projection along the axes, charts packed in shelves ---------------------
+
+
+SMOOTHING_ROUNDS = 8
+NEIGHBOUR_VOTE = 0.4
+MIN_COSINE = 0.15
+"""A face may be projected along an axis up to 81 degrees from its normal."""
+SCALE_STEPS = 24
+
+_AXES = np.repeat(np.eye(3), 2, axis=0) * np.array([[1.0], [-1.0]] * 3)
+# For each signed axis, the two axes of a projection that is counter-clockwise from outside.
+_PLANES = ((1, 2), (2, 1), (2, 0), (0, 2), (0, 1), (1, 0))
+
+
+def box_unwrap(
+    mesh: SurfaceMesh,
+    graph: FaceGraph,
+    size_px: int,
+    gutter_px: int,
+    progress: Progress,
+    atlases: int = 1,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Unwrap by projection along the six axis directions.
+
+    Returns
+    -------
+    corner_uvs : (f, 3, 2) float32
+        UVs in [0, 1], v upwards; charts with overlaps are split.
+    face_atlas : (f,) uint8
+        Atlas of each face, below ``atlases``.
+    gutter_px : float
+        Texels kept between charts; fewer than requested if there is no room.
+    """
+    axis = _axis_of_faces(graph)
+    corners = mesh.vertices[mesh.faces]
+    plane = np.array(_PLANES)[axis]  # (f, 2)
+    flat = np.take_along_axis(corners, plane[:, None, :], axis=2)  # (f, 3, 2)
+    progress.update(0.2, "box projection")
+    other = np.where(graph.opposite >= 0, graph.opposite // 3, 0)
+    charts = components(graph, axis[other] == axis[:, None])
+    charts = split_overlaps(flat - corners.mean(axis=(0, 1))[plane][:, None, :], charts, graph)
+    progress.update(0.6, "box projection: packing")
+    if atlases > 1:
+        charts = split_wide_charts(flat, charts, atlases)
+    return _pack(flat, charts, size_px, gutter_px, atlases)
+
+
+def _axis_of_faces(graph: FaceGraph) -> np.ndarray:
+    """Choose a direction for each face, smoothed so that noise does not fragment charts."""
+    cosines = graph.normals @ _AXES.T  # (f, 6)
+    axis = cosines.argmax(axis=1)
+    rows = np.arange(len(axis))
+    for _ in range(SMOOTHING_ROUNDS):
+        votes = np.zeros_like(cosines)
+        for corner in range(3):
+            has = graph.opposite[:, corner] >= 0
+            votes[rows[has], axis[graph.opposite[has, corner] // 3]] += NEIGHBOUR_VOTE
+        allowed = (cosines > MIN_COSINE) | (rows[:, None] < 0)
+        allowed[rows, cosines.argmax(axis=1)] = True
+        chosen = np.where(allowed, cosines + votes, -np.inf).argmax(axis=1)
+        if (chosen == axis).all():
+            break
+        axis = chosen
+    return axis
+
+
+def _pack(
+    flat: np.ndarray, charts: np.ndarray, size_px: int, gutter_px: int, atlases: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Pack charts in shelves at the largest scale that fits; reduce the gutters if none does."""
+    count = int(charts.max()) + 1
+    low = np.full((count, 2), np.inf)
+    high = np.full((count, 2), -np.inf)
+    for corner in range(3):
+        np.minimum.at(low, charts, flat[:, corner])
+        np.maximum.at(high, charts, flat[:, corner])
+    extent = high - low
+    turned = extent[:, 1] > extent[:, 0]  # wide charts make lower shelves
+    lying = np.where(turned[:, None], extent[:, ::-1], extent)
+    gutter = float(gutter_px)
+    while True:
+        scale, positions = _largest_scale(lying, size_px, gutter, atlases)
+        if positions is not None or gutter < 0.01:
+            break
+        gutter *= 0.7
+    assert positions is not None
+    local = (flat - low[charts][:, None, :]) * scale  # (f, 3, 2)
+    width = extent[charts, 0][:, None] * scale
+    # A rotation by 90 degrees keeps the orientation: (x, y) -> (y, width - x).
+    quarter = np.stack([local[..., 1], width - local[..., 0]], axis=-1)
+    local = np.where(turned[charts][:, None, None], quarter, local)
+    corner_uvs = (local + positions[charts][:, None, :2]) / size_px
+    face_atlas = positions[charts, 2].astype(np.uint8)
+    return np.clip(corner_uvs, 0.0, 1.0).astype(np.float32), face_atlas, gutter
+
+
+def _largest_scale(
+    extent: np.ndarray, size_px: int, gutter: float, atlases: int
+) -> tuple[float, np.ndarray | None]:
+    high = size_px / max(float(extent.max()), 1e-300)
+    low = 0.0
+    positions = _shelves(extent * high, size_px, gutter, atlases)
+    if positions is not None:
+        return high, positions
+    best: np.ndarray | None = None
+    # Below a hundredth of the largest scale, charts would have no texels.
+    low = 0.01 * high
+    best = _shelves(extent * low, size_px, gutter, atlases)
+    if best is None and gutter >= 0.01:
+        return low, None
+    if best is None:
+        low = 0.0
+        best = np.zeros((len(extent), 3))
+    for _ in range(SCALE_STEPS):
+        middle = 0.5 * (low + high)
+        positions = _shelves(extent * middle, size_px, gutter, atlases)
+        if positions is None:
+            high = middle
+        else:
+            low, best = middle, positions
+    return low, best
+
+
+def _shelves(extent_px: np.ndarray, size_px: int, gutter: float, atlases: int) -> np.ndarray | None:
+    """Return x, y of the lower left corner of each box and its atlas; ``None`` without room."""
+    if float(((extent_px + gutter) ** 2).min()) < 0:
+        return None
+    if float(np.prod(extent_px + gutter, axis=1).sum()) > atlases * float(size_px) ** 2:
+        return None
+    order = np.argsort(-extent_px[:, 1], kind="stable")
+    positions = np.empty((len(extent_px), 3))
+    atlas = 0
+    x, y, shelf = 0.5 * gutter, 0.5 * gutter, 0.0
+    for index in order.tolist():
+        width, height = extent_px[index]
+        if x + width + 0.5 * gutter > size_px and x > 0.5 * gutter:
+            x, y = 0.5 * gutter, y + shelf + gutter
+            shelf = 0.0
+        if y + height + 0.5 * gutter > size_px and y > 0.5 * gutter and atlas + 1 < atlases:
+            atlas += 1
+            x, y, shelf = 0.5 * gutter, 0.5 * gutter, 0.0
+        if x + width + 0.5 * gutter > size_px or y + height + 0.5 * gutter > size_px:
+            return None
+        positions[index] = x, y, atlas
+        x += width + gutter
+        shelf = max(shelf, height)
+    return positions
+
+
+# -- UV unwrap: charts and packing by xatlas, validated, with a box projection as fallback --------
+
 
 _logger = logging.getLogger(__name__)
 
@@ -238,3 +392,114 @@ def _find_defect(corner_uvs: np.ndarray, face_atlas: np.ndarray, size_px: int, t
     if overlaps > 0:
         return f"{overlaps} of {used} texels are used twice"
     return ""
+
+
+# -- Use the UVs that a mesh has: check them, and find the UDIM tiles that they lie in ------------
+
+
+EDGE_TOLERANCE = 1e-4
+"""UVs that leave their tile by less are moved onto its edge: rounding of the program before."""
+MAX_FLAT_SHARE = 0.5
+"""If faces without UV area are a larger share of the surface, the UVs are refused."""
+FLAT_UV_AREA = 1e-12
+_NEW_UVS = "Unwrap the mesh, or have new UVs made (--uvs new; in the panel, UVs: New)."
+
+
+@dataclass(frozen=True)
+class OwnUvs:
+    """UVs of a mesh, ready for baking."""
+
+    unwrapped: Unwrap
+    """UVs within their tile; one atlas for each tile in use."""
+    udims: tuple[int, ...]
+    """UDIM number of each atlas; ``(1001,)`` for ordinary UVs."""
+    warnings: tuple[ReportWarning, ...]
+
+
+def own_uvs(mesh: SurfaceMesh, corner_uvs: np.ndarray) -> OwnUvs:
+    """Check the UVs of a mesh and split them by UDIM tile.
+
+    Parameters
+    ----------
+    mesh : SurfaceMesh
+    corner_uvs : (f, 3, 2) float
+        v upwards; tiles are unit squares from (0, 0) on.
+
+    Raises
+    ------
+    MeshingError
+        UVs are not finite, lie outside the tiles, cross from tile to tile, need too many tiles, or
+        have hardly any area. Names the first such face.
+    """
+    uvs = np.array(corner_uvs, np.float64)  # (f, 3, 2)
+    _refuse(~np.isfinite(uvs).all(axis=(1, 2)), "has UVs that are not finite")
+    graph = face_graph(mesh.vertices, mesh.faces)
+    flat = _uv_areas(uvs) <= FLAT_UV_AREA
+    share = float(graph.areas[flat].sum() / max(graph.areas.sum(), 1e-300))
+    if share > MAX_FLAT_SHARE:
+        raise MeshingError(
+            f"The UVs of {100 * share:.0f} % of the surface have no area: nothing can be painted "
+            "there.",
+            _NEW_UVS,
+        )
+    middle = uvs.mean(axis=1)
+    # A collapsed face on the far edge of a tile must not open the next one.
+    collapsed = np.maximum(np.ceil(middle) - 1.0, 0.0)
+    tile = np.where(flat[:, None], collapsed, np.floor(middle)).astype(np.int64)  # (f, 2)
+    inside = uvs - tile[:, None]
+    off = np.maximum(-inside, inside - 1.0).max(axis=(1, 2))
+    _refuse(
+        ((tile < 0) | (tile >= [TILE_COLUMNS, TILE_ROWS])).any(axis=1),
+        "has UVs outside of the UDIM tiles (from 0 to 10 and from 0 to 100)",
+    )
+    _refuse(off > EDGE_TOLERANCE, "has UVs that cross the edge of a tile, as repeated textures do")
+    number = tile[:, 0] + TILE_COLUMNS * tile[:, 1]
+    tiles, face_atlas = np.unique(number, return_inverse=True)
+    if len(tiles) > limits.MAX_ATLASES:
+        raise MeshingError(
+            f"The UVs lie in {len(tiles)} UDIM tiles; the limit is {limits.MAX_ATLASES}.", _NEW_UVS
+        )
+    inside = inside.clip(0.0, 1.0).astype(np.float32)
+    apart = inside + 2.0 * face_atlas.reshape(-1, 1, 1)
+    charts = uv_charts(graph, mesh.faces, apart)
+    unwrapped = Unwrap(
+        inside, charts, "own", 0.0,
+        face_atlas=face_atlas.ravel().astype(np.uint8) if len(tiles) > 1 else None,
+    )  # fmt: skip
+    warnings = []
+    if flat.any():
+        text = (
+            f"{int(flat.sum())} of {len(flat)} faces have no area in the UV map, {100 * share:.2g} "
+            "% of the surface: each shows a single colour."
+        )
+        warnings.append(ReportWarning("uv-flat", text, _NEW_UVS))
+    return OwnUvs(unwrapped, tuple(int(FIRST_UDIM + t) for t in tiles), tuple(warnings))
+
+
+def overlap_warning(overlapping: int, used: int) -> ReportWarning | None:
+    """Return a warning if texels belong to several faces, else ``None``."""
+    if overlapping == 0:
+        return None
+    text = (
+        f"{overlapping} of {used} texels are used by several faces: each shows what one of them "
+        "sees."
+    )
+    return ReportWarning("uv-overlap", text, _NEW_UVS)
+
+
+def uv_area(corner_uvs: np.ndarray) -> float:
+    """Return the area of (f, 3, 2) UVs, in squares of a texture; faces that overlap count each."""
+    return float(_uv_areas(np.asarray(corner_uvs, np.float64)).sum())
+
+
+def _uv_areas(uvs: np.ndarray) -> np.ndarray:
+    one, other = uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
+    areas: np.ndarray = 0.5 * np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0])
+    return areas
+
+
+def _refuse(bad: np.ndarray, what: str) -> None:
+    faces = np.flatnonzero(bad)
+    if len(faces):
+        more = f" (as do {len(faces)} faces in all)" if len(faces) > 1 else ""
+        raise MeshingError(f"Face {int(faces[0])} of the mesh {what}{more}.", _NEW_UVS)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import DatasetError
-from ...processes.helper_process import emit
+from ...worker.helper_process import emit
 
 ROUGH_SIDE_PX = 512
 """Charts are packed again later; here they only must not overlap."""

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.frames.camera_up import camera_up
 from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.scene.frames import camera_up
 from tests.poses import look_at_pose
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.frames.ground import find_ground_plane
+from gaussian_wrapping_addon.core.scene.frames import find_ground_plane
 
 UP = np.array([0.0, 0.0, 1.0])
 Faces = tuple[np.ndarray, np.ndarray, np.ndarray]

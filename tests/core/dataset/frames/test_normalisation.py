@@ -6,11 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.frames.normalisation import SceneFrame, find_scene_frame
-from gaussian_wrapping_addon.core.dataset.frames.scene_grid import FRAME_STEP
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
-from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
+from gaussian_wrapping_addon.core.limits import SCENE_RADIUS
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.frames import FRAME_STEP, SceneFrame, find_scene_frame
 from tests.core.dataset.model_writers import ring_poses
 from tests.poses import look_at_pose
 

@@ -9,22 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.frames.placement import (
+from gaussian_wrapping_addon.core.errors import ParseError, UsageError
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.placement import (
     Plane,
     check_scale,
     ground_step,
     origin_step,
     plane_through,
+    read_placement,
     scale_step,
     similarity_of_matrix,
     turn_to_z,
-)
-from gaussian_wrapping_addon.core.dataset.frames.placement_file import (
-    read_placement,
     write_placement,
 )
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.errors import ParseError, UsageError
 
 NOTHING = np.zeros((0, 3))
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.frames.scene_grid import (
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity, rotation_from_quaternion
+from gaussian_wrapping_addon.core.scene.frames import (
     CENTER_STEP,
     LENGTH_BITS,
     ROTATION_STEP,
@@ -16,8 +16,6 @@ from gaussian_wrapping_addon.core.dataset.frames.scene_grid import (
     snapped_length,
     snapped_rotation,
 )
-from gaussian_wrapping_addon.core.dataset.quaternion import rotation_from_quaternion
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 
 RANDOM = np.random.default_rng(11)
 

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.frames.similarity_fit import umeyama, umeyama_ransac
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.placement import umeyama, umeyama_ransac
 
 
 def rotation_about(axis: list[float], degrees: float) -> np.ndarray:

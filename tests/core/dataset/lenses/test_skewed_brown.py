@@ -6,17 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.lenses.skewed_brown import SkewedBrown
-from gaussian_wrapping_addon.core.dataset.lenses.undistort import (
+from gaussian_wrapping_addon.core.readers.lenses import (
+    SkewedBrown,
     pinhole_of,
     project,
     sampling_map,
 )
-from gaussian_wrapping_addon.core.dataset.readers.source_model import (
-    SKEWED_BROWN,
-    Brown,
-    LensCamera,
-)
+from gaussian_wrapping_addon.core.readers.source_model import SKEWED_BROWN, Brown, LensCamera
 
 BENT = Brown(-0.2, 0.06, -0.01, 0.002, p1=0.003, p2=-0.002, skew=0.8)
 

@@ -11,16 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from gaussian_wrapping_addon.core.dataset.lenses.undistort import pinhole_of, sampling_map
-from gaussian_wrapping_addon.core.dataset.photos.photo_file import (
-    apply_orientation,
-    read_mask,
-    read_photo,
-)
-from gaussian_wrapping_addon.core.dataset.photos.photo_header import read_photo_header
-from gaussian_wrapping_addon.core.dataset.readers.source_model import LensCamera
 from gaussian_wrapping_addon.core.errors import DatasetError
-from gaussian_wrapping_addon.core.imaging.bicubic import sample_bicubic
+from gaussian_wrapping_addon.core.photos.formats import read_photo_header
+from gaussian_wrapping_addon.core.photos.photo_file import apply_orientation, read_mask, read_photo
+from gaussian_wrapping_addon.core.readers.lenses import pinhole_of, sampling_map
+from gaussian_wrapping_addon.core.readers.source_model import LensCamera
+from gaussian_wrapping_addon.core.resampling import sample_bicubic
 
 CAMERAS = {
     "barrel": LensCamera("SIMPLE_RADIAL", 200, 150, (180.0, 102.0, 74.0, -0.15)),

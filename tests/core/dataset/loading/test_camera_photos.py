@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.loading import load as load_module
-from gaussian_wrapping_addon.core.dataset.loading.check import check_input
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.photos.photo_file import read_photo
-from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
-from gaussian_wrapping_addon.core.dataset.poses.pose_solver import MAX_SIFT_PX, solve_poses
-from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.errors import MissingExtraError
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
-from gaussian_wrapping_addon.core.processes import worker_extras
+from gaussian_wrapping_addon.core.jobs.store.job_folder import source_fingerprint
+from gaussian_wrapping_addon.core.loading import load as load_module
+from gaussian_wrapping_addon.core.loading.check import check_input
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.photos.photo_file import read_photo
+from gaussian_wrapping_addon.core.photos.store import PhotoStore
+from gaussian_wrapping_addon.core.poses.solver import MAX_SIFT_PX, solve_poses
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.scene import Scene
+from gaussian_wrapping_addon.core.worker import environment
 from tests.core.dataset.camera_files import write_dng
 from tests.core.dataset.model_writers import write_project
 
@@ -105,9 +105,9 @@ def test_a_missing_package_ends_the_job_before_any_work(
 ) -> None:
     source = camera_project(tmp_path)
     monkeypatch.setattr(
-        worker_extras, "EXTRAS",
-        [worker_extras.Extra(e.name, e.packages, "gw_none", e.title, e.purpose)
-         for e in worker_extras.EXTRAS],
+        environment, "EXTRAS",
+        [environment.Extra(e.name, e.packages, "gw_none", e.title, e.purpose)
+         for e in environment.EXTRAS],
     )  # fmt: skip
     with pytest.raises(MissingExtraError) as caught:
         load(source)
@@ -124,7 +124,7 @@ def test_the_solver_gets_half_developed_photos_of_the_same_camera(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of large RAW photos; cameras are those of the full size."""
-    from gaussian_wrapping_addon.core.dataset.poses import pose_solver
+    from gaussian_wrapping_addon.core.poses import solver as pose_solver
 
     size = (2 * MAX_SIFT_PX * 3 // 4, 2 * MAX_SIFT_PX)
     ramp = np.linspace(0.1, 0.9, size[1])[None, :, None] * np.ones((size[0], 1, 3))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.loading.check import check_input
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.loading.check import check_input
+from gaussian_wrapping_addon.core.loading.load import load_scene
 from gaussian_wrapping_addon.core.progress import Progress
 from tests.core.dataset.model_writers import (
     HEIGHT,

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.loading.coverage import coverage_warnings, listed
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.quality.photo_findings import photo_findings
-from gaussian_wrapping_addon.core.dataset.quaternion import quaternion_from_rotation
-from gaussian_wrapping_addon.core.dataset.readers.colmap_reader import read_colmap
+from gaussian_wrapping_addon.core.loading.check import coverage_warnings, listed
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.loading.photo_quality import photo_findings
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.readers.colmap import read_colmap
+from gaussian_wrapping_addon.core.scene.camera import quaternion_from_rotation
 from tests.core.dataset.model_writers import (
     Model,
     ring_model,

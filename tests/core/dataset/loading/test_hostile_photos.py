@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.loading.check import Finding, check_input
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.photos.photo_finder import find_mask
 from gaussian_wrapping_addon.core.files import resolve_inside
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
+from gaussian_wrapping_addon.core.jobs.store.job_folder import source_fingerprint
+from gaussian_wrapping_addon.core.loading.check import Finding, check_input
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.photos.finder import find_mask
 from gaussian_wrapping_addon.core.progress import Progress
 from tests.core.dataset.model_writers import (
     ring_model,

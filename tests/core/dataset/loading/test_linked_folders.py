@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.loading.check import check_input
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.photos.photo_finder import resolve_photo
+from gaussian_wrapping_addon.core.loading.check import check_input
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.photos.finder import resolve_photo
 from gaussian_wrapping_addon.core.progress import Progress
 from tests.core.dataset.model_writers import ring_poses, write_project
 

@@ -15,16 +15,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.frames.scene_grid import CENTER_STEP, POINT_STEP
-from gaussian_wrapping_addon.core.dataset.loading.check import check_input
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.photos.photo_file import read_photo
-from gaussian_wrapping_addon.core.dataset.scene import Scene
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene, save_scene
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, ParseError
+from gaussian_wrapping_addon.core.limits import SCENE_RADIUS
+from gaussian_wrapping_addon.core.loading.check import check_input
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.photos.photo_file import read_photo
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.frames import CENTER_STEP, POINT_STEP
+from gaussian_wrapping_addon.core.scene.scene import Scene, load_saved_scene, save_scene
 from tests.core.dataset.model_writers import (
     HEIGHT,
     WIDTH,
@@ -424,7 +423,7 @@ def test_checking_needs_numpy_only(tmp_path: Path) -> None:
         "            raise ImportError(name)\n"
         "sys.meta_path.insert(0, Refuse())\n"
         "from pathlib import Path\n"
-        "from gaussian_wrapping_addon.core.dataset.loading.check import check_input\n"
+        "from gaussian_wrapping_addon.core.loading.check import check_input\n"
         "import gaussian_wrapping_addon.core.dataset.loading.load\n"
         "import gaussian_wrapping_addon.core.dataset.photos.photo_store\n"
         "import gaussian_wrapping_addon.core.dataset.scene_file\n"

@@ -11,31 +11,30 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.frames.file_frame import FileFrame
-from gaussian_wrapping_addon.core.dataset.frames.placement_file import FILE_NAME, write_placement
-from gaussian_wrapping_addon.core.dataset.loading import load, real_world
-from gaussian_wrapping_addon.core.dataset.loading.real_world import UnitsRequest
-from gaussian_wrapping_addon.core.dataset.loading.source_kind import read_poses, source_kind
-from gaussian_wrapping_addon.core.dataset.photos.gps_exif import read_gps_exif
-from gaussian_wrapping_addon.core.dataset.photos.photo_file import apply_orientation, stored_pixels
-from gaussian_wrapping_addon.core.dataset.scene import Scene
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.dataset.units.geodesy import (
-    GeoPoint,
-    enu_from_geographic,
-    geographic_from_enu,
-)
-from gaussian_wrapping_addon.core.dataset.units.marker_scale import MarkerScale
-from gaussian_wrapping_addon.core.dataset.units.real_units import blender_start
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError, WorkerError
 from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.jobs.commands.export_files import frames_of
-from gaussian_wrapping_addon.core.jobs.stages.export_stage import _place_in_metres
-from gaussian_wrapping_addon.core.jobs.stages.scene_summary import write_scene_summary
-from gaussian_wrapping_addon.core.jobs.store.sidecar import sidecar_path, write_sidecar
-from gaussian_wrapping_addon.core.processes import worker_extras
+from gaussian_wrapping_addon.core.jobs.stages.cameras import write_scene_summary
+from gaussian_wrapping_addon.core.jobs.stages.texture import _place_in_metres
+from gaussian_wrapping_addon.core.jobs.store.job_file import sidecar_path, write_sidecar
+from gaussian_wrapping_addon.core.loading import load, real_world
+from gaussian_wrapping_addon.core.loading.real_world import UnitsRequest
+from gaussian_wrapping_addon.core.loading.source_kind import read_poses, source_kind
+from gaussian_wrapping_addon.core.photos.exif import read_gps_exif
+from gaussian_wrapping_addon.core.photos.photo_file import apply_orientation, stored_pixels
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.scene.frames import FileFrame
+from gaussian_wrapping_addon.core.scene.placement import FILE_NAME, write_placement
+from gaussian_wrapping_addon.core.scene.scene import Scene
+from gaussian_wrapping_addon.core.units.georeference import (
+    GeoPoint,
+    blender_start,
+    enu_from_geographic,
+    geographic_from_enu,
+)
+from gaussian_wrapping_addon.core.units.markers import MarkerScale
+from gaussian_wrapping_addon.core.worker import environment
 from tests.poses import look_at_pose
 
 PLACE = GeoPoint(47.2, 8.6, 430.0)
@@ -357,7 +356,7 @@ def test_what_is_wrong_is_told_before_cameras_are_solved(
     def missing(_name: str) -> Any:
         raise ModuleNotFoundError("No module named 'cv2'", name="cv2")
 
-    monkeypatch.setattr(worker_extras.importlib, "import_module", missing)
+    monkeypatch.setattr(environment.importlib, "import_module", missing)
     with pytest.raises(WorkerError, match=r"printed markers.*--add markers"):
         loaded(folder, markers="4x4_50:0.1")
 

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.loading.check import check_input
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import (
+from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.jobs.store.job_folder import source_fingerprint
+from gaussian_wrapping_addon.core.limits import SCENE_RADIUS
+from gaussian_wrapping_addon.core.loading.check import check_input
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.loading.other_inputs import (
     cameras_on_spheres,
     fibonacci_directions,
     scene_frame,
     splat_extent,
 )
-from gaussian_wrapping_addon.core.errors import DatasetError
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
 from tests.core.gaussians.splat_files import permuted, splat_columns, write_ply
 from tests.core.training.splat_shells import shell_of_discs
 

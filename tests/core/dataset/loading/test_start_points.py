@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.loading import start_points
 from gaussian_wrapping_addon.core.errors import MemoryShortageError, WorkerError, WrapError
-from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.report_warning import ReportWarning
+from gaussian_wrapping_addon.core.loading import load
+from gaussian_wrapping_addon.core.progress import Progress, ReportWarning
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 
 def points_where(
@@ -23,11 +22,11 @@ def points_where(
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(start_points, "triangulate_points", fail)
+    monkeypatch.setattr(load, "triangulate_points", fail)
     pose = np.hstack([np.eye(3), [[0.0], [0.0], [4.0]]])
     cameras = [Camera(f"{k}.png", 80, 60, 80.0, 80.0, 40.0, 30.0, pose) for k in range(3)]
     warnings: list[ReportWarning] = []
-    points, colors, origin = start_points.make_start_points(
+    points, colors, origin = load.make_start_points(
         cameras, [], [], tmp_path, Progress(), warnings, seed=0, threads=1
     )
     assert len(points) == len(colors) > 1000

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from benchmarks.camera_places import Tracks, hall_tracks, write_database
-from gaussian_wrapping_addon.core.dataset.matching import feature_steps, pair_choice
-from gaussian_wrapping_addon.core.dataset.matching.feature_steps import match_chosen
-from gaussian_wrapping_addon.core.dataset.poses.mapping import place_one_by_one
-from gaussian_wrapping_addon.core.dataset.poses.solution_check import check_solution
+from gaussian_wrapping_addon.core.poses import matching
+from gaussian_wrapping_addon.core.poses.checks import check_solution
+from gaussian_wrapping_addon.core.poses.matching import match_chosen
+from gaussian_wrapping_addon.core.poses.solver_helper import place_one_by_one
 
 pycolmap = pytest.importorskip("pycolmap")
 PHOTOS = 36
@@ -41,12 +41,12 @@ def _features(folder: Path) -> tuple[Path, Tracks]:
 
 
 def test_chosen_pairs_give_right_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (feature_steps, pair_choice):
+    for module in (matching, matching):
         monkeypatch.setattr(module, "EXHAUSTIVE_LIMIT", 10)
-    monkeypatch.setattr(pair_choice, "ALIKE_NEIGHBOURS", 6)
-    monkeypatch.setattr(pair_choice, "WELL_CONNECTED", 4)
+    monkeypatch.setattr(matching, "ALIKE_NEIGHBOURS", 6)
+    monkeypatch.setattr(matching, "WELL_CONNECTED", 4)
     said: list[float] = []
-    monkeypatch.setattr(feature_steps, "emit", lambda **values: said.append(values["fraction"]))
+    monkeypatch.setattr(matching, "emit", lambda **values: said.append(values["fraction"]))
     database, tracks = _features(tmp_path)
     names = sorted(camera.name for camera in tracks.cameras)
     task: dict[str, Any] = {

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.matching.gps_distances import gps_distances
-from gaussian_wrapping_addon.core.dataset.photos.gps_exif import GpsPosition
+from gaussian_wrapping_addon.core.photos.exif import GpsPosition
+from gaussian_wrapping_addon.core.poses.matching import gps_distances
 
 
 def test_metres_on_the_ground() -> None:

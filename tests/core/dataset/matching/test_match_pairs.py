@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.matching.match_pairs import (
+from gaussian_wrapping_addon.core.poses.matching import (
     all_pairs,
     nearest_pairs,
     pairs_by_name,

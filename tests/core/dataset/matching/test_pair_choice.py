@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.matching.match_pairs import (
+from gaussian_wrapping_addon.core.poses.matching import (
     EXHAUSTIVE_LIMIT,
-    all_pairs,
-    pairs_in_order,
-)
-from gaussian_wrapping_addon.core.dataset.matching.pair_choice import (
     SECOND_ROUND_PAIRS,
     VERIFIED_MATCHES,
+    all_pairs,
     choose_pairs,
+    pairs_in_order,
     second_round,
 )
 

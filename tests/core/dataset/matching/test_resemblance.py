@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.matching.resemblance import resemblances
+from gaussian_wrapping_addon.core.poses.matching import resemblances
 
 PHOTOS, EACH, STEP = 30, 200, 40
 

@@ -13,32 +13,30 @@ import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.loading import load as load_module
-from gaussian_wrapping_addon.core.dataset.loading.check import check_input
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.loading.panorama_input import (
-    with_views_of_panoramas,
-)
-from gaussian_wrapping_addon.core.dataset.loading.real_world import UnitsRequest
-from gaussian_wrapping_addon.core.dataset.loading.source_kind import read_poses, source_kind
-from gaussian_wrapping_addon.core.dataset.matching.match_pairs import pairs_by_pose
-from gaussian_wrapping_addon.core.dataset.panoramas.panorama_solver import panorama_pairs
-from gaussian_wrapping_addon.core.dataset.panoramas.panorama_views import (
+from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
+from gaussian_wrapping_addon.core.jobs.commands.estimate_command import input_facts
+from gaussian_wrapping_addon.core.loading import load as load_module
+from gaussian_wrapping_addon.core.loading.check import check_input
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.loading.other_inputs import with_views_of_panoramas
+from gaussian_wrapping_addon.core.loading.real_world import UnitsRequest
+from gaussian_wrapping_addon.core.loading.source_kind import read_poses, source_kind
+from gaussian_wrapping_addon.core.photos.photo_file import AS_WRITTEN
+from gaussian_wrapping_addon.core.poses.matching import pairs_by_pose
+from gaussian_wrapping_addon.core.poses.panoramas import (
     BY_SHAPE,
     FIELD_OF_VIEW_DEG,
     STATED,
     VIEWS,
     panorama_evidence,
+    panorama_pairs,
     panorama_pixels,
     view_lens,
     view_name,
 )
-from gaussian_wrapping_addon.core.dataset.photos.mask_reading import AS_WRITTEN
-from gaussian_wrapping_addon.core.dataset.scene import Scene
-from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
-from gaussian_wrapping_addon.core.jobs.commands.estimate_command import input_facts
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.scene.scene import Scene
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.dataset.panoramas.room import HALF, color_of, poses, write_panoramas
 from tests.core.dataset.readers.programs import writers

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from PIL import Image, ImageCms
 
-from gaussian_wrapping_addon.core.dataset.photos import image_formats, photo_finder
-from gaussian_wrapping_addon.core.dataset.photos.photo_exif import read_lens_exif
-from gaussian_wrapping_addon.core.dataset.photos.photo_file import (
+from gaussian_wrapping_addon.core.errors import DatasetError, MissingExtraError
+from gaussian_wrapping_addon.core.photos import finder, formats
+from gaussian_wrapping_addon.core.photos.exif import read_lens_exif
+from gaussian_wrapping_addon.core.photos.formats import read_photo_header
+from gaussian_wrapping_addon.core.photos.photo_file import (
     apply_orientation,
     photo_header,
     read_mask,
     read_photo,
 )
-from gaussian_wrapping_addon.core.dataset.photos.photo_header import read_photo_header
-from gaussian_wrapping_addon.core.errors import DatasetError, MissingExtraError
-from gaussian_wrapping_addon.core.processes import worker_extras
+from gaussian_wrapping_addon.core.worker import environment
 from tests.core.dataset.camera_files import tiff, write_dng
 
 pillow_heif = pytest.importorskip("pillow_heif")
@@ -102,7 +102,7 @@ def test_the_exif_of_heic_does_not_turn_it_again(tmp_path: Path, orientation: in
 def test_heic_is_known_by_its_content(tmp_path: Path) -> None:
     path = write_modern(tmp_path / "a.heic", quarters())
     renamed = path.rename(tmp_path / "a.jpg")
-    assert image_formats.photo_kind(renamed) == "heif"
+    assert formats.photo_kind(renamed) == "heif"
     assert worst(read_photo(renamed).color, quarters()) <= HEIC_ERROR
     Image.fromarray(quarters()).save(tmp_path / "b.png")
     for name in ("b.heic", "b.dng"):
@@ -263,15 +263,13 @@ def test_of_copies_of_a_photo_one_is_taken(tmp_path: Path) -> None:
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"x")
-    left_out = {
-        p.relative_to(tmp_path).as_posix() for p in photo_finder.list_second_copies(tmp_path)
-    }
+    left_out = {p.relative_to(tmp_path).as_posix() for p in finder.list_second_copies(tmp_path)}
     assert left_out == {"a.nef", "b.DNG", "d.raf", "F.CR2", "g.cr3"}
-    taken = {p.relative_to(tmp_path).as_posix() for p in photo_finder.list_photos(tmp_path)}
+    taken = {p.relative_to(tmp_path).as_posix() for p in finder.list_photos(tmp_path)}
     assert taken == set(names) - left_out - {"g_mask.png"}
     (tmp_path / "a.heic").write_bytes(b"x")
     (tmp_path / "a.heic.png").write_bytes(b"x")
-    assert photo_finder.find_mask([tmp_path], "a.heic") == tmp_path / "a.heic.png"
+    assert finder.find_mask([tmp_path], "a.heic") == tmp_path / "a.heic.png"
 
 
 @pytest.fixture
@@ -281,17 +279,17 @@ def no_extras(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
         raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
-    monkeypatch.setattr(worker_extras.importlib, "import_module", missing)
+    monkeypatch.setattr(environment.importlib, "import_module", missing)
 
 
 def test_without_the_packages_the_files_are_named_at_once(tmp_path: Path, no_extras: None) -> None:
     photos = [write_modern(tmp_path / f"{k}.heic", quarters()) for k in range(5)]
     photos.append(write_dng(tmp_path / "r.dng", linear_quarters()))
     Image.fromarray(quarters()).save(tmp_path / "p.jpg")
-    image_formats.require_extras([tmp_path / "p.jpg", tmp_path / "missing.jpg"])
+    formats.require_extras([tmp_path / "p.jpg", tmp_path / "missing.jpg"])
     begun_s = time.monotonic()
     with pytest.raises(MissingExtraError) as caught:
-        image_formats.require_extras(photos)
+        formats.require_extras(photos)
     assert time.monotonic() - begun_s < 1
     assert caught.value.extras == ("heif", "raw")
     assert "0.heic, 1.heic, 2.heic and 2 others: " in caught.value.message

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.photos.decoded_file import DecodedFile
+from gaussian_wrapping_addon.core.photos.store import DecodedFile
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -113,7 +113,7 @@ def test_a_killed_process_leaves_nothing(tmp_path: Path) -> None:
         "import os, signal, sys\n"
         "from pathlib import Path\n"
         "import numpy as np\n"
-        "from gaussian_wrapping_addon.core.dataset.photos.decoded_file import DecodedFile\n"
+        "from gaussian_wrapping_addon.core.photos.store import DecodedFile\n"
         "file = DecodedFile(Path(sys.argv[1]))\n"
         "file.add(('photo', 0, 1), np.ones(1000, np.uint8))\n"
         "assert file.get(('photo', 0, 1)) is not None\n"

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from gaussian_wrapping_addon.core.dataset.photos.gps_exif import gps_of_tags, read_gps_exif
+from gaussian_wrapping_addon.core.photos.exif import gps_of_tags, read_gps_exif
 
 NORTH_EAST = {1: "N", 2: (47.0, 30.0, 36.0), 3: "E", 4: (8.0, 45.0, 0.0)}
 

@@ -15,16 +15,16 @@ import numpy as np
 import pytest
 from PIL import EpsImagePlugin, Image
 
-from gaussian_wrapping_addon.core.dataset.photos.image_formats import (
+from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
+from gaussian_wrapping_addon.core.evaluation.layouts import read_mesh
+from gaussian_wrapping_addon.core.jobs.commands import export_files
+from gaussian_wrapping_addon.core.photos.exif import read_lens_exif
+from gaussian_wrapping_addon.core.photos.formats import (
     IMAGE_FORMATS,
+    read_photo_header,
     without_warnings,
 )
-from gaussian_wrapping_addon.core.dataset.photos.photo_exif import read_lens_exif
-from gaussian_wrapping_addon.core.dataset.photos.photo_file import read_mask, read_photo
-from gaussian_wrapping_addon.core.dataset.photos.photo_header import read_photo_header
-from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
-from gaussian_wrapping_addon.core.evaluation.layouts.mesh_input import read_mesh
-from gaussian_wrapping_addon.core.jobs.commands import export_files
+from gaussian_wrapping_addon.core.photos.photo_file import read_mask, read_photo
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="Ghostscript is stood for by a script")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.photos.kept_photos import KeptPhotos
+from gaussian_wrapping_addon.core.photos.store import KeptPhotos
 
 
 def array(size: int, value: int = 0) -> np.ndarray:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.loading.source_kind import source_kind
-from gaussian_wrapping_addon.core.dataset.photos.photo_finder import find_mask, list_photos
+from gaussian_wrapping_addon.core.loading.source_kind import source_kind
+from gaussian_wrapping_addon.core.photos.finder import find_mask, list_photos
 
 
 def put(*paths: Path) -> None:

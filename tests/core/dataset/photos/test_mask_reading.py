@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.photos.mask_reading import AS_WRITTEN, MaskReading
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.photos.photo_file import AS_WRITTEN, MaskReading
 from gaussian_wrapping_addon.core.progress import Progress
 from tests.core.dataset.model_writers import ring_model, write_binary, write_photos
 

@@ -6,10 +6,7 @@ from __future__ import annotations
 import pytest
 
 from gaussian_wrapping_addon.core import limits
-from gaussian_wrapping_addon.core.dataset.photos.photo_budget import (
-    photo_budget_bytes,
-    photo_memory,
-)
+from gaussian_wrapping_addon.core.photos.store import photo_budget_bytes, photo_memory
 
 GIB = 2**30
 

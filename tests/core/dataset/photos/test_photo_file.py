@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.photos.photo_file import read_mask, read_photo
 from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.photos.photo_file import read_mask, read_photo
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (40, 48, 3), dtype=np.uint8)
 

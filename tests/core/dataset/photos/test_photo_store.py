@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.photos import photo_store
-from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.photos import store as photo_store
+from gaussian_wrapping_addon.core.photos.store import PhotoStore
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
 
 
 def make_scene(folder: Path, count: int = 1, width: int = 101, height: int = 67) -> Scene:

@@ -6,12 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.poses.pose_consistency import (
-    PairEvidence,
-    Side,
-    Verdict,
-    agreeing_matches,
-)
+from gaussian_wrapping_addon.core.poses.checks import PairEvidence, Side, Verdict, agreeing_matches
 from tests.synthetic import look_at
 
 FOCAL_PX = 500.0

@@ -10,22 +10,20 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.frames.scene_grid import CENTER_STEP
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.loading.start_points import (
-    count_observing_views,
-    random_points,
-)
-from gaussian_wrapping_addon.core.dataset.photos.photo_exif import read_lens_exif
-from gaussian_wrapping_addon.core.dataset.poses import pose_solver
-from gaussian_wrapping_addon.core.dataset.poses.solution_findings import SOLUTION_NAME
-from gaussian_wrapping_addon.core.dataset.poses.standing_still import TURNTABLE_NAME
-from gaussian_wrapping_addon.core.dataset.quaternion import quaternion_from_rotation
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError
 from gaussian_wrapping_addon.core.files import write_json
+from gaussian_wrapping_addon.core.limits import SCENE_RADIUS
+from gaussian_wrapping_addon.core.loading.load import (
+    count_observing_views,
+    load_scene,
+    random_points,
+)
+from gaussian_wrapping_addon.core.photos.exif import read_lens_exif
+from gaussian_wrapping_addon.core.poses import solver
+from gaussian_wrapping_addon.core.poses.checks import SOLUTION_NAME, TURNTABLE_NAME
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
-from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
+from gaussian_wrapping_addon.core.scene.camera import Camera, quaternion_from_rotation
+from gaussian_wrapping_addon.core.scene.frames import CENTER_STEP
 from tests.core.dataset.model_writers import ring_model, write_binary
 from tests.core.dataset.poses.test_solution_findings import RIGHT
 from tests.synthetic import look_at
@@ -184,8 +182,8 @@ def test_a_part_that_stays_apart_has_one_warning(
         apart = [["000004.jpg", "000005.jpg"]]
         write_json(folder / SOLUTION_NAME, {**RIGHT, "parts": [[]], "apart": apart})
 
-    monkeypatch.setattr(pose_solver, "run_helper", solve)
-    solved = pose_solver.solve_poses(
+    monkeypatch.setattr(solver, "run_helper", solve)
+    solved = solver.solve_poses(
         photos, sorted(photos.iterdir()), [], tmp_path / "work", Progress(), threads=1
     )
     told = {warning.code: warning.text for warning in solved.warnings}

@@ -10,19 +10,17 @@ import numpy as np
 import pytest
 
 from benchmarks.camera_places import Tracks, hall_tracks, write_database
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.poses.mapping import (
+from gaussian_wrapping_addon.core.evaluation.alignment import pose_errors
+from gaussian_wrapping_addon.core.poses.checks import check_solution
+from gaussian_wrapping_addon.core.poses.solver_helper import (
     joined,
-    place_at_once,
-    place_one_by_one,
-)
-from gaussian_wrapping_addon.core.dataset.poses.mending import (
     most_alike,
     near_in_tree,
     pair_likeness,
+    place_at_once,
+    place_one_by_one,
 )
-from gaussian_wrapping_addon.core.dataset.poses.solution_check import check_solution
-from gaussian_wrapping_addon.core.evaluation.alignment.pose_error import pose_errors
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 PHOTOS = 24
 pytest.importorskip("pycolmap")

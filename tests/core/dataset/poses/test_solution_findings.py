@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.poses.solution_findings import (
+from gaussian_wrapping_addon.core.files import write_json
+from gaussian_wrapping_addon.core.poses.checks import (
     SOLUTION_NAME,
     findings,
     photos_in_parts,
     with_findings,
 )
-from gaussian_wrapping_addon.core.dataset.readers.source_model import SourceModel
-from gaussian_wrapping_addon.core.files import write_json
+from gaussian_wrapping_addon.core.readers.source_model import SourceModel
 
 NAMES = {f"{k:06d}.jpg": f"walk/{k}.JPG" for k in range(20)}
 RIGHT: dict[str, Any] = {

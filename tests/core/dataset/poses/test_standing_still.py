@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.poses.standing_still import (
+from gaussian_wrapping_addon.core.poses.checks import (
     MIN_GROUP,
     PairMotion,
     are_turning,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scenes.geometry import RayScene
-from gaussian_wrapping_addon.core.dataset.poses.turntable_masks import (
+from gaussian_wrapping_addon.core.poses.turntable import (
     masks_of_turning,
     steady_colors,
     whole_parts,

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
-from gaussian_wrapping_addon.core.dataset.scene import Scene
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene, save_scene
 from gaussian_wrapping_addon.core.errors import DatasetError
-from gaussian_wrapping_addon.core.evaluation.alignment.pose_error import pose_errors
+from gaussian_wrapping_addon.core.evaluation.alignment import pose_errors
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.photos.store import PhotoStore
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.scene import Scene, load_saved_scene, save_scene
 from tests.core.dataset.poses.turntable_photos import Turntable, turntable, write_photos
 
 COUNT, WIDTH, HEIGHT = 20, 400, 300

@@ -15,10 +15,9 @@ from PIL import Image
 
 from benchmarks.known_texture import SolidTexture, spot
 from benchmarks.scenes.geometry import RayScene, count_views, look_at
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.evaluation.surface.samples import sample_uniformly
-from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth
+from gaussian_wrapping_addon.core.evaluation.surface_scores import Truth, sample_uniformly
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 DISTANCE, ELEVATIONS_DEGREES, FOCAL_SHARE = 3.1, (18.0, 42.0), 1.25
 """The camera stands still at one elevation after the other, for as many photos each."""

@@ -13,18 +13,18 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from gaussian_wrapping_addon import batch
-from gaussian_wrapping_addon.core.dataset.loading import check
-from gaussian_wrapping_addon.core.dataset.loading.check import Finding
-from gaussian_wrapping_addon.core.dataset.quality.photo_findings import photo_findings
-from gaussian_wrapping_addon.core.dataset.quality.photo_measures import (
+from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, EXIT_DONE, Cancelled
+from gaussian_wrapping_addon.core.jobs.commands import photo_check_command
+from gaussian_wrapping_addon.core.loading import check
+from gaussian_wrapping_addon.core.loading.check import Finding
+from gaussian_wrapping_addon.core.loading.photo_quality import (
     MEASURED_PX,
+    beside,
+    photo_findings,
     reduced_grey,
     sharpness_of,
 )
-from gaussian_wrapping_addon.core.dataset.quality.set_comparison import beside
-from gaussian_wrapping_addon.core.dataset.video.probe import ProbedVideo
-from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, EXIT_DONE, Cancelled
-from gaussian_wrapping_addon.core.jobs.commands import photo_check_command
+from gaussian_wrapping_addon.core.photos.video import ProbedVideo
 from gaussian_wrapping_addon.core.progress import Progress
 
 COUNT = 12

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.quaternion import (
+from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, DatasetError, ParseError
+from gaussian_wrapping_addon.core.readers.colmap import read_colmap
+from gaussian_wrapping_addon.core.readers.source_model import LENS_NAMES, LENS_PARAMETERS
+from gaussian_wrapping_addon.core.scene.camera import (
     quaternion_from_rotation,
     rotation_from_quaternion,
 )
-from gaussian_wrapping_addon.core.dataset.readers.colmap_reader import read_colmap
-from gaussian_wrapping_addon.core.dataset.readers.source_model import LENS_NAMES, LENS_PARAMETERS
-from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, DatasetError, ParseError
 from tests.core.dataset.model_writers import (
     HEIGHT,
     WIDTH,
@@ -126,7 +126,7 @@ def test_file_cut_inside_a_name_ends_with_the_offset(tmp_path: Path) -> None:
     (folder / "images.bin").write_bytes(whole[:cut])
     code = (
         "import sys; from pathlib import Path\n"
-        "from gaussian_wrapping_addon.core.dataset.readers.colmap_reader import read_colmap\n"
+        "from gaussian_wrapping_addon.core.readers.colmap import read_colmap\n"
         "from gaussian_wrapping_addon.core.errors import WrapError\n"
         "try: read_colmap(Path(sys.argv[1]))\n"
         "except WrapError as error: sys.stderr.write(str(error)); sys.exit(error.exit_code)\n"

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.readers.point_file import read_point_ply
 from gaussian_wrapping_addon.core.errors import ParseError
+from gaussian_wrapping_addon.core.readers.point_files import read_point_ply
 
 HEADER = "ply\nformat ascii 1.0\ncomment x\nelement vertex 1\n{}end_header\n"
 XYZ = "property float x\nproperty float y\nproperty float z\n"

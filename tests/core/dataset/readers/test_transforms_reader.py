@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.readers.colmap_reader import read_colmap
-from gaussian_wrapping_addon.core.dataset.readers.transforms_reader import read_transforms
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
+from gaussian_wrapping_addon.core.readers.colmap import read_colmap
+from gaussian_wrapping_addon.core.readers.transforms import read_transforms
 from tests.core.dataset.real_sets import real_set
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 UNITS_PER_METRE = 3.7
 DICTIONARY = "4x4_50"

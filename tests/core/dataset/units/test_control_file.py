@@ -8,17 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.units.control_file import (
+from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
+from gaussian_wrapping_addon.core.units.control_points import (
     MAX_FILE_BYTES,
     CoordinateSystem,
     parse_control_file,
     read_control_file,
 )
-from gaussian_wrapping_addon.core.dataset.units.geodesy import (
-    geographic_from_enu,
-    utm_from_geographic,
-)
-from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
+from gaussian_wrapping_addon.core.units.georeference import geographic_from_enu, utm_from_geographic
 
 FILE = Path("gcp.txt")
 GOOD = """\

@@ -6,14 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.dataset.units.control_file import ControlFile, CoordinateSystem
-from gaussian_wrapping_addon.core.dataset.units.control_points import (
+from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.units.control_points import (
+    ControlFile,
+    CoordinateSystem,
     Observations,
     fit_control_points,
 )
-from gaussian_wrapping_addon.core.errors import DatasetError
 from tests.core.dataset.units.test_triangulation import ring
 
 LOCAL = ControlFile(CoordinateSystem("local"), ())

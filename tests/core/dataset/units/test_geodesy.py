@@ -7,7 +7,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.units.geodesy import (
+from gaussian_wrapping_addon.core.units.georeference import (
     ECCENTRICITY_2,
     SEMI_MAJOR_M,
     GeoPoint,

@@ -6,18 +6,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.photos.gps_exif import GpsPosition
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.dataset.units.geodesy import (
+from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.photos.exif import GpsPosition
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.units.georeference import (
+    ENOUGH,
     GeoPoint,
     enu_axes,
     enu_from_geographic,
     geographic_from_enu,
+    georeference,
+    robust_similarity,
 )
-from gaussian_wrapping_addon.core.dataset.units.georeference import ENOUGH, georeference
-from gaussian_wrapping_addon.core.dataset.units.robust_fit import robust_similarity
-from gaussian_wrapping_addon.core.errors import DatasetError
 from tests.poses import look_at_pose
 
 PLACE = GeoPoint(46.84, 179.9999, 210.0)

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.loading import load
-from gaussian_wrapping_addon.core.dataset.loading.real_world import UnitsRequest
-from gaussian_wrapping_addon.core.dataset.units.marker_edges import refined_corners
-from gaussian_wrapping_addon.core.dataset.units.marker_scale import (
+from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.loading import load
+from gaussian_wrapping_addon.core.loading.real_world import UnitsRequest
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.settings.job import MarkerSpec
+from gaussian_wrapping_addon.core.units.markers import (
     SeenMarker,
     find_markers,
+    refined_corners,
     scale_from_markers,
 )
-from gaussian_wrapping_addon.core.errors import DatasetError
-from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.settings.markers import MarkerSpec
 from tests.core.dataset.units.marker_scene import (
     DICTIONARY,
     SIDE_M,

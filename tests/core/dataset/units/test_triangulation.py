@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.units.triangulation import triangulate
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.units.control_points import triangulate
 from tests.poses import look_at_pose
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.video.choose_frames import (
+from gaussian_wrapping_addon.core.photos.video_frames import (
     FEWEST_FRAMES,
     MOST_FRAMES,
     FrameMeasures,

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core import limits
-from gaussian_wrapping_addon.core.dataset.video import decode
-from gaussian_wrapping_addon.core.dataset.video.decode import (
+from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.photos import video as decode
+from gaussian_wrapping_addon.core.photos.video import (
     frames_of,
     grey_of,
     open_video,
     upright_color,
     upright_size,
 )
-from gaussian_wrapping_addon.core.errors import DatasetError
 from tests.core.dataset.video.small_videos import FPS, HEIGHT, WIDTH, pan, write
 
 

@@ -11,15 +11,10 @@ import pytest
 from PIL import Image
 
 from gaussian_wrapping_addon.core import limits
-from gaussian_wrapping_addon.core.dataset.video import extract_helper
-from gaussian_wrapping_addon.core.dataset.video.extract import VideoFrames, extract_frames
-from gaussian_wrapping_addon.core.errors import (
-    Cancelled,
-    DatasetError,
-    ResourceError,
-    WrapError,
-)
+from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, ResourceError, WrapError
 from gaussian_wrapping_addon.core.files import write_json
+from gaussian_wrapping_addon.core.photos import video_frames
+from gaussian_wrapping_addon.core.photos.video_frames import VideoFrames, extract_frames
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from tests.core.dataset.video.small_videos import HEIGHT, WIDTH, mural, pan, shot, write
 
@@ -124,7 +119,7 @@ def test_so_many_frames_a_second_are_refused(
     task = {"video": str(path), "frames": 0, "fps": 25.0, "threads": 1}
     write_json(tmp_path / "task" / "task.json", task)
     with pytest.raises(DatasetError, match=r"25 frames of each of the 1 s of clip\.mp4 are more"):
-        extract_helper.main(tmp_path / "task")
+        video_frames.main(tmp_path / "task")
 
 
 def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,9 +131,9 @@ def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(extract_helper, "write_photo", full)
+    monkeypatch.setattr(video_frames, "write_photo", full)
     with pytest.raises(ResourceError, match="No room is left on the disk"):
-        extract_helper.main(tmp_path / "task")
+        video_frames.main(tmp_path / "task")
 
 
 def test_hdr_is_a_warning(tmp_path: Path) -> None:

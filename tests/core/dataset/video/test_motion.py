@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
 
-from gaussian_wrapping_addon.core.dataset.video.motion import MotionMeter, displacement_px
+from gaussian_wrapping_addon.core.photos.video_frames import MotionMeter, displacement_px
 
 SHAPE = (90, 160)
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.loading import check
-from gaussian_wrapping_addon.core.dataset.loading.check import Finding, check_input
-from gaussian_wrapping_addon.core.dataset.video import probe
-from gaussian_wrapping_addon.core.dataset.video.probe import probe_video, probed
 from gaussian_wrapping_addon.core.errors import DatasetError, WorkerError
 from gaussian_wrapping_addon.core.jobs.commands.estimate_command import input_facts
+from gaussian_wrapping_addon.core.loading import check
+from gaussian_wrapping_addon.core.loading.check import Finding, check_input
+from gaussian_wrapping_addon.core.photos import video
+from gaussian_wrapping_addon.core.photos.video import probe_video, probed
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.dataset.video.small_videos import HEIGHT, WIDTH, pan, write
 
@@ -74,8 +74,8 @@ def test_a_worker_without_the_decoder_says_so(
     def missing(_path: Path) -> None:
         raise ModuleNotFoundError("No module named 'av'", name="av")
 
-    monkeypatch.setattr(probe, "probed", missing)
-    assert probe.main(["clip.mp4"]) == WorkerError.exit_code
+    monkeypatch.setattr(video, "probed", missing)
+    assert video.main(["clip.mp4"]) == WorkerError.exit_code
     (line,) = capsys.readouterr().out.splitlines()
     said = json.loads(line)
     assert "lacks a package" in said["error"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
-from gaussian_wrapping_addon.core.dataset.video.sharpness import (
+from gaussian_wrapping_addon.core.photos.video_frames import (
     are_blurred,
     details,
     relative_sharpness,

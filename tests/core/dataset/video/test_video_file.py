@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.loading.source_kind import source_kind
-from gaussian_wrapping_addon.core.dataset.video.video_file import container_of
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
+from gaussian_wrapping_addon.core.loading.source_kind import source_kind
+from gaussian_wrapping_addon.core.photos.video import container_of
 from tests.core.dataset.video.small_videos import pan, write
 
 

@@ -6,14 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
-from gaussian_wrapping_addon.core.evaluation.alignment.pose_error import pose_errors
-from gaussian_wrapping_addon.core.evaluation.alignment.similarity_alignment import (
-    icp,
-    refine_as_tanks,
-)
+from gaussian_wrapping_addon.core.evaluation.alignment import icp, pose_errors, refine_as_tanks
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
 
 
 def rotation_about(axis: list[float], degrees: float) -> np.ndarray:

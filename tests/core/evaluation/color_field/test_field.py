@@ -6,15 +6,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.evaluation.color_field.contraction import Contraction
-from gaussian_wrapping_addon.core.evaluation.color_field.field import (
+from gaussian_wrapping_addon.core.evaluation.color_field import (
+    CORNERS,
+    RATIO,
     ColorFieldSettings,
+    Contraction,
+    Level,
     Samples,
     fit_color_field,
+    pack,
 )
-from gaussian_wrapping_addon.core.evaluation.color_field.lattice import CORNERS, RATIO, Level, pack
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.poses import look_at_pose
 
 HOME = Contraction(np.zeros(3), 1.0)

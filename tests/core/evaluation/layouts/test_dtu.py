@@ -13,10 +13,9 @@ import trimesh
 from scipy.io import savemat
 
 from gaussian_wrapping_addon import batch
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.evaluation.command import EvaluationRequest, evaluate_mesh
-from gaussian_wrapping_addon.core.evaluation.layouts.dtu import (
+from gaussian_wrapping_addon.core.evaluation.layouts import (
     align_to_scan,
     read_dtu,
     read_observation_mask,
@@ -24,6 +23,7 @@ from gaussian_wrapping_addon.core.evaluation.layouts.dtu import (
     score_dtu,
 )
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 from tests.core.evaluation.layouts.written_layouts import (
     JOB_FROM_TRUTH,
     Mesh,

@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.core.evaluation.layouts.polygon_volume import (
-    PolygonVolume,
-    read_polygon_volume,
-)
+from gaussian_wrapping_addon.core.evaluation.layouts import PolygonVolume, read_polygon_volume
 
 # The letter U, 3 wide and 3 high, with a gap of 1 from above.
 LETTER = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], float)

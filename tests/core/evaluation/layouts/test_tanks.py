@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon import batch
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
-from gaussian_wrapping_addon.core.evaluation.layouts.tanks import (
+from gaussian_wrapping_addon.core.evaluation.layouts import (
     THRESHOLDS,
     align_to_log,
     photo_numbers,
@@ -22,7 +21,8 @@ from gaussian_wrapping_addon.core.evaluation.layouts.tanks import (
     read_trajectory,
     score_tanks,
 )
-from gaussian_wrapping_addon.core.evaluation.surface.samples import face_normals
+from gaussian_wrapping_addon.core.evaluation.surface_scores import face_normals
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.evaluation.layouts.written_layouts import (
     JOB_FROM_TRUTH,
     Mesh,

@@ -10,11 +10,10 @@ import numpy as np
 import trimesh
 from scipy.io import savemat
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.evaluation.surface.samples import sample_uniformly
+from gaussian_wrapping_addon.core.evaluation.surface_scores import sample_uniformly
 from gaussian_wrapping_addon.core.names import JOB_MARKER
-from gaussian_wrapping_addon.core.texture.files.textured_files import write_mesh_ply
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.texture.file_checks import write_mesh_ply
 
 Mesh = tuple[np.ndarray, np.ndarray]
 

@@ -10,7 +10,7 @@ from typing import Any
 from PIL import Image
 
 from gaussian_wrapping_addon.core.evaluation.report.report import write_report
-from gaussian_wrapping_addon.core.report_warning import ReportWarning
+from gaussian_wrapping_addon.core.progress import ReportWarning
 
 REGION = "stem_1"
 PICTURES = (

@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.evaluation.report.mesh_size import sizes_in_world
 from gaussian_wrapping_addon.core.evaluation.report.pictures import (
     CAPTION_PX,
     ERROR_GAIN,
@@ -26,10 +24,12 @@ from gaussian_wrapping_addon.core.evaluation.report.pictures import (
     write_held_out,
     write_learning_curve,
 )
-from gaussian_wrapping_addon.core.imaging.view_metrics import psnr
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.evaluation.report.region_section import sizes_in_world
+from gaussian_wrapping_addon.core.image_metrics import psnr
+from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 from tests.core.training.small_scene import sphere_gaussians, sphere_scene
 
 SVG = "{http://www.w3.org/2000/svg}"

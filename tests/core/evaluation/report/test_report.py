@@ -13,21 +13,18 @@ from typing import Any
 
 import pytest
 
-from gaussian_wrapping_addon.core.evaluation.report.figures import figure_rows
-from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
-from gaussian_wrapping_addon.core.evaluation.report.report import headline
-from gaussian_wrapping_addon.core.evaluation.report.report_warnings import (
-    collect_warnings,
-)
-from gaussian_wrapping_addon.core.evaluation.report.text import (
+from gaussian_wrapping_addon.core.evaluation.report.figures import (
     NOT_MEASURED,
     bar,
+    collect_warnings,
     duration,
     escaped,
+    figure_rows,
     number,
     percent,
     table,
 )
+from gaussian_wrapping_addon.core.evaluation.report.report import headline, report_markdown
 from gaussian_wrapping_addon.core.files import finite_json
 from gaussian_wrapping_addon.core.settings import JobSettings, to_json
 from tests.core.evaluation.report.report_examples import (

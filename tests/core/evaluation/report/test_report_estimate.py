@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from gaussian_wrapping_addon.core.evaluation.report.estimate_section import estimate_lines
+from gaussian_wrapping_addon.core.evaluation.report.report import estimate_lines
 
 EXPECTED = {"seconds_low": 60.0, "seconds_high": 120.0, "memory_bytes": 2**30}
 

@@ -9,17 +9,14 @@ from typing import Any
 
 import pytest
 
-from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
-from gaussian_wrapping_addon.core.evaluation.report.report import headline
-from gaussian_wrapping_addon.core.evaluation.report.report_warnings import (
+from gaussian_wrapping_addon.core.evaluation.report.figures import (
     FEW_HELD_OUT,
     TEXELLESS_SHARE,
     collect_warnings,
-)
-from gaussian_wrapping_addon.core.evaluation.report.text import (
     escaped,
 )
-from gaussian_wrapping_addon.core.report_warning import ReportWarning, read_warnings
+from gaussian_wrapping_addon.core.evaluation.report.report import headline, report_markdown
+from gaussian_wrapping_addon.core.progress import ReportWarning, read_warnings
 from tests.core.evaluation.report.report_examples import (
     REGION,
     full_region,

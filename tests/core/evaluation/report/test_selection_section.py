@@ -9,14 +9,9 @@ from typing import Any
 
 import pytest
 
-from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
-from gaussian_wrapping_addon.core.evaluation.report.selection_section import selection_lines
+from gaussian_wrapping_addon.core.evaluation.report.report import report_markdown, selection_lines
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.selection.model_selection import (
-    Decision,
-    ModelSelection,
-    decide,
-)
+from gaussian_wrapping_addon.core.training.model_selection import Decision, ModelSelection, decide
 from tests.core.evaluation.report.report_examples import full_summary
 
 NAMES = (

@@ -8,13 +8,12 @@ import dataclasses
 import numpy as np
 import trimesh
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.evaluation.surface.samples import (
+from gaussian_wrapping_addon.core.evaluation.surface_scores import (
     SurfaceSamples,
+    Truth,
     sample_uniformly,
 )
-from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
 from tests.poses import look_at_pose
 
 Mesh = tuple[np.ndarray, np.ndarray]

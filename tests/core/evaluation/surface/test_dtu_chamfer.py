@@ -11,14 +11,14 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gaussian_wrapping_addon.core.errors import MeshingError, ResourceError, UsageError
-from gaussian_wrapping_addon.core.evaluation.surface.dtu_chamfer import (
+from gaussian_wrapping_addon.core.evaluation.dtu_chamfer import (
     DtuScore,
     ObservationMask,
     dtu_chamfer,
     resample_mesh,
     thin_by_distance,
 )
-from gaussian_wrapping_addon.core.evaluation.surface.samples import sample_uniformly
+from gaussian_wrapping_addon.core.evaluation.surface_scores import sample_uniformly
 from tests.core.evaluation.surface.surface_scenes import ball
 
 GROUND = np.array([0.0, 0.0, 1.0, 50.0])

@@ -10,15 +10,12 @@ import pytest
 import torch
 import trimesh
 
-from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.evaluation.surface.field_errors import (
-    depth_errors,
-    vacancy_errors,
-)
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
+from gaussian_wrapping_addon.core.evaluation.field_errors import depth_errors, vacancy_errors
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.field.field_scenes import camera_at, unit_sphere
 from tests.poses import look_at_pose
 
@@ -57,7 +54,7 @@ def test_the_right_surface_has_no_error() -> None:
     assert depth.pixels > 10_000
     # Depth needs T <= 0.45 behind the ray's peak, which rays near the silhouette do not reach: the
     # discs q_min < 2 ln(alpha / 0.55) and q_min < 2 ln(2 alpha) differ by this ratio of areas.
-    valid = math.log(ALPHA / (1.0 - tolerances.DEPTH_VALID_TRANSMITTANCE)) / math.log(2 * ALPHA)
+    valid = math.log(ALPHA / (1.0 - limits.DEPTH_VALID_TRANSMITTANCE)) / math.log(2 * ALPHA)
     assert depth.found == pytest.approx(valid, abs=0.01)
     assert depth.median < 2e-4  # the facets lie up to 3e-4 of the radius below the sphere
     assert depth.within[1] == depth.found
@@ -95,7 +92,7 @@ def test_depth_is_compared_along_the_ray_far_off_the_axis() -> None:
     missed_sq = eye @ eye - along**2  # (h, w) squared distance of the ray from the middle
     shown = missed_sq < (RADIUS - offset) ** 2
     # See above: the ray's peak has to leave T <= 0.45 behind it.
-    limit = SIGMA**2 * 2.0 * math.log(ALPHA / (1.0 - tolerances.DEPTH_VALID_TRANSMITTANCE))
+    limit = SIGMA**2 * 2.0 * math.log(ALPHA / (1.0 - limits.DEPTH_VALID_TRANSMITTANCE))
     valid = missed_sq < limit
     assert 1.1 < stretch[valid].min() < 1.3 < stretch[valid].max() < 1.5
     reach = [np.sqrt(radius**2 - missed_sq[valid]) for radius in (RADIUS, RADIUS - offset)]

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from gaussian_wrapping_addon.core.errors import MeshingError, UsageError
-from gaussian_wrapping_addon.core.evaluation.surface.samples import (
+from gaussian_wrapping_addon.core.evaluation.surface_scores import (
     SurfaceSamples,
     choose_per_cell,
     face_normals,
@@ -20,7 +20,7 @@ from gaussian_wrapping_addon.core.evaluation.surface.samples import (
     voxel_downsample,
 )
 from gaussian_wrapping_addon.core.mesh.depth_buffer import NEAR_DEPTH
-from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
+from gaussian_wrapping_addon.core.mesh.sampling import distances_to_mesh
 from tests.core.evaluation.surface.surface_scenes import (
     ball,
     camera_at,

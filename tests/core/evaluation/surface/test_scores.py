@@ -12,24 +12,23 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gaussian_wrapping_addon.core.errors import MeshingError, UsageError
-from gaussian_wrapping_addon.core.evaluation.surface import scores as surface_scores
-from gaussian_wrapping_addon.core.evaluation.surface.samples import (
+from gaussian_wrapping_addon.core.evaluation import surface_scores
+from gaussian_wrapping_addon.core.evaluation.surface_scores import (
+    PROTOCOLS,
+    RegionCrop,
     SurfaceSamples,
+    SurfaceScore,
+    Truth,
     face_normals,
     sample_legacy,
     sample_uniformly,
-)
-from gaussian_wrapping_addon.core.evaluation.surface.scores import (
-    PROTOCOLS,
-    SurfaceScore,
     score_clouds,
     score_protocols,
     score_surface,
 )
-from gaussian_wrapping_addon.core.evaluation.surface.truth import RegionCrop, Truth
-from gaussian_wrapping_addon.core.kernels.parallel import default_threads
-from gaussian_wrapping_addon.core.mesh import distance as surface_distance
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.mesh import sampling as surface_distance
+from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.evaluation.surface.surface_scenes import (
     Mesh,
     ball,

@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
-from gaussian_wrapping_addon.core.evaluation.surface.samples import SurfaceSamples, sample_uniformly
-from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth, read_truth
-from gaussian_wrapping_addon.core.regions.convex_region import Region
-from gaussian_wrapping_addon.core.regions.region import write_region
+from gaussian_wrapping_addon.core.evaluation.surface_scores import (
+    SurfaceSamples,
+    Truth,
+    read_truth,
+    sample_uniformly,
+)
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.evaluation.surface.surface_scenes import ball
 
 

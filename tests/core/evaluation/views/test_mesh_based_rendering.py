@@ -14,16 +14,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.evaluation.views.mesh_based_rendering import (
+from gaussian_wrapping_addon.core.evaluation.mesh_based_rendering import (
     MeshBasedRendering,
     MeshBasedSettings,
     PhotoView,
     mesh_based_rendering,
 )
-from gaussian_wrapping_addon.core.imaging.lpips import WEIGHTS_VARIABLE, Lpips
+from gaussian_wrapping_addon.core.image_metrics import WEIGHTS_VARIABLE, Lpips
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
 from tests.core.evaluation.views.lpips_weights import random_states, write
 from tests.core.texture.texture_scenes import look_at, ring, shoot, sphere_hit
 

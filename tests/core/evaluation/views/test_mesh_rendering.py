@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.evaluation.views import mesh_rendering
-from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
-from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import (
+from gaussian_wrapping_addon.core.evaluation import mesh_rendering
+from gaussian_wrapping_addon.core.evaluation.mesh_rendering import (
     BACKGROUND,
     TexturedRenderer,
+    render_views,
 )
-from gaussian_wrapping_addon.core.imaging.lpips import WEIGHTS_VARIABLE, Lpips
-from gaussian_wrapping_addon.core.imaging.view_metrics import PSNR_CAP_DB
+from gaussian_wrapping_addon.core.image_metrics import PSNR_CAP_DB, WEIGHTS_VARIABLE, Lpips
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from tests.core.evaluation.views.gradient_wall import CAMERAS, gradient_wall

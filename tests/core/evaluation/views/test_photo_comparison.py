@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gaussian_wrapping_addon.core import image_metrics
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.core.evaluation.views import photo_comparison
-from gaussian_wrapping_addon.core.evaluation.views.held_out_texture import bake_held_out_texture
-from gaussian_wrapping_addon.core.evaluation.views.photo_comparison import (
-    LONG_SIDE_PX,
+from gaussian_wrapping_addon.core.evaluation import photo_views
+from gaussian_wrapping_addon.core.evaluation.mesh_based_rendering import bake_held_out_texture
+from gaussian_wrapping_addon.core.evaluation.photo_views import (
+    GAP_PX,
     MAX_PHOTOS,
+    PHOTO_COMPARISON_LONG_SIDE_PX,
     PICTURE_WIDTH_PX,
     compare_with_photos,
 )
-from gaussian_wrapping_addon.core.evaluation.views.side_by_side import GAP_PX
-from gaussian_wrapping_addon.core.imaging import lpips
 from gaussian_wrapping_addon.core.progress import Progress
 from tests.core.evaluation.views.gradient_wall import gradient_wall, wall_color, wall_hit
 from tests.core.texture.texture_scenes import FakePhotos, look_at, photograph, scene_of
@@ -75,7 +75,7 @@ def test_a_held_out_photo_is_judged_by_a_texture_without_it(tmp_path: Path) -> N
     scores = {view["name"]: view["psnr"] for view in values["views"]}
     assert scores.keys() == {"2.jpg", "4.jpg"}
     assert max(scores.values()) < 12.0
-    assert values["note"] == photo_comparison.NOTE_HELD_OUT
+    assert values["note"] == photo_views.NOTE_HELD_OUT
     assert values["texture_size_px"] == len(wall.albedo)
     assert values["bake_s"] >= 0.0
     assert sorted(p.name for p in tmp_path.iterdir()) == values["pictures"]
@@ -85,7 +85,7 @@ def test_a_held_out_photo_is_judged_by_a_texture_without_it(tmp_path: Path) -> N
         from_gaussians=True,
     )  # fmt: skip
     assert {view["name"]: view["psnr"] for view in values["views"]}["2.jpg"] > 40.0
-    assert values["note"] == photo_comparison.NOTE_GAUSSIANS
+    assert values["note"] == photo_views.NOTE_GAUSSIANS
 
 
 @pytest.mark.parametrize(("reduction", "size_px"), [(1, 1024), (3, 512), (4, 256), (99, 256)])
@@ -122,7 +122,7 @@ def test_large_photos_are_compared_small(tmp_path: Path) -> None:
     values = compared(photos, [], tmp_path)
     with Image.open(tmp_path / values["pictures"][0]) as picture:
         # 1700 / 3 is the largest whole fraction that fits.
-        assert LONG_SIDE_PX >= 1700 // 3
+        assert PHOTO_COMPARISON_LONG_SIDE_PX >= 1700 // 3
         assert picture.size == (2 * (1700 // 3) + GAP_PX, 40)
     photos = wall_photos(1, 800, 40)
     values = compared(photos, [], tmp_path)
@@ -159,8 +159,8 @@ def test_broken_weights_of_lpips_do_not_end_the_job(
     def broken() -> None:
         raise ParseError("alex.pth", "whole file", "not weights.")
 
-    monkeypatch.setattr(lpips.Lpips, "load", broken)
-    assert photo_comparison.lpips_if_ready is lpips.lpips_if_ready
+    monkeypatch.setattr(image_metrics.Lpips, "load", broken)
+    assert photo_views.lpips_if_ready is image_metrics.lpips_if_ready
     photos = wall_photos(1)
     values = compared(photos, [], tmp_path)
     assert "alex.pth" in values["lpips_note"]

@@ -10,9 +10,8 @@ import pytest
 from PIL import Image
 
 from gaussian_wrapping_addon.core.errors import ResourceError
-from gaussian_wrapping_addon.core.evaluation.views.preview import choose_view, write_preview
-from gaussian_wrapping_addon.core.evaluation.views.side_by_side import GAP_PX
-from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import BACKGROUND
+from gaussian_wrapping_addon.core.evaluation.mesh_rendering import BACKGROUND
+from gaussian_wrapping_addon.core.evaluation.photo_views import GAP_PX, choose_view, write_preview
 from tests.core.evaluation.views.gradient_wall import CAMERAS, gradient_wall, wall_color, wall_hit
 from tests.core.texture.texture_scenes import FakePhotos, look_at, photograph, scene_of
 

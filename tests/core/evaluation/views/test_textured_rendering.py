@@ -6,12 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import (
-    BACKGROUND,
-    TexturedRenderer,
-)
+from gaussian_wrapping_addon.core.evaluation.mesh_rendering import BACKGROUND, TexturedRenderer
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.evaluation.views.gradient_wall import CAMERAS, gradient_wall, wall_color, wall_hit
 from tests.core.texture.texture_scenes import look_at, photograph
 

@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.field.vacancy.photo_masks import PackedMask
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import SETTLED, VacancyField
+from gaussian_wrapping_addon.core.field.vacancy import SETTLED, PackedMask, VacancyField
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.field.field_scenes import camera_at, cameras_around, random_arrays, shell_arrays
 
 

@@ -10,16 +10,17 @@ import numba
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import Cancelled, UsageError
-from gaussian_wrapping_addon.core.field.vacancy.brute_force import (
+from gaussian_wrapping_addon.core.field.vacancy import (
+    SETTLED,
+    VacancyField,
     brute_force_vacancy,
     log_transmittance,
 )
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import SETTLED, VacancyField
-from gaussian_wrapping_addon.core.field.vacancy.vacancy_kernels import transmittance_of_cells
+from gaussian_wrapping_addon.core.field.vacancy_kernels import transmittance_of_cells
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 from tests.core.field.field_scenes import (
     around_shell,
     camera_at,

@@ -17,13 +17,12 @@ import pytest
 import trimesh
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.refined_scene import save_poses
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene, save_scene
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.rollback import finished_job
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.scene import load_saved_scene, save_poses, save_scene
 from tests.core.jobs.finished_sphere import write_finished_sphere
 from tests.core.training.small_scene import surface_color
 from tests.proofs import first_then_proofs
@@ -224,8 +223,7 @@ def test_refined_poses_are_used_where_the_training_has_them(tmp_path: Path) -> N
 
 @pytest.mark.proof
 def test_a_cancelled_bake_leaves_no_files_and_is_resumed(job: JobFolder, tmp_path: Path) -> None:
-    from gaussian_wrapping_addon.core.jobs.store.bake_request import BakeRequest
-    from gaussian_wrapping_addon.core.jobs.store.job_file import make_bake_job
+    from gaussian_wrapping_addon.core.jobs.store.job_file import BakeRequest, make_bake_job
 
     mesh = write_world(tmp_path / "large.ply")
     request = BakeRequest(str(mesh), "cancelled")

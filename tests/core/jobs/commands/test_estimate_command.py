@@ -9,17 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import (
-    FAR_VIEWS,
-    NEAR_VIEWS,
-    PHOTO_SIDE_PX,
-)
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
-from gaussian_wrapping_addon.core.gaussians.splat_ply import write_splat_ply
+from gaussian_wrapping_addon.core.gaussians.files import write_splat_ply
 from gaussian_wrapping_addon.core.jobs.commands import estimate_command
 from gaussian_wrapping_addon.core.jobs.commands.estimate_command import input_facts
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
+from gaussian_wrapping_addon.core.loading.other_inputs import FAR_VIEWS, NEAR_VIEWS, PHOTO_SIDE_PX
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.training.small_scene import sphere_gaussians
 
@@ -46,7 +42,7 @@ def test_what_comes_after_the_training_is_said(
     """Not as a tenth of it: more than twice that in all jobs measured."""
     for index in range(3):
         Image.new("RGB", (40, 30)).save(tmp_path / f"{index}.png")
-    name = "gaussian_wrapping_addon.core.training.cost.machine_speed.renderer_is_compiled"
+    name = "gaussian_wrapping_addon.core.training.estimate.renderer_is_compiled"
     monkeypatch.setattr(name, lambda: False)
     lines = estimate_command._estimate(make_job("wrap", tmp_path, JobSettings()))
     (line,) = [line for line in lines if line.startswith("mesh and texture")]

@@ -15,9 +15,6 @@ import pytest
 import torch
 import trimesh
 
-from gaussian_wrapping_addon.core.dataset.frames.file_frame import FileFrame
-from gaussian_wrapping_addon.core.dataset.frames.placement_file import write_placement
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import (
     DatasetError,
     MeshingError,
@@ -26,8 +23,11 @@ from gaussian_wrapping_addon.core.errors import (
     UsageError,
 )
 from gaussian_wrapping_addon.core.files import read_json
-from gaussian_wrapping_addon.core.gaussians.foreign_splat import read_foreign_splat
-from gaussian_wrapping_addon.core.gaussians.splat_ply import standard_names, write_splat_ply
+from gaussian_wrapping_addon.core.gaussians.files import (
+    read_foreign_splat,
+    standard_names,
+    write_splat_ply,
+)
 from gaussian_wrapping_addon.core.jobs.commands.export_files import (
     SPLAT_NAME,
     ExportRequest,
@@ -36,14 +36,21 @@ from gaussian_wrapping_addon.core.jobs.commands.export_files import (
     main,
     result_of,
 )
-from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, write_job
-from gaussian_wrapping_addon.core.jobs.store.sidecar import code_fingerprint, sidecar_path
+from gaussian_wrapping_addon.core.jobs.store.job_file import (
+    JobFile,
+    code_fingerprint,
+    sidecar_path,
+    write_job,
+)
 from gaussian_wrapping_addon.core.names import file_stem, file_stems
-from gaussian_wrapping_addon.core.ply.header import read_ply_header
+from gaussian_wrapping_addon.core.ply import read_ply_header
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.frames import FileFrame
+from gaussian_wrapping_addon.core.scene.placement import write_placement
 from gaussian_wrapping_addon.core.settings import JobSettings
-from gaussian_wrapping_addon.core.texture.files.textured_files import write_textured
+from gaussian_wrapping_addon.core.texture.files import write_textured
 from tests.core.jobs.finished_sphere import write_cube
 from tests.core.render.scenes import front_camera, random_gaussians
 from tests.core.texture.files.test_textured_files import UTM, cube

@@ -14,7 +14,7 @@ from PIL import Image
 
 from gaussian_wrapping_addon import batch
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
-from gaussian_wrapping_addon.core.evaluation.layouts.mesh_input import read_mesh
+from gaussian_wrapping_addon.core.evaluation.layouts import read_mesh
 from gaussian_wrapping_addon.core.jobs.commands.evaluate_command import _check_metric, job_mesh
 from gaussian_wrapping_addon.core.jobs.commands.mesh_based_command import (
     MeshBasedRequest,

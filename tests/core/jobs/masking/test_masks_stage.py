@@ -12,21 +12,23 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.scene import Scene
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene, save_scene
 from gaussian_wrapping_addon.core.devices import choose_device
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.files import read_json, write_json
-from gaussian_wrapping_addon.core.jobs.masking import masks_stage, region_masks
-from gaussian_wrapping_addon.core.jobs.masking.masks_stage import check_mask_model, run_masks
-from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import MASKED, run_cameras
-from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage
-from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
-from gaussian_wrapping_addon.core.masks.cleaning import encoded
+from gaussian_wrapping_addon.core.jobs.stages import masks
+from gaussian_wrapping_addon.core.jobs.stages.cameras import MASKED, run_cameras
+from gaussian_wrapping_addon.core.jobs.stages.masks import check_mask_model, run_masks
+from gaussian_wrapping_addon.core.jobs.store.job_file import (
+    JobFile,
+    make_job,
+    read_job,
+    training_keys,
+)
+from gaussian_wrapping_addon.core.jobs.store.job_folder import STAGE_VERSIONS, JobFolder, Stage
+from gaussian_wrapping_addon.core.masks.making import encoded
 from gaussian_wrapping_addon.core.masks.mask_folder import read_list, write_list
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.scene.scene import Scene, load_saved_scene, save_scene
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
 from tests.core.masks import onnx_files
@@ -68,7 +70,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         calls.append(target)
         left_half(scene, target)
 
-    monkeypatch.setattr(masks_stage, "make_region_masks", make)
+    monkeypatch.setattr(masks, "make_region_masks", make)
     return calls
 
 
@@ -241,7 +243,7 @@ def test_a_region_makes_masks_of_the_sphere(tmp_path: Path) -> None:
     target = tmp_path / "made"
     target.mkdir()
     scene = dataclasses.replace(scene, views=tuple(views))
-    region_masks.make_region_masks(scene, job, target, Progress(), threads=1, device=PROCESSOR)
+    masks.make_region_masks(scene, job, target, Progress(), threads=1, device=PROCESSOR)
     for index, view in enumerate(views):
         mask = np.asarray(Image.open(target / f"{index:06d}.png")) == 255
         truth = sphere_seen(view.camera, np.zeros(3), 1.0)
@@ -253,7 +255,7 @@ def test_a_region_makes_masks_of_the_sphere(tmp_path: Path) -> None:
 def test_a_stopped_making_is_resumed(
     folder: JobFolder, job: JobFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(region_masks.COARSE, "iterations", 60)
+    monkeypatch.setitem(masks.COARSE, "iterations", 60)
     cameras = run_cameras(folder, job, Progress(), threads=1)
     iterations: list[float] = []
 
@@ -272,7 +274,7 @@ def test_a_stopped_making_is_resumed(
 def test_a_region_with_nothing_in_it_is_refused(
     folder: JobFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(region_masks.COARSE, "iterations", 5)
+    monkeypatch.setitem(masks.COARSE, "iterations", 5)
     box = write_cube(tmp_path / "far.json")
     values = json.loads(box.read_text())
     values["vertices"] = [[x + 50.0, y, z] for x, y, z in values["vertices"]]

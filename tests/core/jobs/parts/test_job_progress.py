@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.jobs.parts import job_progress
-from gaussian_wrapping_addon.core.jobs.parts.graph import Part
-from gaussian_wrapping_addon.core.jobs.parts.job_progress import JobProgress
-from gaussian_wrapping_addon.core.jobs.parts.part_state import new_state, write_state
+from gaussian_wrapping_addon.core.jobs.parts import runner
+from gaussian_wrapping_addon.core.jobs.parts.graph import Part, new_state, write_state
+from gaussian_wrapping_addon.core.jobs.parts.runner import JobProgress
 from gaussian_wrapping_addon.core.progress import ProgressEvent
 
 PARTS = {f"block-{k:04d}": Part(f"block-{k:04d}", "block", (), (), 0.2, block=k) for k in range(3)}
@@ -35,7 +34,7 @@ def test_a_part_that_runs_here_moves_the_job_by_its_share() -> None:
 def test_parts_elsewhere_are_told_by_their_states(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(job_progress, "STATES_EVERY_S", -1.0)
+    monkeypatch.setattr(runner, "STATES_EVERY_S", -1.0)
     sent: list[ProgressEvent] = []
     report = told(sent).side_by_side(tmp_path)
     report(0.25, PARTS, 1)

@@ -17,14 +17,14 @@ import pytest
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.jobs.parts import lease as lease_module
-from gaussian_wrapping_addon.core.jobs.parts.lease import PartHeldError, PartLease
-from gaussian_wrapping_addon.core.jobs.parts.part_state import (
+from gaussian_wrapping_addon.core.jobs.parts.graph import (
     PartState,
     new_state,
     read_state,
     state_path,
     write_state,
 )
+from gaussian_wrapping_addon.core.jobs.parts.lease import PartHeldError, PartLease
 from gaussian_wrapping_addon.core.progress import ProgressEvent
 
 TAKEN: list[PartLease] = []

@@ -8,13 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.jobs.parts.code_version import code_version
-from gaussian_wrapping_addon.core.jobs.parts.graph import PartsGraph, read_parts, write_parts
-from gaussian_wrapping_addon.core.jobs.parts.planning import (
+from gaussian_wrapping_addon.core.jobs.parts.graph import (
+    PartsGraph,
     PlannedTiles,
+    code_version,
     fixed_tiles,
     plan_hash,
     plan_parts,
+    read_parts,
+    write_parts,
 )
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings

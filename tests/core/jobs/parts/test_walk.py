@@ -9,18 +9,19 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.core.jobs.parts import walk as walk_module
-from gaussian_wrapping_addon.core.jobs.parts.engine import Outcome
-from gaussian_wrapping_addon.core.jobs.parts.graph import Part, read_parts
-from gaussian_wrapping_addon.core.jobs.parts.part_state import (
+from gaussian_wrapping_addon.core.jobs.parts import runner as walk_module
+from gaussian_wrapping_addon.core.jobs.parts.graph import (
+    Part,
     PartState,
+    PlannedTiles,
+    fixed_tiles,
     new_state,
+    read_parts,
     read_state,
     state_path,
     write_state,
 )
-from gaussian_wrapping_addon.core.jobs.parts.planning import PlannedTiles, fixed_tiles
-from gaussian_wrapping_addon.core.jobs.parts.walk import PartError, Walk
+from gaussian_wrapping_addon.core.jobs.parts.runner import Outcome, PartError, Walk
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from tests.core.jobs.parts.test_planning import job_of
 

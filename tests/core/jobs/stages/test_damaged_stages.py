@@ -12,32 +12,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset import refined_scene, scene_file
-from gaussian_wrapping_addon.core.dataset.loading import load
-from gaussian_wrapping_addon.core.dataset.refined_scene import (
-    POSES_NAME,
-    load_refined_scene,
-    save_poses,
-)
 from gaussian_wrapping_addon.core.devices import choose_device
 from gaussian_wrapping_addon.core.files import read_json, write_json
-from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians, save_gaussians
-from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
-from gaussian_wrapping_addon.core.jobs.stages.mesh_stage import DENSE_MESH, run_mesh
-from gaussian_wrapping_addon.core.jobs.stages.texture_stage import run_texture
+from gaussian_wrapping_addon.core.gaussians.files import load_gaussians, save_gaussians
+from gaussian_wrapping_addon.core.jobs.stages import training
+from gaussian_wrapping_addon.core.jobs.stages.cameras import run_cameras
+from gaussian_wrapping_addon.core.jobs.stages.meshing import DENSE_MESH, run_mesh
+from gaussian_wrapping_addon.core.jobs.stages.texture import run_texture
+from gaussian_wrapping_addon.core.jobs.stages.training import run_training
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     DONE_NAME,
     STAGE_VERSIONS,
+    JobFolder,
     Stage,
     read_done,
 )
-from gaussian_wrapping_addon.core.jobs.training import training_stage
-from gaussian_wrapping_addon.core.jobs.training.training_stage import run_training
-from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh, save_mesh
-from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.loading import load
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh, load_mesh, save_mesh
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene import scene
+from gaussian_wrapping_addon.core.scene import scene as scene_file
+from gaussian_wrapping_addon.core.scene.scene import POSES_NAME, load_refined_scene, save_poses
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
 
@@ -98,14 +94,14 @@ def test_a_damaged_training_is_trained_again(
     folder: JobFolder, damage: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, _, trained = run(folder)
-    path = trained.folder / training_stage.GAUSSIANS_NAME
+    path = trained.folder / training.GAUSSIANS_NAME
     gaussians = load_gaussians(path)
 
     def train(stage_folder: Path, *_: object) -> dict[str, Any]:
-        save_gaussians(stage_folder / training_stage.GAUSSIANS_NAME, gaussians)
+        save_gaussians(stage_folder / training.GAUSSIANS_NAME, gaussians)
         return {}
 
-    monkeypatch.setattr(training_stage, "_train", train)
+    monkeypatch.setattr(training, "_train", train)
     damage(path)
     _, cameras, again = run(folder)
     assert (trained.reused, cameras.reused, again.reused) == (True, True, False)
@@ -121,18 +117,18 @@ def test_a_training_whose_refined_poses_are_damaged_is_trained_again(
     scene = scene_file.load_saved_scene(cameras.folder)
     poses = np.array([view.camera.cam_from_world for view in scene.views])
     done = trained.folder / DONE_NAME
-    write_json(done, {**read_json(done), training_stage.REFINED: True})
+    write_json(done, {**read_json(done), training.REFINED: True})
     save_poses(trained.folder, poses)
     assert run(folder)[2].reused
 
-    gaussians = load_gaussians(trained.folder / training_stage.GAUSSIANS_NAME)
+    gaussians = load_gaussians(trained.folder / training.GAUSSIANS_NAME)
 
     def train(stage_folder: Path, *_: object) -> dict[str, Any]:
-        save_gaussians(stage_folder / training_stage.GAUSSIANS_NAME, gaussians)
+        save_gaussians(stage_folder / training.GAUSSIANS_NAME, gaussians)
         save_poses(stage_folder, poses)
-        return {training_stage.REFINED: True}
+        return {training.REFINED: True}
 
-    monkeypatch.setattr(training_stage, "_train", train)
+    monkeypatch.setattr(training, "_train", train)
     damage(trained.folder / POSES_NAME)
     again = run(folder)[2]
     assert not again.reused
@@ -188,7 +184,7 @@ def test_a_damaged_textured_mesh_is_made_again(
     def begin(*_: Path) -> None:
         raise BegunAgainError
 
-    monkeypatch.setattr(refined_scene, "load_refined_scene", begin)  # what the work begins with
+    monkeypatch.setattr(scene, "load_refined_scene", begin)  # what the work begins with
     job, cameras, trained = run(folder)
     meshed = Stage("mesh-ball", "key", folder.stages / "mesh-ball-key", {}, True)
 

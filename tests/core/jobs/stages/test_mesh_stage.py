@@ -11,28 +11,23 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.devices import DeviceChoice, choice, choose_device
 from gaussian_wrapping_addon.core.errors import DeviceError, MeshingError
-from gaussian_wrapping_addon.core.field import depth_samples
-from gaussian_wrapping_addon.core.field.vacancy import cuda_vacancy
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
-from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
-from gaussian_wrapping_addon.core.jobs.stages import region_field
+from gaussian_wrapping_addon.core.field import cuda_vacancy, samples
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
+from gaussian_wrapping_addon.core.jobs.stages import meshing
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage
-from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
-from gaussian_wrapping_addon.core.meshing.points.pivots import pivot_rule
-from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import bounding_points, delaunay
-from gaussian_wrapping_addon.core.meshing.tetrahedra.marching_tetrahedra import (
-    bisect,
-    marching_tetrahedra,
-)
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, Stage
+from gaussian_wrapping_addon.core.mesh.surface_mesh import load_mesh
+from gaussian_wrapping_addon.core.meshing.delaunay import bounding_points, delaunay
+from gaussian_wrapping_addon.core.meshing.marching_tetrahedra import bisect, marching_tetrahedra
+from gaussian_wrapping_addon.core.meshing.pivots import pivot_rule
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.cuda import device_renderer
 from gaussian_wrapping_addon.core.render.cuda.device_renderer import DeviceRenderer
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
+from gaussian_wrapping_addon.core.scene.scene import load_saved_scene
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
 from tests.core.jobs.mesh_walk import walk_mesh
@@ -58,13 +53,13 @@ def test_every_part_of_the_mesh_stage_uses_the_chosen_cameras(
 ) -> None:
     folder = write_finished_sphere(tmp_path)
     sampled = []
-    honest = depth_samples.sample_depth_maps
+    honest = samples.sample_depth_maps
 
     def watched(gaussians, cameras, *arguments, **named):  # type: ignore[no-untyped-def]
         sampled.append({camera.name for camera in cameras})
         return honest(gaussians, cameras, *arguments, **named)
 
-    monkeypatch.setattr(depth_samples, "sample_depth_maps", watched)
+    monkeypatch.setattr(samples, "sample_depth_maps", watched)
     settings = MeshingSettings(method=method, points=300 if method == "pam" else 0)
     by_default = mesh_of(folder, settings)
     by_all = mesh_of(folder, dataclasses.replace(settings, cameras="all"))
@@ -82,7 +77,7 @@ def test_a_job_makes_the_mesh_of_the_pivots_alone(
 ) -> None:
     folder = write_finished_sphere(tmp_path)
     monkeypatch.setattr(
-        depth_samples, "sample_depth_maps", lambda *_, **__: pytest.fail("sampled depth maps")
+        samples, "sample_depth_maps", lambda *_, **__: pytest.fail("sampled depth maps")
     )
     settings = MeshingSettings(
         method="pivots", pivots=pivots, pivot_box=box, pivot_samples="none", min_component_share=0.0
@@ -163,14 +158,14 @@ def test_on_a_gpu_the_field_and_the_depth_maps_are_there_if_they_fit(
 
     monkeypatch.setattr(device_renderer, "device_renderer", renderer_of)
     sampled = []
-    honest = depth_samples.sample_depth_maps
+    honest = samples.sample_depth_maps
 
     def watched(gaussians, *arguments, renderer, **named):  # type: ignore[no-untyped-def]
         assert {tensor.device.type for _, tensor in gaussians.tensors()} == {"cpu"}
         sampled.append(type(renderer))
         return honest(gaussians, *arguments, renderer=renderer, **named)
 
-    monkeypatch.setattr(depth_samples, "sample_depth_maps", watched)
+    monkeypatch.setattr(samples, "sample_depth_maps", watched)
     made = mesh_of(folder, MeshingSettings(points=300), GPU)
     assert made.done["provenance"]["field_device"] == device
     assert made.done["check"]["good"] is True
@@ -210,7 +205,7 @@ def test_a_gpu_that_fails_in_the_middle_leaves_the_mesh_of_the_processor(
     (tmp_path / "gpu").mkdir()
     here = mesh_of(write_finished_sphere(tmp_path / "cpu"), settings)
     monkeypatch.setattr(cuda_vacancy, "CudaVacancyField", _FailingField)
-    monkeypatch.setattr(region_field, "stage_device", lambda chosen, *_: chosen)
+    monkeypatch.setattr(meshing, "stage_device", lambda chosen, *_: chosen)
     monkeypatch.setattr(device_renderer, "device_renderer", fail)
     monkeypatch.setattr(_FailingField, "left", 7)
     there = mesh_of(write_finished_sphere(tmp_path / "gpu"), settings, GPU)
@@ -230,7 +225,7 @@ def test_what_no_device_would_have_met_ends_the_stage(
     def wrong(*_: object, **__: object) -> VacancyField:
         raise MeshingError("No surface.", "")
 
-    monkeypatch.setattr(region_field, "region_field", wrong)
+    monkeypatch.setattr(meshing, "region_field", wrong)
     with pytest.raises(MeshingError, match="No surface"):
         mesh_of(write_finished_sphere(tmp_path), MeshingSettings(points=300), GPU)
 

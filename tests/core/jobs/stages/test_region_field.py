@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
-from gaussian_wrapping_addon.core.field.vacancy import cuda_vacancy
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
-from gaussian_wrapping_addon.core.jobs.stages.region_field import (
+from gaussian_wrapping_addon.core.field import cuda_vacancy
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.jobs.stages.meshing import (
     field_figures,
     field_views,
     region_field,
 )
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import mesh_by_pivots
-from gaussian_wrapping_addon.core.meshing.points.candidate_surface import halo_bounds
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
+from gaussian_wrapping_addon.core.meshing.surface_points import halo_bounds
+from gaussian_wrapping_addon.core.photos.store import PhotoStore
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from gaussian_wrapping_addon.core.settings import MeshingSettings, TrainingSettings
 from tests.core.field.field_scenes import camera_at, cameras_around, shell_arrays
 from tests.core.meshing.meshing_scenes import ShapeField, cube, gaussians_on, sphere

@@ -9,18 +9,21 @@ from typing import Any
 
 import pytest
 
-from gaussian_wrapping_addon.core.devices import DeviceChoice, choose_device, whole_views
+from gaussian_wrapping_addon.core.devices import DeviceChoice, checks, choose_device
 from gaussian_wrapping_addon.core.evaluation.report import pictures
-from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
+from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
+from gaussian_wrapping_addon.core.jobs.stages import training, training_cost
+from gaussian_wrapping_addon.core.jobs.stages.training import GAUSSIANS_NAME, run_training
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage, read_done
-from gaussian_wrapping_addon.core.jobs.training import training_cost, training_stage
-from gaussian_wrapping_addon.core.jobs.training.training_stage import GAUSSIANS_NAME, run_training
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
+    STAGE_VERSIONS,
+    JobFolder,
+    Stage,
+    read_done,
+)
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.training import trainer
-from gaussian_wrapping_addon.core.training.devices import chosen
-from gaussian_wrapping_addon.core.training.result import TrainingResult
+from gaussian_wrapping_addon.core.training import device_backend, trainer
+from gaussian_wrapping_addon.core.training.state import TrainingResult
 from tests.core.jobs.finished_sphere import write_finished_sphere
 
 GPU = DeviceChoice("cuda:1", "Some GPU", "It passed.")
@@ -62,12 +65,12 @@ def test_the_training_gets_the_device_and_notes_it(
 
     monkeypatch.setattr(trainer, "train", train)
     monkeypatch.setattr(
-        chosen, "chosen_backend", lambda device, threads, **_: f"backend of {device}"
+        device_backend, "chosen_backend", lambda device, threads, **_: f"backend of {device}"
     )
-    monkeypatch.setattr(whole_views, "with_renderer", with_renderer)
+    monkeypatch.setattr(checks, "with_renderer", with_renderer)
     monkeypatch.setattr(pictures, "write_held_out", write_held_out)
     monkeypatch.setattr(training_cost, "stage_device", lambda chosen, *_: chosen)
-    monkeypatch.setattr(training_stage, "estimated_cost", lambda *_: ({}, []))
+    monkeypatch.setattr(training, "estimated_cost", lambda *_: ({}, []))
     done = trained(folder, GPU)
     expected = [
         "backend of cuda:1", ("cuda:1", "Pictures of held-out photos"), "its renderer",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.jobs.store.blend_file import back_up_stale_blend, result_state
+from gaussian_wrapping_addon.core.jobs.store.job_folder import back_up_stale_blend, result_state
 
 
 @pytest.fixture

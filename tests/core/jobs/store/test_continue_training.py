@@ -10,16 +10,15 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.jobs.store.continue_training import (
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, training_keys
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.rollback import (
     checkpoints,
     continue_training_job,
     lineage,
     link_checkpoints,
     shorter_training,
 )
-from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
 from gaussian_wrapping_addon.core.settings import JobSettings, TrainingSettings
 
 

@@ -24,11 +24,16 @@ from gaussian_wrapping_addon.core.jobs.commands.export_files import result_of
 from gaussian_wrapping_addon.core.jobs.store import job_folder
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.jobs.store.result_swap import EARLIER, NEW, new_result, recover
+from gaussian_wrapping_addon.core.jobs.store.rollback import (
+    EARLIER,
+    NEW,
+    new_result,
+    recover,
+    roll_back,
+)
 from gaussian_wrapping_addon.core.jobs.store.rollback import NAME as FINISHED
-from gaussian_wrapping_addon.core.jobs.store.rollback import roll_back
-from gaussian_wrapping_addon.core.processes.helper_process import child_command
 from gaussian_wrapping_addon.core.settings import JobSettings
+from gaussian_wrapping_addon.core.worker.helper_process import child_command
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
 

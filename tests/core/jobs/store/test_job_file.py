@@ -10,22 +10,21 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.loading.real_world import UnitsRequest
 from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.commands import estimate_mesh_command, worker_call
-from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import _units_key, run_cameras
+from gaussian_wrapping_addon.core.jobs.commands import estimate_mesh_command, run_in_worker
+from gaussian_wrapping_addon.core.jobs.stages.cameras import _units_key, run_cameras
 from gaussian_wrapping_addon.core.jobs.store.job_file import (
     JobFile,
     make_job,
     read_job,
     reject_folder_conflicts,
     reject_region_conflicts,
+    training_keys,
     write_job,
 )
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import stage_key
-from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, stage_key
+from gaussian_wrapping_addon.core.loading.real_world import UnitsRequest
 from gaussian_wrapping_addon.core.names import JOB_MARKER, region_name, region_names
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings, preset
@@ -194,7 +193,7 @@ def test_a_region_that_is_no_file_is_told_by_all_commands(
     region: str,
     message: str,
 ) -> None:
-    monkeypatch.setattr(worker_call, "exit_with_caller", lambda _caller: None)
+    monkeypatch.setattr(run_in_worker, "exit_with_caller", lambda _caller: None)
     path = str(tmp_path / region)
     with pytest.raises(DatasetError, match=message):
         make_job("mesh", tmp_path, JobSettings(regions=(path,)))

@@ -16,12 +16,8 @@ import pytest
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.store import job_folder
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
-    JobFolder,
-    JobStatus,
-    process_start_ticks,
-)
-from gaussian_wrapping_addon.core.processes.process_identity import process_alive
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.worker.spawn import process_alive, process_start_ticks
 
 
 def dead_pid() -> int:

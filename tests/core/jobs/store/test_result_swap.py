@@ -14,16 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.jobs.stages import export_stage
-from gaussian_wrapping_addon.core.jobs.stages.export_stage import export_results
-from gaussian_wrapping_addon.core.jobs.store import result_swap
+from gaussian_wrapping_addon.core.jobs.stages import texture
+from gaussian_wrapping_addon.core.jobs.stages.texture import export_results
+from gaussian_wrapping_addon.core.jobs.store import rollback
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.result_swap import new_result, recover
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, Stage
+from gaussian_wrapping_addon.core.jobs.store.rollback import new_result, recover
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Similarity
 from gaussian_wrapping_addon.core.settings import JobSettings
 
 
@@ -84,7 +83,7 @@ def test_an_error_while_renaming_changes_nothing(
             raise PermissionError(errno.EACCES, "open elsewhere")
         replace(source, target)
 
-    monkeypatch.setattr(result_swap.os, "replace", failing)
+    monkeypatch.setattr(rollback.os, "replace", failing)
     with pytest.raises(PermissionError), new_result(result, last=("report.json",)) as new:
         fill(new, "new", "scene.json", "box/a", "other/a", "report.json")
     assert content(result) == before
@@ -103,8 +102,8 @@ def test_a_change_that_is_killed_is_undone_later(
         replace(source, target)
 
     with monkeypatch.context() as patched:
-        patched.setattr(result_swap.os, "replace", killed)
-        patched.setattr(result_swap.shutil, "rmtree", lambda *_, **__: None)
+        patched.setattr(rollback.os, "replace", killed)
+        patched.setattr(rollback.shutil, "rmtree", lambda *_, **__: None)
         with pytest.raises(SystemExit), new_result(result) as new:
             fill(new, "new", "scene.json", "box/a", "other/a", "report.json")
     recover(result)
@@ -130,18 +129,18 @@ DONE = {"seconds": 1.0, "processor_seconds": 1.0, "finished_unix_s": 5.0, "held_
 def exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Export finished stages whose scene and Gaussians are not looked at."""
     for module, name in (
-        ("dataset.refined_scene", "load_refined_scene"),
-        ("gaussians.gaussian_file", "load_gaussians"),
+        ("scene.scene", "load_refined_scene"),
+        ("gaussians.files", "load_gaussians"),
     ):
         frame = Similarity(1.0, np.eye(3), np.zeros(3))
         scene = SimpleNamespace(world_from_scene=frame, facts={})
         monkeypatch.setattr(f"gaussian_wrapping_addon.core.{module}.{name}", lambda *_, s=scene: s)
     monkeypatch.setattr(
-        "gaussian_wrapping_addon.core.gaussians.splat_ply.write_splat_ply",
+        "gaussian_wrapping_addon.core.gaussians.files.write_splat_ply",
         lambda path, *_: path.write_bytes(b"gaussians"),
     )
-    monkeypatch.setattr(export_stage, "write_scene_summary", lambda path, _: write_json(path, {}))
-    monkeypatch.setattr(export_stage, "_in_world_units", lambda *_: {})
+    monkeypatch.setattr(texture, "write_scene_summary", lambda path, _: write_json(path, {}))
+    monkeypatch.setattr(texture, "_in_world_units", lambda *_: {})
     folder = JobFolder(tmp_path / "out")
     folder.create()
 
@@ -183,7 +182,7 @@ def test_a_full_disk_leaves_the_earlier_result(
 ) -> None:
     exported("box", "first")
     before = content(exported.result)
-    copy, write = shutil.copy2, export_stage.write_report
+    copy, write = shutil.copy2, texture.write_report
 
     def full(source: Path, target: Path, **options: Any) -> Any:
         if Path(source).name == where:
@@ -197,7 +196,7 @@ def test_a_full_disk_leaves_the_earlier_result(
     with monkeypatch.context() as patched:
         patched.setattr(shutil, "copy2", full)
         if where == "report.md":
-            patched.setattr(export_stage, "write_report", full_report)
+            patched.setattr(texture, "write_report", full_report)
         with pytest.raises(OSError, match="No space"):
             exported("box", "second")
     assert content(exported.result) == before

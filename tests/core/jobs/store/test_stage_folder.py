@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.photos.photo_finder import list_photos
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     record_interrupted_time,
     run_stage,
     source_fingerprint,
     stage_key,
 )
 from gaussian_wrapping_addon.core.names import JOB_MARKER
+from gaussian_wrapping_addon.core.photos.finder import list_photos
 from gaussian_wrapping_addon.core.progress import Progress
 
 

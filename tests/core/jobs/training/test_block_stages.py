@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.devices import choose_device
 from gaussian_wrapping_addon.core.errors import (
     EXIT_RESOURCES,
@@ -20,26 +18,28 @@ from gaussian_wrapping_addon.core.errors import (
     UsageError,
     WorkerError,
 )
-from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
+from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.jobs.store.continue_training import continue_training_job
-from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage
-from gaussian_wrapping_addon.core.jobs.training.training_stage import (
+from gaussian_wrapping_addon.core.jobs.stages.training import (
     GAUSSIANS_NAME,
     run_block,
     run_coarse,
     run_training,
 )
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import STAGE_VERSIONS, JobFolder, Stage
+from gaussian_wrapping_addon.core.jobs.store.rollback import continue_training_job
+from gaussian_wrapping_addon.core.photos.store import PhotoStore
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.scene import load_saved_scene
 from gaussian_wrapping_addon.core.settings import JobSettings, TrainingSettings
-from gaussian_wrapping_addon.core.training.blocks import train_block as block_module
-from gaussian_wrapping_addon.core.training.blocks.block_settings import BlockSettings
-from gaussian_wrapping_addon.core.training.blocks.coarse_training import train_coarse
-from gaussian_wrapping_addon.core.training.blocks.join_blocks import join_blocks
-from gaussian_wrapping_addon.core.training.blocks.plan_blocks import plan_blocks
-from gaussian_wrapping_addon.core.training.blocks.train_block import train_block
+from gaussian_wrapping_addon.core.training import blocks as block_module
+from gaussian_wrapping_addon.core.training.block_plan import (
+    BlockSettings,
+    plan_blocks,
+    train_coarse,
+)
+from gaussian_wrapping_addon.core.training.blocks import join_blocks, train_block
 from tests.core.jobs.block_jobs import TRAINING, cameras_of, row_job
 from tests.core.training.test_trainer import StopAt, assert_same
 

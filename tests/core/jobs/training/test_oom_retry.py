@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, ResourceError
-from gaussian_wrapping_addon.core.jobs.training.oom_retry import (
+from gaussian_wrapping_addon.core.jobs.stages.training import (
     GAUSSIANS_FACTOR,
     IMAGE_FACTOR,
     MIN_GAUSSIANS,

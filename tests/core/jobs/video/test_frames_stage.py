@@ -12,23 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.loading import load
-from gaussian_wrapping_addon.core.dataset.photos.photo_finder import list_photos
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.dataset.video import extract
 from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
-from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
+from gaussian_wrapping_addon.core.evaluation.report.report import report_markdown
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
-from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS
-from gaussian_wrapping_addon.core.jobs.store.training_keys import training_keys
-from gaussian_wrapping_addon.core.jobs.video.frames_stage import frames_request
+from gaussian_wrapping_addon.core.jobs.stages.cameras import frames_request, run_cameras
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, training_keys
+from gaussian_wrapping_addon.core.jobs.store.job_folder import STAGE_VERSIONS, JobFolder
+from gaussian_wrapping_addon.core.loading import load
+from gaussian_wrapping_addon.core.photos import video_frames
+from gaussian_wrapping_addon.core.photos.finder import list_photos
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, View, load_saved_scene
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.dataset.video.small_videos import HEIGHT, WIDTH, pan, write
 
@@ -64,13 +59,13 @@ def loaded(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 def extracted(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Note how often a video is decoded."""
     calls: list[Path] = []
-    real = extract.extract_frames
+    real = video_frames.extract_frames
 
-    def noted(video: Path, *arguments: Any, **options: Any) -> extract.VideoFrames:
+    def noted(video: Path, *arguments: Any, **options: Any) -> video_frames.VideoFrames:
         calls.append(video)
         return real(video, *arguments, **options)
 
-    monkeypatch.setattr(extract, "extract_frames", noted)
+    monkeypatch.setattr(video_frames, "extract_frames", noted)
     return calls
 
 

@@ -11,18 +11,19 @@ import numpy as np
 import pytest
 import trimesh
 
-from gaussian_wrapping_addon.core.dataset.frames.file_frame import FileFrame
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import ParseError
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.mesh.exchange.handed_over import (
+from gaussian_wrapping_addon.core.mesh.exchange import (
+    FileMesh,
     read_handed_over,
+    read_mesh_file,
+    world_from_file,
     write_handed_over,
 )
-from gaussian_wrapping_addon.core.mesh.exchange.mesh_frame import world_from_file
-from gaussian_wrapping_addon.core.mesh.exchange.mesh_reader import FileMesh, read_mesh_file
-from gaussian_wrapping_addon.core.mesh.polygons import Polygons
-from gaussian_wrapping_addon.core.texture.files.textured_files import write_glb, write_obj
+from gaussian_wrapping_addon.core.mesh.textured_mesh import Polygons
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.frames import FileFrame
+from gaussian_wrapping_addon.core.texture.files import write_glb, write_obj
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 0], [0, 0, 3]], float)
 FACES = np.array([[0, 1, 2], [0, 2, 3], [0, 1, 4]])

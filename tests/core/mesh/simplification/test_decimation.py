@@ -9,16 +9,12 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError
-from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
-from gaussian_wrapping_addon.core.mesh.simplification import decimation
-from gaussian_wrapping_addon.core.mesh.simplification.decimation import (
-    LIMITS,
-    DecimationResult,
-    decimate,
-)
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
+from gaussian_wrapping_addon.core.mesh import simplification
+from gaussian_wrapping_addon.core.mesh.sampling import distances_to_mesh
+from gaussian_wrapping_addon.core.mesh.simplification import LIMITS, DecimationResult, decimate
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.meshing.closed_shapes import (
     Mesh,
     ball,
@@ -184,7 +180,7 @@ def test_bad_input_is_refused() -> None:
 
 
 def test_it_can_be_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decimation, "EDGES_PER_CALL", 50)
+    monkeypatch.setattr(simplification, "EDGES_PER_CALL", 50)
     asked = []
 
     def is_cancelled() -> bool:

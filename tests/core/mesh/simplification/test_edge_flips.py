@@ -8,10 +8,9 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from gaussian_wrapping_addon.core.mesh.components import compacted
-from gaussian_wrapping_addon.core.mesh.simplification.edge_flips import flip_edges
-from gaussian_wrapping_addon.core.mesh.simplification.vertex_selection import select_vertices
+from gaussian_wrapping_addon.core.mesh.sampling import sample_triangles
+from gaussian_wrapping_addon.core.mesh.simplification import flip_edges, select_vertices
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles
 from tests.core.field.field_scenes import unit_sphere
 from tests.core.mesh.simplification.test_vertex_selection import ring
 from tests.core.meshing.meshing_scenes import assert_closed_manifold, torus

@@ -6,29 +6,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.mesh.simplification.corners import (
-    merge_vertices,
-    unlink_dead_faces,
-)
-from gaussian_wrapping_addon.core.mesh.simplification.counters import (
+from gaussian_wrapping_addon.core.mesh.edge_collapse import (
     DONE,
     FULL,
+    MAX_RING,
     PAUSED,
     VERTICES_LEFT,
-)
-from gaussian_wrapping_addon.core.mesh.simplification.engine import Heap, Simplification
-from gaussian_wrapping_addon.core.mesh.simplification.half_edge_collapse import MAX_RING
-from gaussian_wrapping_addon.core.mesh.simplification.link_condition import (
-    link_allows,
-    mark_ring,
-)
-from gaussian_wrapping_addon.core.mesh.simplification.quadrics import (
     WEIGHT,
     error_of_both,
     error_of_one,
+    link_allows,
+    mark_ring,
+    merge_vertices,
+    unlink_dead_faces,
 )
-from gaussian_wrapping_addon.core.mesh.simplification.vertex_selection import select_vertices
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
+from gaussian_wrapping_addon.core.mesh.simplification import Heap, Simplification, select_vertices
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 RNG = np.random.default_rng(0)

@@ -6,8 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.mesh.simplification.counters import COUNTERS, HEAP_SIZE
-from gaussian_wrapping_addon.core.mesh.simplification.heap import pop_first, sift_up_last
+from gaussian_wrapping_addon.core.mesh.edge_collapse import (
+    COUNTERS,
+    HEAP_SIZE,
+    pop_first,
+    sift_up_last,
+)
 
 Entry = tuple[float, ...]
 

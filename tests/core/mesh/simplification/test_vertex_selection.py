@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from gaussian_wrapping_addon.core.mesh.components import compacted
-from gaussian_wrapping_addon.core.mesh.simplification.vertex_selection import (
+from gaussian_wrapping_addon.core.mesh.simplification import (
     Units,
     left_of,
     merge_vertices,

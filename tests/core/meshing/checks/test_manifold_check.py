@@ -11,12 +11,12 @@ import pytest
 import trimesh
 
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import (
+from gaussian_wrapping_addon.core.meshing.checks import (
     MAX_LISTED_PARTS,
     MIN_HEIGHT_SHARE,
+    mesh_statistics,
     validate_manifold,
 )
-from gaussian_wrapping_addon.core.meshing.checks.mesh_statistics import mesh_statistics
 from tests.core.meshing.cleanup.test_repair import cubes
 from tests.core.meshing.closed_shapes import Mesh, ball, joined, lattice, noisy, ring, slab, wire
 

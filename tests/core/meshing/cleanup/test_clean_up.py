@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
-from gaussian_wrapping_addon.core.meshing.cleanup.clean_up import clean_up
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
+from gaussian_wrapping_addon.core.meshing.clean_up import clean_up
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.meshing.meshing_scenes import (
     ShapeField,

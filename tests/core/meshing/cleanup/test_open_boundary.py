@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
-from gaussian_wrapping_addon.core.meshing.cleanup.open_boundary import split_fans, without_caps
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
+from gaussian_wrapping_addon.core.meshing.clean_up import split_fans, without_caps
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.meshing.closed_shapes import ball, joined, slab
 from tests.core.meshing.meshing_scenes import ShapeField, cube, gaussians_on, sphere, torus

@@ -9,16 +9,20 @@ import pytest
 from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.mesh.components import winding_number, without_floaters
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_statistics import mesh_statistics
-from gaussian_wrapping_addon.core.meshing.cleanup.degenerate import narrow_faces, remove_degenerate
-from gaussian_wrapping_addon.core.meshing.cleanup.repair import RepairResult, split_nonmanifold
-from gaussian_wrapping_addon.core.meshing.tetrahedra.boundary_faces import (
+from gaussian_wrapping_addon.core.meshing.checks import mesh_statistics
+from gaussian_wrapping_addon.core.meshing.classification import (
     boundary_faces,
     tetrahedron_neighbours,
 )
-from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import bounding_points, delaunay
+from gaussian_wrapping_addon.core.meshing.delaunay import bounding_points, delaunay
+from gaussian_wrapping_addon.core.meshing.repair import (
+    RepairResult,
+    narrow_faces,
+    remove_degenerate,
+    split_nonmanifold,
+)
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.meshing.meshing_scenes import assert_closed_manifold
 
 

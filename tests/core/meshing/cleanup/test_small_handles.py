@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.mesh.components import compacted
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import (
-    ManifoldCheck,
-    validate_manifold,
-)
-from gaussian_wrapping_addon.core.meshing.cleanup import small_handles
-from gaussian_wrapping_addon.core.meshing.cleanup.small_handles import without_small_handles
+from gaussian_wrapping_addon.core.meshing import clean_up
+from gaussian_wrapping_addon.core.meshing.checks import ManifoldCheck, validate_manifold
+from gaussian_wrapping_addon.core.meshing.clean_up import without_small_handles
 
 QUADS = {
     (0, 1): [(1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)],
@@ -133,7 +130,7 @@ def test_a_ring_around_a_wire_is_left() -> None:
 
 def test_what_cannot_be_closed_is_left_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = surface_of(with_arch(block((16, 16, 4)), 6, 7, 4))
-    monkeypatch.setattr(small_handles, "MAX_LOOP_EDGES", 3)
+    monkeypatch.setattr(clean_up, "MAX_LOOP_EDGES", 3)
     closed = without_small_handles(vertices, faces, 1.0)
     assert (closed.closed, closed.left) == (0, 1)
     np.testing.assert_array_equal(closed.faces, faces)

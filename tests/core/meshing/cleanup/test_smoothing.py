@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
-from gaussian_wrapping_addon.core.meshing.cleanup.smoothing import smooth
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
+from gaussian_wrapping_addon.core.meshing.clean_up import smooth
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.meshing.closed_shapes import Mesh, ball, joined, noisy, ring, slab, wire
 
 

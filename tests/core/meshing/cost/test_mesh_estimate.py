@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import ResourceError
-from gaussian_wrapping_addon.core.meshing.cost.mesh_estimate import (
+from gaussian_wrapping_addon.core.meshing.estimate import (
     AREA_HIGH,
     AREA_LOW,
     BASE_BYTES,
@@ -16,9 +16,8 @@ from gaussian_wrapping_addon.core.meshing.cost.mesh_estimate import (
     occupied_boundary_area,
     two_digits_below,
 )
-from gaussian_wrapping_addon.core.meshing.points.resolution import ResolutionRequest
-from gaussian_wrapping_addon.core.meshing.points.spacing import resolved_edges
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.meshing.surface_points import ResolutionRequest, resolved_edges
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.meshing.meshing_scenes import gaussians_on, some_cameras, sphere
 from tests.core.meshing.test_tiles import (
     SIGMA,

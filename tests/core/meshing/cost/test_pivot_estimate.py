@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import MeshingError, ResourceError
-from gaussian_wrapping_addon.core.meshing.cost.pivot_estimate import estimate_pivot_mesh
+from gaussian_wrapping_addon.core.meshing.estimate import estimate_pivot_mesh
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import mesh_by_pivots
-from gaussian_wrapping_addon.core.meshing.points.pivots import PIVOTS
+from gaussian_wrapping_addon.core.meshing.pivots import PIVOTS
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.meshing.meshing_scenes import (
     ShapeField,

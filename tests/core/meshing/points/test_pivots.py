@@ -9,12 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
-from gaussian_wrapping_addon.core.meshing.points.candidate_surface import (
-    halo_bounds,
-    pivot_cloud,
-    pivots_alone,
-)
-from gaussian_wrapping_addon.core.meshing.points.pivots import (
+from gaussian_wrapping_addon.core.meshing.pivots import (
     PIVOTS,
     directional_sigma,
     gaussians_reaching,
@@ -25,7 +20,12 @@ from gaussian_wrapping_addon.core.meshing.points.pivots import (
     three_pivots,
     two_pivots,
 )
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.meshing.surface_points import (
+    halo_bounds,
+    pivot_cloud,
+    pivots_alone,
+)
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.field.field_scenes import make_arrays, random_arrays
 from tests.core.meshing.meshing_scenes import cube
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.mesh.surface_sampling import EDGE_PER_RADIUS
-from gaussian_wrapping_addon.core.meshing.points.spacing import (
+from gaussian_wrapping_addon.core.mesh.sampling import EDGE_PER_RADIUS
+from gaussian_wrapping_addon.core.meshing.surface_points import (
     EDGE_PER_PIXEL,
     GRADING,
     Spacing,

@@ -8,13 +8,9 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from gaussian_wrapping_addon.core.errors import MeshingError
-from gaussian_wrapping_addon.core.meshing.tetrahedra import delaunay as module
-from gaussian_wrapping_addon.core.meshing.tetrahedra.boundary_faces import tetrahedron_neighbours
-from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import (
-    bounding_points,
-    delaunay,
-    signed_volumes,
-)
+from gaussian_wrapping_addon.core.meshing import delaunay as module
+from gaussian_wrapping_addon.core.meshing.classification import tetrahedron_neighbours
+from gaussian_wrapping_addon.core.meshing.delaunay import bounding_points, delaunay, signed_volumes
 from gaussian_wrapping_addon.core.progress import Progress
 
 RNG = np.random.default_rng(0)

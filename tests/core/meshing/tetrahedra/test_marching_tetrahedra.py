@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_statistics import mesh_statistics
-from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import bounding_points, delaunay
-from gaussian_wrapping_addon.core.meshing.tetrahedra.marching_tetrahedra import (
+from gaussian_wrapping_addon.core.meshing.checks import mesh_statistics
+from gaussian_wrapping_addon.core.meshing.delaunay import bounding_points, delaunay
+from gaussian_wrapping_addon.core.meshing.marching_tetrahedra import (
     bisect,
     case_tables,
     marching_tetrahedra,

@@ -9,7 +9,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.core.meshing.tetrahedra.minimum_cut import minimum_cut
+from gaussian_wrapping_addon.core.meshing.classification import minimum_cut
 from gaussian_wrapping_addon.core.progress import Progress
 
 

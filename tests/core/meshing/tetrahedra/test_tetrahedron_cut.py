@@ -9,22 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
-from gaussian_wrapping_addon.core.meshing.tetrahedra.boundary_faces import (
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
+from gaussian_wrapping_addon.core.meshing.classification import (
     boundary_faces,
     tetrahedron_neighbours,
 )
-from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import (
-    bounding_points,
-    delaunay,
-    signed_volumes,
-)
-from gaussian_wrapping_addon.core.meshing.tetrahedra.tetrahedron_cut import (
-    CutTetrahedra,
-    cut_to_region,
-)
+from gaussian_wrapping_addon.core.meshing.delaunay import bounding_points, delaunay, signed_volumes
+from gaussian_wrapping_addon.core.meshing.marching_tetrahedra import CutTetrahedra, cut_to_region
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.meshing.meshing_scenes import cube
 
 

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
-from gaussian_wrapping_addon.core.render.cuda.cuda_render import render_with
+from gaussian_wrapping_addon.core.render.cuda.device_renderer import render_with
 from gaussian_wrapping_addon.core.render.cuda.kernels import Argument, Kernels
-from gaussian_wrapping_addon.core.render.types.images import Render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")
 STATISTICS = ("visible", "radii_px", "weight_sum", "weight_max", "grad_px", "grad_abs_px")
@@ -169,7 +168,7 @@ def assert_same_images(
         Share of the pixels in which rounding may decide a threshold the other way: whether an
         alpha of 1/255 contributes, whether a transmittance of 0.45 has a depth.
     """
-    step = 2.0 * tolerances.ALPHA_MIN  # what a decision changes, times features up to 2
+    step = 2.0 * limits.ALPHA_MIN  # what a decision changes, times features up to 2
     for name in IMAGES[:4]:
         error = (found.images[name].double() - wanted.images[name].double()).abs()
         worst = error.flatten(2).amax(2) if error.dim() > 2 else error

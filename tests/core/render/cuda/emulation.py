@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.render.cuda.kernels import Kernels
-from gaussian_wrapping_addon.core.render.cuda.source import KERNELS, cuda_source
+from gaussian_wrapping_addon.core.render.cuda.kernels import KERNELS, Kernels, cuda_source
 
 # No fused operations but those the text asks for; setjmp switches stacks, which fortified libc
 # functions refuse.

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core.errors import DeviceError
-from gaussian_wrapping_addon.core.render.cuda import compiler, driver, source
+from gaussian_wrapping_addon.core.render.cuda import compiler, kernels
 from gaussian_wrapping_addon.core.render.cuda.compiler import compile_text, find_nvrtc
-from gaussian_wrapping_addon.core.render.cuda.source import KERNELS, PARTS, cuda_source
+from gaussian_wrapping_addon.core.render.cuda.kernels import KERNELS, PARTS, cuda_source
 from tests.proofs import first_then_proofs
 
 REPOSITORY = Path(__file__).resolve().parents[4]
@@ -93,9 +93,9 @@ def test_a_missing_driver_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def absent(name: str) -> None:
         raise OSError(name)
 
-    monkeypatch.setattr(driver.ctypes, "CDLL", absent)
+    monkeypatch.setattr(compiler.ctypes, "CDLL", absent)
     with pytest.raises(DeviceError, match=r"NVIDIA driver library \S+ was not found"):
-        driver.load_driver.__wrapped__()
+        compiler.load_driver.__wrapped__()
 
 
 def test_the_text_reaches_zip_and_wheel() -> None:
@@ -108,5 +108,5 @@ def test_the_text_reaches_zip_and_wheel() -> None:
     assert {f"core/render/cuda/{part}" for part in PARTS} <= set(files)
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
     patterns = project["tool"]["setuptools"]["package-data"]
-    assert patterns[source.__package__] == ["*.cu"]
-    assert {path.name for path in Path(source.__file__).parent.glob("*.cu")} == set(PARTS)
+    assert patterns[kernels.__package__] == ["*.cu"]
+    assert {path.name for path in Path(kernels.__file__).parent.glob("*.cu")} == set(PARTS)

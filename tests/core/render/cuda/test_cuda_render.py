@@ -9,11 +9,11 @@ import torch
 
 from gaussian_wrapping_addon.core.errors import ResourceError, UsageError
 from gaussian_wrapping_addon.core.render import render as render_module
-from gaussian_wrapping_addon.core.render.cuda import cuda_render, kernels
-from gaussian_wrapping_addon.core.render.cuda.cuda_render import render_cuda
+from gaussian_wrapping_addon.core.render.cuda import device_renderer, kernels
+from gaussian_wrapping_addon.core.render.cuda.device_renderer import render_cuda
 from gaussian_wrapping_addon.core.render.cuda.kernels import cuda_available
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 
 from ..scenes import isotropic, look_at, random_gaussians
 from .comparison import (
@@ -67,7 +67,7 @@ def test_cpu_tensors_and_other_float_types_are_refused() -> None:
             raise AssertionError
 
     with pytest.raises(UsageError, match=r"means of the Gaussians is torch.float64 on cpu"):
-        cuda_render.render_with(NoKernels(), random_gaussians(3), CAMERA, None, 1 << 20)
+        device_renderer.render_with(NoKernels(), random_gaussians(3), CAMERA, None, 1 << 20)
 
 
 def test_a_full_gpu_is_a_typed_error() -> None:
@@ -77,7 +77,7 @@ def test_a_full_gpu_is_a_typed_error() -> None:
 
     gaussians = random_gaussians(3, dtype=torch.float32)
     with pytest.raises(ResourceError, match="memory does not suffice for view 'camera': 2 GiB"):
-        cuda_render.render_with(Full(), gaussians, CAMERA, None, 1 << 20)
+        device_renderer.render_with(Full(), gaussians, CAMERA, None, 1 << 20)
 
 
 def test_render_hands_cuda_tensors_over(monkeypatch: pytest.MonkeyPatch) -> None:

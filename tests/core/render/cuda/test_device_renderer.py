@@ -11,9 +11,8 @@ import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.cuda.device_renderer import DeviceRenderer
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.types import ImageGradients, RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from tests.core.device_kernels import DEVICES, kernels_of
 from tests.core.render.scenes import look_at, random_gaussians

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.errors import DeviceError
-from gaussian_wrapping_addon.core.render.cuda import driver
-from gaussian_wrapping_addon.core.render.cuda.driver import DriverModule
+from gaussian_wrapping_addon.core.render.cuda import compiler
+from gaussian_wrapping_addon.core.render.cuda.compiler import DriverModule
 from gaussian_wrapping_addon.core.render.cuda.kernels import Argument, Kernels
 
 
@@ -37,7 +37,7 @@ class FakeDriver:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeDriver:
     found = FakeDriver()
-    monkeypatch.setattr(driver, "load_driver", lambda: found)
+    monkeypatch.setattr(compiler, "load_driver", lambda: found)
     return found
 
 

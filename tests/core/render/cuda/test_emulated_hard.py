@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.reference.reference import render_reference
+from gaussian_wrapping_addon.core.render.reference import render_reference
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 from ..scenes import isotropic, look_at, random_gaussians
 from .comparison import (

@@ -12,25 +12,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ResourceError, UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.render import depth_query
 from gaussian_wrapping_addon.core.render.cuda import device_query
-from gaussian_wrapping_addon.core.render.cuda.cuda_render import render_with
 from gaussian_wrapping_addon.core.render.cuda.device_query import project_query_gradients
+from gaussian_wrapping_addon.core.render.cuda.device_renderer import render_with
 from gaussian_wrapping_addon.core.render.cuda.kernels import (
     Kernels,
     cuda_available,
+    cuda_source,
     device_kernels,
 )
-from gaussian_wrapping_addon.core.render.cuda.source import cuda_source
-from gaussian_wrapping_addon.core.render.projection.projection import (
-    RawArrays,
-    RawGradients,
-    project_backward,
-)
-from gaussian_wrapping_addon.core.render.query import depth_query
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.projection import RawArrays, RawGradients, project_backward
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.render.query_scenes import SCENES, SHAPES, Oracle, assert_depths, scene
 from tests.core.render.query_scenes import random_positions as positions_of
 from tests.core.render.scenes import isotropic, look_at, random_gaussians

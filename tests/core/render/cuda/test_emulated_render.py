@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.errors import ResourceError
-from gaussian_wrapping_addon.core.render.cuda.tile_lists import KEPT_BYTES, PASSING_BYTES
-from gaussian_wrapping_addon.core.render.reference.reference import render_reference
+from gaussian_wrapping_addon.core.render.cuda.device_view import KEPT_BYTES, PASSING_BYTES
+from gaussian_wrapping_addon.core.render.reference import render_reference
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 
 from ..scenes import look_at, random_gaussians
 from .comparison import (

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.render.cuda.kernels import Kernels
-from gaussian_wrapping_addon.core.render.cuda.source import cuda_source
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.cuda.kernels import Kernels, cuda_source
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 
 from ..scenes import look_at, random_gaussians
 from .comparison import emulated, outcome, random_weights

@@ -12,7 +12,7 @@ import torch
 
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection.projection import (
+from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     ScreenGaussians,
     allocate_visible,
@@ -20,8 +20,8 @@ from gaussian_wrapping_addon.core.render.projection.projection import (
     project_backward_visible,
     project_gaussians,
 )
-from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.reference import reference_projection
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from tests.core.render.first_principles import TRAINED
 from tests.core.render.projections import CAMERA, OPTIONS, project
 from tests.core.render.scenes import random_gaussians

@@ -9,8 +9,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.kernels.compiled import kernel
-from gaussian_wrapping_addon.core.render.projection.projection_math import (
+from gaussian_wrapping_addon.core.compiled import kernel
+from gaussian_wrapping_addon.core.render.projection_kernels import (
     block_scratch,
     exp_parts,
     exp_wide,

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.render.area_lists import sort_positions
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.tiling.area_lists import sort_positions
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.render.query_autograd import query_depth
 from tests.core.render.query_scenes import SCENES, Oracle, assert_depths, random_positions, scene
 from tests.core.render.scenes import isotropic, look_at

@@ -9,8 +9,8 @@ import numba
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.render.raster.contributors import (
+from gaussian_wrapping_addon.core import limits
+from gaussian_wrapping_addon.core.render.tile_io import (
     CONTRIBUTORS_PADDING,
     active_blocks,
     list_contributors,
@@ -61,7 +61,7 @@ def _lit(lanes, m, plane):  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize("lanes", [8, 16])
 def test_lit_blocks(lanes: int) -> None:
     random = np.random.default_rng(3)
-    threshold = np.float32(tolerances.TRANSMITTANCE_MIN)
+    threshold = np.float32(limits.TRANSMITTANCE_MIN)
     below = np.nextafter(threshold, np.float32(0))
     for _ in range(20):
         light = np.full((256 // lanes, lanes), below, np.float32)

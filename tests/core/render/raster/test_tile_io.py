@@ -10,8 +10,8 @@ import pytest
 import torch
 from numba.core.errors import TypingError
 
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.raster.blend import (
+from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.raster import (
     Images,
     RenderBuffers,
     ScreenView,
@@ -19,9 +19,9 @@ from gaussian_wrapping_addon.core.render.raster.blend import (
     write_intersection_gradients,
 )
 from gaussian_wrapping_addon.core.render.render import project_view
-from gaussian_wrapping_addon.core.render.simd.raster_math import ROW_VALUES, TILE, aligned_zeros
-from gaussian_wrapping_addon.core.render.tiling.block_masks import mask_kernel
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.simd import ROW_VALUES, TILE, aligned_zeros
+from gaussian_wrapping_addon.core.render.tile_kernels import mask_kernel
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from tests.core.render.scenes import look_at, random_gaussians
 
 SIZES = [(1, 1), (17, 33), (40, 1), (31, 16), (16, 5)]

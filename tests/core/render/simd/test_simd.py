@@ -12,7 +12,7 @@ import pytest
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from gaussian_wrapping_addon.core.render.simd.simd import Block, State
+from gaussian_wrapping_addon.core.render.simd import Block, State
 
 
 def _unary(lanes: int, body: Any) -> Any:

@@ -7,10 +7,10 @@ import dataclasses
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.query.depth_query import query_view
-from gaussian_wrapping_addon.core.render.tiling.area_lists import list_areas
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.area_lists import list_areas
+from gaussian_wrapping_addon.core.render.depth_query import query_view
+from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from tests.core.render.query_scenes import scene
 
 

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core import tolerances
+from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays, project_gaussians
-from gaussian_wrapping_addon.core.render.tiling.block_masks import mask_kernel
-from gaussian_wrapping_addon.core.render.tiling.tiles import bin_gaussians
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.projection import RawArrays, project_gaussians
+from gaussian_wrapping_addon.core.render.tile_kernels import mask_kernel
+from gaussian_wrapping_addon.core.render.tiles import bin_gaussians
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from tests.core.render.scenes import look_at, random_gaussians
 
-TILE, WIDTH = tolerances.TILE_PX, 4
+TILE, WIDTH = limits.TILE_PX, 4
 
 
 def masks_and_truth(gaussians: OrientedGaussians, lanes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -39,7 +39,7 @@ def masks_and_truth(gaussians: OrientedGaussians, lanes: int) -> tuple[np.ndarra
     dy = top[:, None, None] + np.arange(TILE)[:, None] - q[1]  # (p, 16, 1)
     num = q[2] * dx * dx + q[3] * dx * dy + q[4] * dy * dy
     den = 1 + 2 * (q[5] * dx + q[6] * dy) + q[7] * dx * dx + q[8] * dx * dy + q[9] * dy * dy
-    seen = q[11] * np.exp(-0.5 * num / den) >= tolerances.ALPHA_MIN
+    seen = q[11] * np.exp(-0.5 * num / den) >= limits.ALPHA_MIN
     blocks = seen.reshape(len(seen), strips, height, TILE // WIDTH, WIDTH).any((2, 4))
     return bits.astype(bool), blocks.reshape(len(seen), -1)
 

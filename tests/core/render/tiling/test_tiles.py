@@ -10,17 +10,22 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.kernels.array_store import ArrayStore
-from gaussian_wrapping_addon.core.render.projection.projection import (
+from gaussian_wrapping_addon.core.limits import ALPHA_MIN, TILE_PX
+from gaussian_wrapping_addon.core.parallel import ArrayStore
+from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     ScreenGaussians,
     project_gaussians,
 )
-from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
-from gaussian_wrapping_addon.core.render.tiling.depth_order import order_by_keys, radix_order
-from gaussian_wrapping_addon.core.render.tiling.tiles import TileBinning, TileLists, bin_gaussians
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
-from gaussian_wrapping_addon.core.tolerances import ALPHA_MIN, TILE_PX
+from gaussian_wrapping_addon.core.render.reference import reference_projection
+from gaussian_wrapping_addon.core.render.tiles import (
+    TileBinning,
+    TileLists,
+    bin_gaussians,
+    order_by_keys,
+    radix_order,
+)
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from tests.core.render.scenes import look_at, random_gaussians
 
 OPTIONS = RenderOptions(threads=1)

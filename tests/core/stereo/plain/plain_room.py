@@ -8,7 +8,7 @@ import functools
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap
 from tests.synthetic import look_at
 

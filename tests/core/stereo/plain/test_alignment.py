@@ -13,9 +13,8 @@ from scipy import ndimage
 
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap
-from gaussian_wrapping_addon.core.stereo.plain.alignment import Aligner, Part
-from gaussian_wrapping_addon.core.stereo.plain.evidence import packed
-from gaussian_wrapping_addon.core.stereo.plain.segments import segments_of
+from gaussian_wrapping_addon.core.stereo.plane_evidence import Aligner, Part, packed
+from gaussian_wrapping_addon.core.stereo.plane_fitting import segments_of
 from tests.core.stereo.plain.plain_room import (
     COUNT,
     FAINT_LEVELS,

@@ -8,16 +8,15 @@ import dataclasses
 import numpy as np
 
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.stereo.plain.alignment import Aligner
-from gaussian_wrapping_addon.core.stereo.plain.assignment import (
+from gaussian_wrapping_addon.core.stereo.plane_evidence import Aligner, packed
+from gaussian_wrapping_addon.core.stereo.plane_filling import (
     Assignment,
     PlaneSet,
     assigned,
     continued,
     lies_far,
 )
-from gaussian_wrapping_addon.core.stereo.plain.evidence import packed
-from gaussian_wrapping_addon.core.stereo.plain.segments import Segment, segments_of
+from gaussian_wrapping_addon.core.stereo.plane_fitting import Segment, segments_of
 from tests.core.stereo.plain.plain_room import (
     SKY,
     WALL,

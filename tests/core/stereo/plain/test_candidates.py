@@ -7,13 +7,14 @@ import dataclasses
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.stereo.plain.candidates import (
+from gaussian_wrapping_addon.core.stereo.plane_fitting import (
     LEAST_SPREAD,
     LEAST_WEIGHT,
+    Segment,
     proposed_planes,
+    segments_of,
     spreads,
 )
-from gaussian_wrapping_addon.core.stereo.plain.segments import Segment, segments_of
 from tests.core.stereo.plain.plain_room import (
     WALL,
     WALL_Y,

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.stereo.plain.evidence import packed
-from gaussian_wrapping_addon.core.stereo.plain.evidence_kernels import NEARER, UNLIKE
+from gaussian_wrapping_addon.core.stereo.plane_evidence import NEARER, UNLIKE, packed
 from tests.core.stereo.plain.plain_room import WALL, cameras, depth_map, depth_maps, traced
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.stereo.plain.evidence import packed
-from gaussian_wrapping_addon.core.stereo.plain.evidence_kernels import (
+from gaussian_wrapping_addon.core.stereo.plane_evidence import (
     AGREEING_SHARE,
     ALIKE_LEVELS,
     THROUGH_SHARE,
     correlate,
     count_votes,
+    packed,
 )
 from tests.core.stereo.plain.plain_room import cameras, depth_maps
 

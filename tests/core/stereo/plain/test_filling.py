@@ -10,7 +10,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.stereo.plain.filling import (
+from gaussian_wrapping_addon.core.stereo.plane_filling import (
     FILLED_CONFIDENCE,
     KEPT_SHARE,
     fill_plain_parts,

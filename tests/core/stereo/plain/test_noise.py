@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from gaussian_wrapping_addon.core.stereo.plain.noise import (
+from gaussian_wrapping_addon.core.stereo.plane_fitting import (
     BLOCK,
     noise_levels,
     smoothed_noise,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.stereo.plain.planes import (
+from gaussian_wrapping_addon.core.stereo.plane_fitting import (
     Plane,
     fit_plane,
     image_plane,

@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.stereo.plain.segments import (
+from gaussian_wrapping_addon.core.stereo.plane_fitting import (
     INSIDE_WEIGHT,
     SPARSE_WEIGHT,
     plain_pixels,

@@ -11,7 +11,7 @@ import torch
 
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.bake.gaussian_photos import GaussianPhotos
+from gaussian_wrapping_addon.core.texture.atlas_colors import GaussianPhotos
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 from tests.core.texture.test_texture_mesh import texels
 from tests.core.texture.texture_scenes import FakePhotos, scene_of, sphere

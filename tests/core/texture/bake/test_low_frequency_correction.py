@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.texture.bake.low_frequency_correction import (
+from gaussian_wrapping_addon.core.texture.bake import (
     GRID,
     MAX_LOG_CORRECTION,
     solve_low_frequency_correction,

@@ -10,18 +10,16 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import MeshingError
-from gaussian_wrapping_addon.core.evaluation.report.report_warnings import collect_warnings
+from gaussian_wrapping_addon.core.evaluation.report.figures import collect_warnings
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
-from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
+from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
-from gaussian_wrapping_addon.core.texture.atlas.texel_points import texel_points
-from gaussian_wrapping_addon.core.texture.bake.fill import dilate
-from gaussian_wrapping_addon.core.texture.detail import levels_of_detail as levels_module
-from gaussian_wrapping_addon.core.texture.detail.chart_pyramid import chart_pyramid
-from gaussian_wrapping_addon.core.texture.detail.levels_of_detail import levels_of_detail
+from gaussian_wrapping_addon.core.texture import levels_of_detail as levels_module
+from gaussian_wrapping_addon.core.texture.atlas import raster_atlas, texel_points
+from gaussian_wrapping_addon.core.texture.fill import dilate
+from gaussian_wrapping_addon.core.texture.levels_of_detail import chart_pyramid, levels_of_detail
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
 from tests.core.texture.detail_scenes import bumpy_ball
 from tests.core.texture.texture_scenes import waves

@@ -11,15 +11,17 @@ import pytest
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.tangent_frame import shading_normals, tangent_frames
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import AtlasRaster, raster_atlas
-from gaussian_wrapping_addon.core.texture.detail.dense_surface import (
+from gaussian_wrapping_addon.core.texture.atlas import AtlasRaster, raster_atlas
+from gaussian_wrapping_addon.core.texture.dense_detail import (
     BY_NEAREST,
     BY_RAY,
+    FLAT,
     NO_HIT,
     DenseSurface,
+    NormalMap,
+    bake_normal_map,
     cage_distance,
 )
-from gaussian_wrapping_addon.core.texture.detail.normal_map import FLAT, NormalMap, bake_normal_map
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
 from tests.core.texture.detail_scenes import (
     bumpy_ball,

@@ -10,11 +10,10 @@ import trimesh
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.tangent_frame import shading_normals
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
-from gaussian_wrapping_addon.core.texture.atlas.texel_points import texel_points
-from gaussian_wrapping_addon.core.texture.detail.dense_surface import DenseSurface
-from gaussian_wrapping_addon.core.texture.detail.occlusion import (
+from gaussian_wrapping_addon.core.texture.atlas import raster_atlas, texel_points
+from gaussian_wrapping_addon.core.texture.dense_detail import (
     REACH_SHARE,
+    DenseSurface,
     bake_occlusion,
     sky_visibility,
     smoothed,

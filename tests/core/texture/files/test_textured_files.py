@@ -14,17 +14,13 @@ import pytest
 import trimesh
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import MeshingError, ResourceError, UsageError
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
-from gaussian_wrapping_addon.core.texture.files.textured_files import (
-    file_offset,
-    write_glb,
-    write_mesh_ply,
-    write_obj,
-    write_textured,
-)
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.frames import file_offset
+from gaussian_wrapping_addon.core.texture.file_checks import write_mesh_ply
+from gaussian_wrapping_addon.core.texture.files import write_glb, write_obj, write_textured
 from tests.core.texture.texture_scenes import box
 
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])

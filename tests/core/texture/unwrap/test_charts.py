@@ -6,19 +6,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.mesh.face_graph import components, face_graph
-from gaussian_wrapping_addon.core.texture.unwrap.chart_overlaps import (
-    find_overlaps,
-    overlapping_pairs,
-    signed_areas,
-    split_overlaps,
-)
-from gaussian_wrapping_addon.core.texture.unwrap.chart_shapes import (
+from gaussian_wrapping_addon.core.mesh.components import components, face_graph
+from gaussian_wrapping_addon.core.texture.unwrap.charts import (
     chart_points,
     equalise_density,
     flatten_faces,
     relax,
     smooth_vertices,
+)
+from gaussian_wrapping_addon.core.texture.unwrap.overlaps import (
+    find_overlaps,
+    overlapping_pairs,
+    signed_areas,
+    split_overlaps,
 )
 from tests.core.texture.texture_scenes import sphere
 

@@ -9,12 +9,8 @@ import pytest
 from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.limits import MAX_ATLASES
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.mesh.udims import udim_uvs
-from gaussian_wrapping_addon.core.texture.unwrap.own_uvs import (
-    overlap_warning,
-    own_uvs,
-    uv_area,
-)
+from gaussian_wrapping_addon.core.mesh.textured_mesh import udim_uvs
+from gaussian_wrapping_addon.core.texture.unwrap.unwrap import overlap_warning, own_uvs, uv_area
 
 FACES = 24
 TRIANGLE = np.array([[0.1, 0.1], [0.9, 0.1], [0.1, 0.9]])

@@ -16,15 +16,18 @@ from gaussian_wrapping_addon.core.errors import (
     MemoryShortageError,
     ResourceError,
 )
-from gaussian_wrapping_addon.core.mesh.face_graph import components, face_graph
+from gaussian_wrapping_addon.core.mesh.components import components, face_graph
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.atlas import raster_atlas
 from gaussian_wrapping_addon.core.texture.unwrap import charts as charts_module
 from gaussian_wrapping_addon.core.texture.unwrap import unwrap as unwrap_module
-from gaussian_wrapping_addon.core.texture.unwrap.chart_overlaps import find_overlaps
-from gaussian_wrapping_addon.core.texture.unwrap.chunks import MAX_CHUNK_FACES, split_into_chunks
-from gaussian_wrapping_addon.core.texture.unwrap.stretch import texture_stretch
+from gaussian_wrapping_addon.core.texture.unwrap.charts import (
+    MAX_CHUNK_FACES,
+    split_into_chunks,
+    texture_stretch,
+)
+from gaussian_wrapping_addon.core.texture.unwrap.overlaps import find_overlaps
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import Unwrap, unwrap
 from tests.core.texture.texture_scenes import box, joined, sphere
 

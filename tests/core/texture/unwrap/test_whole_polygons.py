@@ -8,15 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.mesh.face_graph import face_graph, uv_charts
+from gaussian_wrapping_addon.core.mesh.components import face_graph, uv_charts
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.texture.unwrap.chart_boxes import split_wide_charts
-from gaussian_wrapping_addon.core.texture.unwrap.chart_overlaps import find_overlaps, signed_areas
-from gaussian_wrapping_addon.core.texture.unwrap.chart_shapes import flatten_faces
-from gaussian_wrapping_addon.core.texture.unwrap.stretch import texture_stretch
+from gaussian_wrapping_addon.core.texture.unwrap.charts import (
+    flatten_faces,
+    split_wide_charts,
+    texture_stretch,
+)
+from gaussian_wrapping_addon.core.texture.unwrap.overlaps import (
+    find_overlaps,
+    join_polygons,
+    set_cut_apart,
+    signed_areas,
+)
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import Unwrap, unwrap
-from gaussian_wrapping_addon.core.texture.unwrap.whole_polygons import join_polygons, set_cut_apart
 
 
 def quad_torus(around: int, across: int) -> tuple[SurfaceMesh, np.ndarray]:

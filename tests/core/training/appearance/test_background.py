@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.kernels.array_store import ArrayStore
-from gaussian_wrapping_addon.core.training.appearance.background import (
+from gaussian_wrapping_addon.core.parallel import ArrayStore
+from gaussian_wrapping_addon.core.training.background import (
     background_gradient,
     composited,
     draw_background,

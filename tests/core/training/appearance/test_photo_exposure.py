@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.imaging.image_values import as_unit_floats as as_floats
-from gaussian_wrapping_addon.core.imaging.view_metrics import psnr
-from gaussian_wrapping_addon.core.training.appearance.photo_exposure import (
+from gaussian_wrapping_addon.core.image_metrics import psnr
+from gaussian_wrapping_addon.core.resampling import as_unit_floats as as_floats
+from gaussian_wrapping_addon.core.training.exposure import (
     LARGEST_RATE,
     LAST_SHARE,
     MAX_LOG_GAIN,

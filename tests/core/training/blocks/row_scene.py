@@ -9,21 +9,20 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.blocks.block_plan import BlockPlan
-from gaussian_wrapping_addon.core.training.blocks.block_settings import BlockSettings
-from gaussian_wrapping_addon.core.training.blocks.coarse_training import CoarseTraining
-from gaussian_wrapping_addon.core.training.blocks.plan_blocks import plan_blocks
-from gaussian_wrapping_addon.core.training.selection.model_selection import (
-    Decision,
-    ModelSelection,
+from gaussian_wrapping_addon.core.training.block_plan import (
+    BlockPlan,
+    BlockSettings,
+    CoarseTraining,
+    plan_blocks,
 )
+from gaussian_wrapping_addon.core.training.model_selection import Decision, ModelSelection
 from tests.core.render.scenes import look_at
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, surface_color
 

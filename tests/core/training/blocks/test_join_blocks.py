@@ -15,14 +15,15 @@ from gaussian_wrapping_addon.core.errors import Cancelled, UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
-from gaussian_wrapping_addon.core.training.blocks.block_plan import BlockPlan
-from gaussian_wrapping_addon.core.training.blocks.block_settings import BlockSettings
-from gaussian_wrapping_addon.core.training.blocks.coarse_training import train_coarse
-from gaussian_wrapping_addon.core.training.blocks.join_blocks import join_blocks, joined_blocks
-from gaussian_wrapping_addon.core.training.blocks.plan_blocks import plan_blocks
-from gaussian_wrapping_addon.core.training.blocks.train_block import train_block
-from gaussian_wrapping_addon.core.training.result import TrainingResult
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.training.block_plan import (
+    BlockPlan,
+    BlockSettings,
+    plan_blocks,
+    train_coarse,
+)
+from gaussian_wrapping_addon.core.training.blocks import join_blocks, joined_blocks, train_block
+from gaussian_wrapping_addon.core.training.state import TrainingResult
 from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.training.blocks.row_scene import SETTINGS, row_scene, two_blocks
 from tests.core.training.test_trainer import StopAt, assert_same

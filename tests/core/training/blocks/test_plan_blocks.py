@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 
 from gaussian_wrapping_addon.core.errors import Cancelled, UsageError
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
-from gaussian_wrapping_addon.core.training.blocks.block_settings import BlockSettings
-from gaussian_wrapping_addon.core.training.blocks.photo_choice import chosen_photos
-from gaussian_wrapping_addon.core.training.blocks.plan_blocks import plan_blocks
+from gaussian_wrapping_addon.core.training.block_plan import (
+    BlockSettings,
+    chosen_photos,
+    plan_blocks,
+)
 from tests.core.training.blocks.row_scene import SETTINGS, known_coarse, row_scene, two_blocks
 from tests.core.training.small_scene import sphere_gaussians
 

@@ -15,14 +15,14 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.core.training.appearance.photo_exposure import Exposure
-from gaussian_wrapping_addon.core.training.blocks.block_plan import BlockPlan
-from gaussian_wrapping_addon.core.training.blocks.plan_file import (
+from gaussian_wrapping_addon.core.training.block_plan import (
     ARRAYS_NAME,
     PLAN_NAME,
+    BlockPlan,
     load_plan,
     save_plan,
 )
+from gaussian_wrapping_addon.core.training.exposure import Exposure
 from tests.core.training.blocks.row_scene import two_blocks
 
 

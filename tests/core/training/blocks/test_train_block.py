@@ -12,20 +12,17 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.errors import Cancelled, UsageError
-from gaussian_wrapping_addon.core.gaussians.mip_filter import mip_filter
-from gaussian_wrapping_addon.core.gaussians.model import TRAINED
+from gaussian_wrapping_addon.core.gaussians.model import TRAINED, mip_filter
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training import trainer
-from gaussian_wrapping_addon.core.training.appearance.photo_exposure import Exposure
-from gaussian_wrapping_addon.core.training.blocks.block_plan import BlockPlan
-from gaussian_wrapping_addon.core.training.blocks.train_block import block_settings, train_block
-from gaussian_wrapping_addon.core.training.density import density_control
-from gaussian_wrapping_addon.core.training.devices.backend import Backend
-from gaussian_wrapping_addon.core.training.result import TrainingResult
+from gaussian_wrapping_addon.core.training import density, trainer
+from gaussian_wrapping_addon.core.training.backend import Backend
+from gaussian_wrapping_addon.core.training.block_plan import BlockPlan
+from gaussian_wrapping_addon.core.training.blocks import block_settings, train_block
+from gaussian_wrapping_addon.core.training.exposure import Exposure
+from gaussian_wrapping_addon.core.training.model_selection import Decision
 from gaussian_wrapping_addon.core.training.schedule import Schedule
-from gaussian_wrapping_addon.core.training.selection.model_selection import Decision
-from gaussian_wrapping_addon.core.training.state import TrainingState
+from gaussian_wrapping_addon.core.training.state import TrainingResult, TrainingState
 from tests.core.device_kernels import DEVICES
 from tests.core.training.blocks.row_scene import SETTINGS, row_scene, two_blocks
 from tests.core.training.devices.device_training import backend_of
@@ -79,7 +76,7 @@ def test_what_stands_still_keeps_every_bit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(Schedule, "resets_opacity", lambda _, iteration: iteration == 15)
-    monkeypatch.setattr(density_control, "CLONE_SIZE", 0.05)
+    monkeypatch.setattr(density, "CLONE_SIZE", 0.05)
     backend = None if device is None else backend_of(device, request)
     states, plan = last_state(monkeypatch), two_blocks()
     block = plan.blocks[0]

@@ -9,17 +9,15 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import ResourceError, UsageError
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.blocks.block_settings import BlockSettings
-from gaussian_wrapping_addon.core.training.cost.blocks_estimate import (
-    block_estimates,
-    blocks_advice,
-    estimate_training,
-    memory_warnings,
-)
-from gaussian_wrapping_addon.core.training.cost.training_estimate import (
+from gaussian_wrapping_addon.core.training.block_plan import BlockSettings
+from gaussian_wrapping_addon.core.training.estimate import (
     Machine,
     SceneFacts,
+    block_estimates,
+    blocks_advice,
     estimate,
+    estimate_training,
+    memory_warnings,
 )
 
 FACTS = SceneFacts(400, 640.0 * 480.0, 640, 20_000)

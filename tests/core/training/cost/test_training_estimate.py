@@ -12,7 +12,7 @@ import pytest
 from gaussian_wrapping_addon.core.errors import ResourceError
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.stereo.depth_maps import least_divisor
-from gaussian_wrapping_addon.core.training.cost.training_estimate import (
+from gaussian_wrapping_addon.core.training.estimate import (
     MATCHING_PIXEL_BYTES,
     MATCHING_PIXEL_S,
     Machine,
@@ -22,8 +22,8 @@ from gaussian_wrapping_addon.core.training.cost.training_estimate import (
     gaussian_counts,
     this_machine,
 )
-from gaussian_wrapping_addon.core.training.initialisation.dense_start import start_budget
 from gaussian_wrapping_addon.core.training.schedule import Schedule
+from gaussian_wrapping_addon.core.training.start import start_budget
 
 FACTS = SceneFacts(40, 640 * 480, 640, 3000)
 PLAIN = TrainingSettings(multi_view="off", growth="on", wrapping="on")

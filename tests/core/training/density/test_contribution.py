@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
-from gaussian_wrapping_addon.core.training.density.contribution import (
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.training.adam import Adam
+from gaussian_wrapping_addon.core.training.density import (
     contributions,
     needed_by_a_view,
     prune_contributors,
 )
-from gaussian_wrapping_addon.core.training.density.wrapping import WrapView
-from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
+from gaussian_wrapping_addon.core.training.wrapping import WrapView
 from tests.core.render.scenes import random_gaussians
 
 

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
-from gaussian_wrapping_addon.core.render.types.images import RenderStatistics
-from gaussian_wrapping_addon.core.training.density.density_control import (
+from gaussian_wrapping_addon.core.render.types import RenderStatistics
+from gaussian_wrapping_addon.core.training.adam import Adam
+from gaussian_wrapping_addon.core.training.density import (
     CLONE_SIZE,
     GRADIENT_THRESHOLD,
     MIN_OPACITY,
@@ -18,7 +19,6 @@ from gaussian_wrapping_addon.core.training.density.density_control import (
     densify_and_prune,
     reset_opacity,
 )
-from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
 from tests.core.render.scenes import random_gaussians
 
 

@@ -6,15 +6,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.stereo.depth_priors import DepthPrior
-from gaussian_wrapping_addon.core.stereo.plain.evidence import MOST_ASKED
-from gaussian_wrapping_addon.core.stereo.plain.evidence_kernels import (
+from gaussian_wrapping_addon.core import limits
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.stereo.depth_maps import DepthPrior
+from gaussian_wrapping_addon.core.stereo.plane_evidence import (
     AGREEING_SHARE,
+    MOST_ASKED,
     THROUGH_SHARE,
 )
-from gaussian_wrapping_addon.core.training.density.free_space import contradicted
+from gaussian_wrapping_addon.core.training.density import contradicted
 from tests.synthetic import look_at
 
 FLOOR_Z = -2.0
@@ -92,7 +92,7 @@ def test_what_may_be_the_sky_is_left() -> None:
     found = {0: priors(free=1)[0]}
     found[0].free[...] = 1e6
     axis = -found[0].camera.center / np.linalg.norm(found[0].camera.center)
-    points = np.array([[0.9], [1.1]]) * tolerances.FAR_RADIUS * axis
+    points = np.array([[0.9], [1.1]]) * limits.FAR_RADIUS * axis
     assert contradicted(points, found, 1).tolist() == [True, False]
 
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED
-from gaussian_wrapping_addon.core.training.density.orientation import FIRST_SIGN
-from gaussian_wrapping_addon.core.training.density.wrapping import (
+from gaussian_wrapping_addon.core.training.adam import Adam
+from gaussian_wrapping_addon.core.training.wrapping import (
+    FIRST_SIGN,
     WrapView,
     normal_errors,
     start_orientation,
     wrap,
 )
-from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
 from tests.core.render.scenes import random_gaussians
 from tests.core.training.small_scene import ring_cameras, sphere_gaussians
 

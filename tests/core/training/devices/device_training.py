@@ -11,7 +11,7 @@ import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.cuda.kernels import Kernels
-from gaussian_wrapping_addon.core.training.devices.device_backend import DeviceBackend
+from gaussian_wrapping_addon.core.training.device_backend import DeviceBackend
 from tests.core.device_kernels import kernels_of
 from tests.core.training.small_scene import sphere_gaussians
 

@@ -8,10 +8,9 @@ import sys
 import pytest
 
 from gaussian_wrapping_addon.core.errors import DeviceError
-from gaussian_wrapping_addon.core.training.devices import device_backend
-from gaussian_wrapping_addon.core.training.devices.chosen import chosen_backend
-from gaussian_wrapping_addon.core.training.devices.cpu_backend import CpuBackend
-from gaussian_wrapping_addon.core.training.devices.device_backend import DeviceBackend
+from gaussian_wrapping_addon.core.training import device_backend
+from gaussian_wrapping_addon.core.training.cpu_backend import CpuBackend
+from gaussian_wrapping_addon.core.training.device_backend import DeviceBackend, chosen_backend
 
 
 def test_the_processor_needs_no_kernels_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.initialisation import point_start
+from gaussian_wrapping_addon.core.training import start
 from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.device_kernels import DEVICES
 from tests.core.training.devices.device_training import backend_of, perturbed_sphere
@@ -48,9 +48,7 @@ def test_fifty_iterations_come_to_the_same_end(
     scene, photos = sphere_scene(views=30, size_px=24)
     # Round Gaussians of one colour, as at the start of a training, have gradients of 1e-10 on
     # turns and the like, whose sign is rounding, and Adam's first step is as large for any.
-    monkeypatch.setattr(
-        point_start, "initial_gaussians", lambda *_, **__: perturbed_sphere(120, seed)
-    )
+    monkeypatch.setattr(start, "initial_gaussians", lambda *_, **__: perturbed_sphere(120, seed))
     settings = dataclasses.replace(SETTINGS, harmonics=word, wrapping=word, growth=word)
     results = []
     for name, backend in (("cpu", None), ("device", backend_of(device, request))):

@@ -14,11 +14,9 @@ from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training import trainer
-from gaussian_wrapping_addon.core.training.checkpoint import load_checkpoint
-from gaussian_wrapping_addon.core.training.initialisation import point_start
-from gaussian_wrapping_addon.core.training.optimizer.device_adam import DeviceAdam
-from gaussian_wrapping_addon.core.training.state import TrainingState
+from gaussian_wrapping_addon.core.training import start, trainer
+from gaussian_wrapping_addon.core.training.device_adam import DeviceAdam
+from gaussian_wrapping_addon.core.training.state import TrainingState, load_checkpoint
 from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.device_kernels import DEVICES
 from tests.core.training.devices.device_training import backend_of, perturbed_sphere
@@ -37,9 +35,7 @@ SETTINGS = TrainingSettings(
 
 @pytest.fixture(autouse=True)
 def _uneven_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        point_start, "initial_gaussians", lambda *_, **__: perturbed_sphere(100, SEED)
-    )
+    monkeypatch.setattr(start, "initial_gaussians", lambda *_, **__: perturbed_sphere(100, SEED))
 
 
 @pytest.mark.parametrize("first", ["cpu", "device"])

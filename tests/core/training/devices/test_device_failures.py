@@ -11,24 +11,15 @@ from typing import Any
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.devices.failures import (
-    is_device_failure,
-    is_memory_failure,
-)
-from gaussian_wrapping_addon.core.errors import (
-    Cancelled,
-    DeviceError,
-    ResourceError,
-    WrapError,
-)
+from gaussian_wrapping_addon.core.devices.checks import is_device_failure, is_memory_failure
+from gaussian_wrapping_addon.core.errors import Cancelled, DeviceError, ResourceError, WrapError
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training import trainer
-from gaussian_wrapping_addon.core.training.devices.cpu_backend import CpuBackend
-from gaussian_wrapping_addon.core.training.devices.device_backend import DeviceBackend
-from gaussian_wrapping_addon.core.training.initialisation import point_start
-from gaussian_wrapping_addon.core.training.optimizer.device_adam import DeviceAdam
-from gaussian_wrapping_addon.core.training.result import TrainingResult
+from gaussian_wrapping_addon.core.training import start, trainer
+from gaussian_wrapping_addon.core.training.cpu_backend import CpuBackend
+from gaussian_wrapping_addon.core.training.device_adam import DeviceAdam
+from gaussian_wrapping_addon.core.training.device_backend import DeviceBackend
+from gaussian_wrapping_addon.core.training.state import TrainingResult
 from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.device_kernels import kernels_of
 from tests.core.training.devices.device_training import emulated_backend, perturbed_sphere
@@ -49,9 +40,7 @@ FULL = (torch.OutOfMemoryError("CUDA out of memory."), ResourceError("The lists 
 
 @pytest.fixture(autouse=True)
 def _uneven_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        point_start, "initial_gaussians", lambda *_, **__: perturbed_sphere(80, SEED)
-    )
+    monkeypatch.setattr(start, "initial_gaussians", lambda *_, **__: perturbed_sphere(80, SEED))
     monkeypatch.setattr(trainer, "SNAPSHOT_EVERY", SNAPSHOT)
 
 

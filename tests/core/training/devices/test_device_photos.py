@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.training.devices.backend import counts_of
-from gaussian_wrapping_addon.core.training.devices.cpu_backend import CpuBackend
-from gaussian_wrapping_addon.core.training.devices.device_photos import DevicePhotos
-from gaussian_wrapping_addon.core.training.devices.windows import Window
+from gaussian_wrapping_addon.core.training.backend import Window, counts_of
+from gaussian_wrapping_addon.core.training.cpu_backend import CpuBackend
+from gaussian_wrapping_addon.core.training.device_backend import DevicePhotos
 from tests.core.training.small_scene import PhotosInMemory, sphere_scene
 
 HOST = torch.device("cpu")

@@ -24,21 +24,17 @@ import pytest
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.stereo.depth_priors import DepthPrior
-from gaussian_wrapping_addon.core.training.appearance.photo_exposure import Exposure
-from gaussian_wrapping_addon.core.training.devices.backend import Backend
-from gaussian_wrapping_addon.core.training.devices.cpu_backend import CpuBackend
+from gaussian_wrapping_addon.core.stereo.depth_maps import DepthPrior
+from gaussian_wrapping_addon.core.training import multi_view
+from gaussian_wrapping_addon.core.training.backend import Backend
+from gaussian_wrapping_addon.core.training.camera_poses import CameraPoses, PosedPhotos
+from gaussian_wrapping_addon.core.training.cpu_backend import CpuBackend
+from gaussian_wrapping_addon.core.training.exposure import Exposure
 from gaussian_wrapping_addon.core.training.iteration import Stepper
-from gaussian_wrapping_addon.core.training.losses import multi_view
-from gaussian_wrapping_addon.core.training.losses.neighbours import find_neighbours
-from gaussian_wrapping_addon.core.training.poses.camera_poses import CameraPoses
-from gaussian_wrapping_addon.core.training.poses.posed_photos import PosedPhotos
+from gaussian_wrapping_addon.core.training.model_selection import Decision, ModelSelection
+from gaussian_wrapping_addon.core.training.multi_view import find_neighbours
 from gaussian_wrapping_addon.core.training.rounds import Rounds
 from gaussian_wrapping_addon.core.training.schedule import Schedule
-from gaussian_wrapping_addon.core.training.selection.model_selection import (
-    Decision,
-    ModelSelection,
-)
 from gaussian_wrapping_addon.core.training.state import TrainingState
 from tests.core.device_kernels import DEVICES
 from tests.core.training.devices.device_training import backend_of, perturbed_sphere

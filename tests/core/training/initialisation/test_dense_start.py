@@ -11,22 +11,21 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.photo_source import PhotoSource
-from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.scene.scene import PhotoSource, Scene
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.stereo.depth_priors import FILE_NAME
+from gaussian_wrapping_addon.core.stereo.depth_maps import FILE_NAME
 from gaussian_wrapping_addon.core.training import trainer
-from gaussian_wrapping_addon.core.training.initialisation.dense_start import (
+from gaussian_wrapping_addon.core.training.rounds import Rounds
+from gaussian_wrapping_addon.core.training.start import (
     FLATNESS,
     LEAST_CONFIRMED,
     OPACITY,
     DenseStart,
     dense_start,
 )
-from gaussian_wrapping_addon.core.training.rounds import Rounds
 from gaussian_wrapping_addon.core.training.state import TrainingState
 from tests.core.stereo.ball_scene import (
     SIDE_PX,

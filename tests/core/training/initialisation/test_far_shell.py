@@ -8,14 +8,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap
-from gaussian_wrapping_addon.core.training.initialisation.far_shell import (
-    CELL_PX,
-    LEAST_REACH,
-    REACH_FACTOR,
-    far_shell,
-)
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.stereo.depth_maps import CELL_PX, DepthMap
+from gaussian_wrapping_addon.core.training.start import LEAST_REACH, REACH_FACTOR, far_shell
 from tests.synthetic import look_at
 
 WIDTH, HEIGHT = 96, 64

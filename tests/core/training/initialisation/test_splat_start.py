@@ -11,29 +11,25 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import fibonacci_directions
-from gaussian_wrapping_addon.core.dataset.quaternion import rotation_from_quaternion
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.loading.other_inputs import fibonacci_directions
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.render.reference.reference import render_reference
+from gaussian_wrapping_addon.core.render.reference import render_reference
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity, rotation_from_quaternion
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.density.orientation import voted_orientation
-from gaussian_wrapping_addon.core.training.initialisation.splat_start import (
+from gaussian_wrapping_addon.core.training.splat_start import (
     FILTER_MULTIPLE,
     baked,
     fit_filter,
     start_from_splat,
-)
-from gaussian_wrapping_addon.core.training.initialisation.splat_transform import (
     transform_gaussians,
     with_degree,
 )
+from gaussian_wrapping_addon.core.training.wrapping import voted_orientation
 from tests.core.gaussians.splat_files import splat_columns, write_ply
 from tests.core.render.scenes import look_at, random_gaussians
 from tests.core.training.splat_shells import AXES, shell_of_discs

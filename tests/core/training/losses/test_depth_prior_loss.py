@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.stereo.depth_priors import DepthPrior
-from gaussian_wrapping_addon.core.training.devices.windows import Window
-from gaussian_wrapping_addon.core.training.losses.depth_prior_loss import (
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.stereo.depth_maps import DepthPrior
+from gaussian_wrapping_addon.core.training.backend import Window
+from gaussian_wrapping_addon.core.training.losses import (
     OUTLIER_SHARE,
     TOLERANCE_SHARE,
     depth_prior_loss,

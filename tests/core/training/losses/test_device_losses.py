@@ -7,20 +7,23 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.imaging.ssim_kernels import RADIUS
-from gaussian_wrapping_addon.core.render.cuda import source
-from gaussian_wrapping_addon.core.stereo.depth_priors import DepthPrior
-from gaussian_wrapping_addon.core.training.losses import depth_prior_loss as prior_module
-from gaussian_wrapping_addon.core.training.losses.depth_prior_loss import depth_prior_loss
-from gaussian_wrapping_addon.core.training.losses.device_losses import (
+from gaussian_wrapping_addon.core.image_metrics import RADIUS
+from gaussian_wrapping_addon.core.render.cuda import kernels
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.stereo.depth_maps import DepthPrior
+from gaussian_wrapping_addon.core.training import adam
+from gaussian_wrapping_addon.core.training import losses as prior_module
+from gaussian_wrapping_addon.core.training.device_losses import (
     device_color_loss,
     device_normal_losses,
     device_prior_loss,
 )
-from gaussian_wrapping_addon.core.training.losses.loss_kernels import MIN_NORMAL_SQ
-from gaussian_wrapping_addon.core.training.losses.losses import color_loss, normal_losses
-from gaussian_wrapping_addon.core.training.optimizer import adam_kernels
+from gaussian_wrapping_addon.core.training.losses import (
+    MIN_NORMAL_SQ,
+    color_loss,
+    depth_prior_loss,
+    normal_losses,
+)
 from tests.core.device_kernels import DEVICES, kernels_of
 
 SIZES = [(33, 17), (48, 40), (16, 16), (70, 11), (9, 30)]
@@ -157,12 +160,12 @@ def test_prior_loss(request, device: str, masked: bool) -> None:  # type: ignore
 
 
 def test_the_source_has_the_numbers_of_the_cpu_kernels() -> None:
-    text = source.cuda_source()
+    text = kernels.cuda_source()
     for name, value in {
         "MIN_NORMAL_SQ": MIN_NORMAL_SQ,
-        "ADAM_BETA1": adam_kernels.BETA1,
-        "ADAM_BETA2": adam_kernels.BETA2,
-        "ADAM_EPSILON": adam_kernels.EPSILON,
+        "ADAM_BETA1": adam.BETA1,
+        "ADAM_BETA2": adam.BETA2,
+        "ADAM_EPSILON": adam.EPSILON,
     }.items():
         assert f"#define {name} {value!r}f\n" in text
     assert f"#define PRIOR_TOLERANCE {prior_module.TOLERANCE_SHARE!r}\n" in text

@@ -13,31 +13,29 @@ import pytest
 import torch
 from torch import Tensor
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.cuda.kernels import (
-    Kernels,
-    cuda_available,
-    device_kernels,
-)
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.cuda.kernels import Kernels, cuda_available, device_kernels
+from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
-from gaussian_wrapping_addon.core.training.losses import device_multi_view, multi_view
-from gaussian_wrapping_addon.core.training.losses.device_multi_view import (
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.training import device_losses, multi_view
+from gaussian_wrapping_addon.core.training.device_losses import (
     DeviceMultiViewLoss,
     choose_on_device,
     device_multi_view_losses,
     grey_on_device,
 )
-from gaussian_wrapping_addon.core.training.losses.multi_view import (
+from gaussian_wrapping_addon.core.training.multi_view import (
+    KEPT,
+    SAMPLES,
     MultiViewLoss,
     MultiViewOptions,
+    choose_pixels,
+    grey_image,
     multi_view_losses,
 )
-from gaussian_wrapping_addon.core.training.losses.multi_view_kernels import KEPT, SAMPLES
-from gaussian_wrapping_addon.core.training.losses.pixel_choice import choose_pixels, grey_image
 from tests.core.render.comparisons import relative_l2
 from tests.core.render.cuda.emulation import EmulatedKernels
 from tests.core.training.plane_scene import camera_pair, plane_gaussians, plane_photo
@@ -272,7 +270,7 @@ def assert_same_steps(case: Case, kernels: Kernels, device: str = "cpu") -> None
     def there(array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(device)
 
-    pair = device_multi_view._Pair(kernels, there(pixels), case.camera, case.other, near_z)
+    pair = device_losses._Pair(kernels, there(pixels), case.camera, case.other, near_z)
     wanted = ours.lift(masks[1])
     found = pair.lift(there(images.depth), there(masks[1]))
     np.testing.assert_allclose(found[0].cpu(), wanted[0], rtol=1e-6)
@@ -322,7 +320,7 @@ def test_wrong_sizes_and_types_are_refused(emulator_library: Path) -> None:
         case.on_device(kernels, SimpleNamespace(**{**vars(images), "depth": np.ones((4, 3))}))
     photo = torch.from_numpy(bytes_of(OTHER))
     with pytest.raises(UsageError, match=r"photo is torch.float32"):
-        device_multi_view._check(OTHER, photo.float(), None)
+        device_losses._check(OTHER, photo.float(), None)
 
 
 # -- on a GPU -------------------------------------------------------------------------------------

@@ -6,11 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.render.types.gradients import VisibleGradients
-from gaussian_wrapping_addon.core.training.losses.footprint_regulariser import (
-    add_footprint_regulariser,
-    footprint_shares,
-)
+from gaussian_wrapping_addon.core.render.types import VisibleGradients
+from gaussian_wrapping_addon.core.training.losses import add_footprint_regulariser, footprint_shares
 
 
 def no_gradients(ids: list[int]) -> VisibleGradients:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.kernels.array_store import ArrayStore
-from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients
-from gaussian_wrapping_addon.core.training.losses.losses import (
+from gaussian_wrapping_addon.core.parallel import ArrayStore
+from gaussian_wrapping_addon.core.render.types import ImageGradients
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.training.losses import (
     color_loss,
     normal_losses,
     normals_from_depth,

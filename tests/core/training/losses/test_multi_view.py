@@ -10,22 +10,23 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
+from gaussian_wrapping_addon.core.render.projection import RawArrays
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewPass, ViewRenderer
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.losses.multi_view import (
+from gaussian_wrapping_addon.core.training.adam import merge_gradients
+from gaussian_wrapping_addon.core.training.multi_view import (
+    SAMPLES,
     MultiViewLoss,
     MultiViewOptions,
+    choose_pixels,
+    grey_image,
     multi_view_losses,
 )
-from gaussian_wrapping_addon.core.training.losses.multi_view_kernels import SAMPLES
-from gaussian_wrapping_addon.core.training.losses.pixel_choice import choose_pixels, grey_image
-from gaussian_wrapping_addon.core.training.optimizer.gradient_sums import merge_gradients
 from tests.core.render.query_autograd import query_depth
 from tests.core.training.plane_scene import camera_pair, plane_gaussians, plane_photo
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.losses.multi_view_kernels import KEPT, SAMPLES, SKIPPED
-from gaussian_wrapping_addon.core.training.losses.pixel_choice import NO_MASK
+from gaussian_wrapping_addon.core.training.multi_view import KEPT, NO_MASK, SAMPLES, SKIPPED
 from tests.core.training.plane_scene import (
     NORMAL,
     PlaneView,

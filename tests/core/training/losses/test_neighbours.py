@@ -6,16 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core import limits
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.settings import preset
-from gaussian_wrapping_addon.core.training.losses.neighbours import (
-    NeighbourLimits,
-    find_neighbours,
-)
+from gaussian_wrapping_addon.core.training.multi_view import NeighbourLimits, find_neighbours
 from tests.core.render.scenes import look_at
 
-RADIUS = tolerances.SCENE_RADIUS
+RADIUS = limits.SCENE_RADIUS
 PUBLISHED = NeighbourLimits.of_settings(preset("paper").training)
 
 

@@ -6,12 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.render.types.gradients import VisibleGradients
-from gaussian_wrapping_addon.core.training.losses.opacity_prior import (
-    FAINT,
-    SURE,
-    add_opacity_prior,
-)
+from gaussian_wrapping_addon.core.render.types import VisibleGradients
+from gaussian_wrapping_addon.core.training.losses import FAINT, SURE, add_opacity_prior
 
 SHARES = np.array([1.0, 0.5, 0.12], np.float32)
 """Of the image in the footprints of the first three Gaussians; the fourth is not seen."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.training.losses.pixel_choice import choose_pixels, grey_image
+from gaussian_wrapping_addon.core.training.multi_view import choose_pixels, grey_image
 
 HEIGHT, WIDTH = 60, 80
 

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED
-from gaussian_wrapping_addon.core.render.types.gradients import VisibleGradients
-from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
-from gaussian_wrapping_addon.core.training.optimizer.adam_kernels import BETA1, BETA2, EPSILON
+from gaussian_wrapping_addon.core.render.types import VisibleGradients
+from gaussian_wrapping_addon.core.training.adam import BETA1, BETA2, EPSILON, Adam
 from tests.core.render.scenes import random_gaussians
 
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED
-from gaussian_wrapping_addon.core.render.types.gradients import VisibleGradients
-from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
-from gaussian_wrapping_addon.core.training.optimizer.device_adam import DeviceAdam
+from gaussian_wrapping_addon.core.render.types import VisibleGradients
+from gaussian_wrapping_addon.core.training.adam import Adam
+from gaussian_wrapping_addon.core.training.device_adam import DeviceAdam
 from tests.core.device_kernels import DEVICES, kernels_of
 from tests.core.render.scenes import random_gaussians
 

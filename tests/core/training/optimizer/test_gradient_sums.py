@@ -6,12 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.kernels.array_store import ArrayStore
-from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients, VisibleGradients
-from gaussian_wrapping_addon.core.training.optimizer.gradient_sums import (
-    add_image_gradients,
-    merge_gradients,
-)
+from gaussian_wrapping_addon.core.parallel import ArrayStore
+from gaussian_wrapping_addon.core.render.types import ImageGradients, VisibleGradients
+from gaussian_wrapping_addon.core.training.adam import add_image_gradients, merge_gradients
 
 COUNT = 50
 SHAPES = {

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.training.optimizer.photo_adam import BETAS, PhotoAdam, photo_rate
+from gaussian_wrapping_addon.core.training.exposure import BETAS, PhotoAdam, photo_rate
 
 
 def test_steps_of_a_photo_are_those_of_torch_and_leave_the_others_alone() -> None:

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.training.poses.camera_poses import (
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.training.camera_poses import (
     LARGEST_RATE_PX,
     LAST_SHARE,
     LEAST_VIEWS,
     SMALLEST_RATE_PX,
     TRAVEL_PX,
     CameraPoses,
+    PosedPhotos,
     pose_rate_px,
 )
-from gaussian_wrapping_addon.core.training.poses.posed_photos import PosedPhotos
 from tests.core.training.small_scene import ring_cameras, sphere_scene
 
 COUNT = 8

@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients, VisibleGradients
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.types import (
+    ImageGradients,
+    RenderOptions,
+    VisibleGradients,
+)
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
-from gaussian_wrapping_addon.core.training.poses.pose_gradient import pose_gradient
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.training.camera_poses import pose_gradient
 from tests.core.training.small_scene import ring_cameras, sphere_gaussians
 
 OPTIONS = RenderOptions(depth=False, threads=1)

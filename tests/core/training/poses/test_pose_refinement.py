@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.dataset.refined_scene import with_poses
-from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.scene import Scene, with_poses
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.poses.camera_poses import CameraPoses
+from gaussian_wrapping_addon.core.training.camera_poses import CameraPoses
 from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.training.small_scene import PhotosInMemory, sphere_scene
 from tests.core.training.test_trainer import StopAt, assert_same

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.scene import Scene, View
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.training.appearance.photo_exposure import SRGB_PEDESTAL
-from gaussian_wrapping_addon.core.training.selection.exposure_selection import (
+from gaussian_wrapping_addon.core.scene.camera import Similarity
+from gaussian_wrapping_addon.core.scene.scene import Scene, View
+from gaussian_wrapping_addon.core.training.exposure import SRGB_PEDESTAL
+from gaussian_wrapping_addon.core.training.exposure_selection import (
     NEEDED_SPREAD,
     PARTS,
     exposure_evidence,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.training.selection.growth_selection import (
+from gaussian_wrapping_addon.core.training.growth_selection import (
     CAPACITY,
     CERTAINTY,
     MIN_GAIN_DB,

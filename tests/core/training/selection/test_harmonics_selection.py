@@ -11,21 +11,19 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
-from gaussian_wrapping_addon.core.training.selection.harmonics_selection import (
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.training.harmonics_selection import (
     NEEDED_SHARE,
     HarmonicsEvidence,
-    _halves,
-    select_harmonics,
-)
-from gaussian_wrapping_addon.core.training.selection.harmonics_trial import (
     TrialView,
+    _halves,
     match_exposure,
+    select_harmonics,
 )
 from tests.core.training.small_scene import ring_cameras, sphere_gaussians
 

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from gaussian_wrapping_addon.core.training.selection.image_size_selection import (
+from gaussian_wrapping_addon.core.training.growth_selection import (
     DETAIL_RMS,
     PhotoDetail,
     photo_detail,

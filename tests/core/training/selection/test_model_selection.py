@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.training.selection.model_selection import (
+from gaussian_wrapping_addon.core.training.model_selection import (
     TWO_SIDED_ERROR,
     WRAPPING_SHARE,
     Decision,

@@ -6,13 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.training.poses.camera_poses import LEAST_VIEWS
-from gaussian_wrapping_addon.core.training.selection.model_selection import (
+from gaussian_wrapping_addon.core.training.camera_poses import LEAST_VIEWS
+from gaussian_wrapping_addon.core.training.model_selection import (
+    LEAST_SHIFT_PX,
     Decision,
     ModelSelection,
-)
-from gaussian_wrapping_addon.core.training.selection.pose_selection import (
-    LEAST_SHIFT_PX,
     select_poses,
     start_poses,
 )

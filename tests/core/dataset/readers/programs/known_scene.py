@@ -8,14 +8,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.lenses.lens_fit import fit_lens
-from gaussian_wrapping_addon.core.dataset.lenses.undistort import project
-from gaussian_wrapping_addon.core.dataset.loading.source_kind import read_poses, source_kind
-from gaussian_wrapping_addon.core.dataset.photos.photo_header import PhotoHeader
-from gaussian_wrapping_addon.core.dataset.readers.source_model import (
-    SourceModel,
-    counts_stored_pixels,
-)
+from gaussian_wrapping_addon.core.loading.source_kind import read_poses, source_kind
+from gaussian_wrapping_addon.core.photos.formats import PhotoHeader
+from gaussian_wrapping_addon.core.readers.lenses import fit_lens, project
+from gaussian_wrapping_addon.core.readers.source_model import SourceModel, counts_stored_pixels
 from tests.core.dataset.readers.programs.writers import Shots
 from tests.poses import look_at_pose
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.dataset.frames.scene_grid import POINT_STEP
-from gaussian_wrapping_addon.core.dataset.loading.check import check_input
-from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.loading.source_kind import source_kind
-from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.jobs.commands.estimate_command import input_facts
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
+from gaussian_wrapping_addon.core.jobs.store.job_folder import source_fingerprint
+from gaussian_wrapping_addon.core.loading.check import check_input
+from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.loading.source_kind import source_kind
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.scene.frames import POINT_STEP
+from gaussian_wrapping_addon.core.scene.scene import Scene
 from tests.core.dataset.poses.test_pose_solver import textured_plane
 from tests.core.dataset.readers.programs import writers
 from tests.core.dataset.readers.programs.known_scene import NAMES, shots, write_photos

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.readers.programs.photo_list import relative_names
-from gaussian_wrapping_addon.core.dataset.readers.source_model import SourceModel
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
+from gaussian_wrapping_addon.core.readers.program_values import relative_names
+from gaussian_wrapping_addon.core.readers.source_model import SourceModel
 from tests.core.dataset.readers.programs import writers
 from tests.core.dataset.readers.programs.known_scene import NAMES, read, shots, write_photos
 

@@ -15,13 +15,8 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon import batch
-from gaussian_wrapping_addon.core.errors import (
-    EXIT_BAD_DATA,
-    EXIT_DONE,
-    EXIT_OTHER,
-    EXIT_USAGE,
-)
-from gaussian_wrapping_addon.core.jobs.parts.code_version import code_version
+from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, EXIT_DONE, EXIT_OTHER, EXIT_USAGE
+from gaussian_wrapping_addon.core.jobs.parts.graph import code_version
 from gaussian_wrapping_addon.core.names import SHARED_VARIABLE
 from tests.core.jobs.farm_jobs import wait_until
 from tests.core.jobs.test_farm_network import PACKAGE, Farm, descendants, end, free_port

@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from gaussian_wrapping_addon.core.cluster.worker_questions import Answer
-from gaussian_wrapping_addon.core.jobs.commands.farm import findings, meeting_folder
-from gaussian_wrapping_addon.core.jobs.commands.farm.meeting_folder import MeetingFolder
-from gaussian_wrapping_addon.core.jobs.commands.farm.worker_findings import (
+from gaussian_wrapping_addon.core.farm.dask import Answer
+from gaussian_wrapping_addon.core.jobs.commands import farm_findings
+from gaussian_wrapping_addon.core.jobs.commands.farm_findings import (
     MAX_CHARACTERS,
+    MeetingFolder,
     WorkerFinding,
     finding_of,
 )
@@ -30,7 +30,7 @@ PLACE = "tls://10.0.0.7:41234"
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(meeting_folder, "SEEN_S", 0.3)
+    monkeypatch.setattr(farm_findings, "SEEN_S", 0.3)
 
 
 def found(folder: Path, *, clock_s: float = 0.2, **changes: Any) -> WorkerFinding:
@@ -125,20 +125,20 @@ def test_long_texts_are_cut(tmp_path: Path) -> None:
 def test_the_worker_reads_and_writes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(findings, "diagnose", lambda _folder: [])
-    monkeypatch.setattr(findings, "end_with_parent", lambda: None)
+    monkeypatch.setattr(farm_findings, "diagnose", lambda _folder: [])
+    monkeypatch.setattr(farm_findings, "end_with_parent", lambda: None)
     with MeetingFolder(tmp_path) as meeting:
         seen, unseen = meeting.requests(3, 600.0)
         for request, folder in ((seen, meeting.root), (unseen, tmp_path)):
             arguments = {**request["arguments"], "out": str(folder)}
-            assert findings.main([json.dumps(arguments)]) == 0
+            assert farm_findings.main([json.dumps(arguments)]) == 0
         first, second = map(json.loads, capsys.readouterr().out.splitlines())
         assert first["answer"]["token"] == meeting.token
         assert (meeting.root / "worker-3.txt").read_text() == first["answer"]["reply"]
         assert asyncio.run(meeting.sees(first["answer"]["reply"]))
         assert "token" not in second["answer"]
     arguments = {**seen["arguments"], "out": str(tmp_path)}
-    findings.main([json.dumps(arguments)])
+    farm_findings.main([json.dumps(arguments)])
     told = json.loads(capsys.readouterr().out)["answer"]["folder_error"]
     assert told.startswith("No such file or directory")
     assert list(tmp_path.iterdir()) == []

@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon import batch
-from gaussian_wrapping_addon.core.cluster.certificates import make_certificates
 from gaussian_wrapping_addon.core.errors import EXIT_CANCELLED, EXIT_OTHER, EXIT_USAGE
+from gaussian_wrapping_addon.core.farm.addresses import make_certificates
 from tests.core.jobs.farm_jobs import kill, wait_until
 from tests.core.jobs.test_farm_network import PACKAGE, descendants, free_port
 from tests.proofs import first_then_proofs

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Errors of depth and vacancy of trained Gaussians against a true surface, without meshing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import UsageError
+from ..field.vacancy import VacancyField
+from ..gaussians.model import OrientedGaussians
+from ..mesh.depth_buffer import depth_buffer
+from ..parallel import default_threads
+from ..render.render import render
+from ..render.types import RenderOptions
+from ..scene.camera import Camera
+
+PROBE_REACH = 2.0
+"""Vacancy is sampled along each normal over this many largest thresholds to both sides."""
+PROBES_PER_SIDE = 40
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """Isosurface depth against the depth of the true surface, over the pixels that show it."""
+
+    pixels: int
+    """Pixels whose ray meets the true surface."""
+    found: float
+    """Share of them where the Gaussians have a depth."""
+    median: float
+    """Median absolute difference along the ray where found, scene units."""
+    percentile_95: float
+    within: tuple[float, ...]
+    """Share of all these pixels with a depth within each threshold."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class VacancyErrors:
+    """Crossings of vacancy 0.5 along the normals of the true surface."""
+
+    samples: int
+    found: float
+    """Share of samples with a crossing (empty outside, occupied inside) in the sampled range."""
+    median_offset: float
+    """Median signed offset of the nearest crossing, positive outside, scene units."""
+    median: float
+    """Median absolute offset."""
+    within: tuple[float, ...]
+    """Share of all samples with a crossing within each threshold."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return dataclasses.asdict(self)
+
+
+def depth_errors(
+    gaussians: OrientedGaussians,
+    cameras: Sequence[Camera],
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    thresholds: Sequence[float],
+    *,
+    threads: int = 0,
+) -> DepthErrors:
+    """Compare the 0.5-isosurface depth with the first hit of each pixel's ray.
+
+    See docs/method.md, section 2.4.
+
+    Parameters
+    ----------
+    gaussians : OrientedGaussians
+        Scene frame.
+    cameras : sequence of Camera
+        In the same frame; all pixels are compared.
+    vertices, faces : (v, 3) float64, (f, 3) int
+        The true surface in the same frame. Nothing else may occlude it.
+    thresholds : sequence of float
+        Distances along the ray, unit of the frame.
+
+    Raises
+    ------
+    UsageError
+        No pixel shows the surface.
+    """
+    threads = threads or default_threads()
+    errors, missing = [], 0
+    for camera in cameras:
+        true = depth_buffer(
+            vertices, np.ascontiguousarray(faces, np.int32), camera, threads=threads
+        )
+        shows = np.isfinite(true.depth)  # (h, w)
+        depth = render(gaussians, camera, RenderOptions(threads=threads)).depth.numpy()  # (h, w)
+        stretch = np.linalg.norm(camera.rays(), axis=2)  # (h, w) ray length of one unit of z
+        found = shows & (depth > 0)
+        missing += int(np.count_nonzero(shows & ~found))
+        errors.append((np.abs(depth.astype(np.float64) - true.depth) * stretch)[found])
+    error = np.concatenate(errors) if errors else np.zeros(0)
+    total = len(error) + missing
+    if total == 0:
+        raise UsageError("No pixel shows the true surface.", "Check its frame.")
+    return DepthErrors(
+        total,
+        len(error) / total,
+        float(np.median(error)) if len(error) else float("inf"),
+        float(np.percentile(error, 95)) if len(error) else float("inf"),
+        tuple(float(np.count_nonzero(error <= limit)) / total for limit in thresholds),
+    )
+
+
+def vacancy_errors(
+    field: VacancyField,
+    points: np.ndarray,
+    normals: np.ndarray,
+    thresholds: Sequence[float],
+) -> VacancyErrors:
+    """Sample vacancy along the normals of true surface samples and find where it crosses 0.5.
+
+    Probes are evenly spaced up to ``PROBE_REACH`` times the largest threshold to both sides; a
+    crossing lies between an empty probe and the occupied one below it, by linear interpolation.
+    The crossing nearest to the sample is used, so that the other side of a thin part is taken
+    only if it is nearer.
+
+    Parameters
+    ----------
+    field : VacancyField
+    points, normals : (n, 3) float64
+        Samples and unit normals (towards the empty side) of the true surface, frame of the field.
+    thresholds : sequence of float
+        Unit of the frame.
+
+    Raises
+    ------
+    UsageError
+        There is no sample.
+    """
+    count = len(points)
+    if count == 0:
+        raise UsageError("There is no sample of the true surface.", "Check the crop volume.")
+    reach = PROBE_REACH * max(thresholds)
+    offsets = np.linspace(reach, -reach, 2 * PROBES_PER_SIDE + 1)  # from outside to inside
+    probes = points[:, None] + offsets[None, :, None] * normals[:, None]  # (n, k, 3)
+    vacancy = field.vacancy(probes.reshape(-1, 3)).vacancy.reshape(count, -1).astype(np.float64)
+    outer, inner = vacancy[:, :-1], vacancy[:, 1:]  # (n, k - 1)
+    crosses = (outer > 0.5) & (inner <= 0.5)
+    share = np.where(crosses, (outer - 0.5) / np.where(crosses, outer - inner, 1.0), 0.0)
+    crossing = offsets[:-1] + share * (offsets[1:] - offsets[:-1])  # (n, k - 1)
+    distance = np.where(crosses, np.abs(crossing), np.inf)
+    nearest = distance.argmin(1)
+    rows = np.arange(count)
+    least = distance[rows, nearest]
+    found = np.isfinite(least)
+    signed = crossing[rows, nearest][found]
+    return VacancyErrors(
+        count,
+        float(found.mean()),
+        float(np.median(signed)) if len(signed) else float("inf"),
+        float(np.median(np.abs(signed))) if len(signed) else float("inf"),
+        tuple(float((least <= limit).mean()) for limit in thresholds),
+    )

@@ -1,0 +1,911 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Layouts of data sets with ground truth: Tanks and Temples, DTU."""
+
+from __future__ import annotations
+
+import math
+import re
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import limits
+from ..errors import DatasetError, ParseError, UsageError
+from ..files import read_json
+from ..mesh.exchange import read_mesh_file
+from ..ply import read_ply_header
+from ..progress import Progress
+from ..readers.point_files import read_point_ply
+from ..scene.camera import Camera, Similarity
+from ..scene.placement import RansacResult, umeyama, umeyama_ransac
+from .alignment import refine_as_tanks
+from .dtu_chamfer import DENSITY_MM, PATCH_MM, DtuScore, ObservationMask, dtu_chamfer, resample_mesh
+from .surface_scores import (
+    sample_legacy,
+    sample_uniformly,
+    scan_virtually,
+    score_clouds,
+    voxel_downsample_points,
+)
+
+# -- Read meshes and point clouds for evaluation from common file formats -------------------------
+
+
+_MESH_INPUT_AGAIN = "Export the file again."
+
+
+def is_cloud(path: Path) -> bool:
+    """Return whether a file is a PLY without faces; other formats count as meshes.
+
+    Raises
+    ------
+    ParseError
+        The header of the PLY is invalid.
+    """
+    return path.suffix.lower() == ".ply" and not read_ply_header(path, _MESH_INPUT_AGAIN).count(
+        "face"
+    )
+
+
+def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return (v, 3) float64 vertices and (f, 3) int64 faces, in the coordinates of the file.
+
+    Raises
+    ------
+    ParseError, WorkerError
+        As :func:`~.exchange.read_mesh_file`.
+    """
+    mesh = read_mesh_file(path)
+    return mesh.vertices, mesh.faces
+
+
+def read_cloud(path: Path) -> np.ndarray:
+    """Read the points of a PLY, (n, 3) float64.
+
+    Raises
+    ------
+    ParseError
+        Not a PLY, truncated, empty, or with points that are not finite.
+    """
+    announced = read_ply_header(path, _MESH_INPUT_AGAIN).count("vertex")
+    points, _ = read_point_ply(path)
+    if announced == 0:
+        raise ParseError(path, "header", "the cloud is empty.", _MESH_INPUT_AGAIN)
+    if len(points) < announced:
+        raise ParseError(
+            path,
+            "vertices",
+            f"{announced - len(points)} of {announced} are not finite.",
+            _MESH_INPUT_AGAIN,
+        )
+    return points
+
+
+# -- Crop volumes of Tanks and Temples: a polygon swept along an axis (Open3D's selection volume)
+
+
+CLASS_NAME = "SelectionPolygonVolume"
+VERSION = 1
+_POLYGON_VOLUME_AGAIN = "Use the crop file that belongs to the data set."
+_PLANES = {"X": (1, 2, 0), "Y": (0, 2, 1), "Z": (0, 1, 2)}
+"""For each axis: the two coordinates of the polygon's plane, then the axis itself."""
+
+
+@dataclass(frozen=True)
+class PolygonVolume:
+    """All points between two heights whose projection along an axis lies in a polygon."""
+
+    polygon: np.ndarray
+    """(k, 3) float64 corners in order, the last joined to the first; the coordinate along the axis
+    is not used. The polygon may be concave; self-intersections follow the even-odd rule."""
+    orthogonal_axis: str
+    """``"X"``, ``"Y"`` or ``"Z"``."""
+    axis_min: float
+    axis_max: float
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """Return whether (n, 3) points lie inside, (n,) bool.
+
+        The heights ``axis_min`` and ``axis_max`` are inside. A point on the polygon's border is on
+        the side with larger coordinates, so that exactly one of two volumes that share an edge
+        contains it. NaN is outside.
+        """
+        points = np.asarray(points, np.float64)
+        u, v, w = _PLANES[self.orthogonal_axis]
+        height = points[:, w]
+        result = (height >= self.axis_min) & (height <= self.axis_max)
+        candidates = np.flatnonzero(result)
+        x, y = points[candidates, u], points[candidates, v]
+        odd = np.zeros(len(candidates), bool)
+        corners = self.polygon[:, (u, v)]
+        for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            if y0 == y1:
+                continue
+            crosses = (y0 > y) != (y1 > y)
+            odd ^= crosses & (x < x0 + (y - y0) * ((x1 - x0) / (y1 - y0)))
+        result[candidates] = odd
+        return result
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lower and upper corner, (3,) each, of the axis-aligned box around it."""
+        u, v, w = _PLANES[self.orthogonal_axis]
+        low, high = np.empty(3), np.empty(3)
+        for axis in (u, v):
+            low[axis], high[axis] = self.polygon[:, axis].min(), self.polygon[:, axis].max()
+        low[w], high[w] = self.axis_min, self.axis_max
+        return low, high
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the values of the file format."""
+        return {
+            "class_name": CLASS_NAME,
+            "version_major": VERSION,
+            "version_minor": 0,
+            "axis_max": self.axis_max,
+            "axis_min": self.axis_min,
+            "orthogonal_axis": self.orthogonal_axis,
+            "bounding_polygon": self.polygon.tolist(),
+        }
+
+
+def read_polygon_volume(path: Path) -> PolygonVolume:
+    """Read a crop file.
+
+    Raises
+    ------
+    ParseError
+        States the entry: missing, not finite, an unknown axis or version, too few corners.
+    """
+    try:
+        values = read_json(path, follow_links=True)
+    except OSError as error:
+        raise ParseError(
+            path, "whole file", f"cannot be read: {error.strerror}.", _POLYGON_VOLUME_AGAIN
+        ) from None
+    if not isinstance(values, dict):
+        raise ParseError(path, "top level", "an object was expected.", _POLYGON_VOLUME_AGAIN)
+    if values.get("class_name", CLASS_NAME) != CLASS_NAME:
+        raise ParseError(path, "class_name", f"is not {CLASS_NAME!r}.", _POLYGON_VOLUME_AGAIN)
+    version = values.get("version_major", values.get("version", VERSION))
+    if isinstance(version, bool) or version != VERSION:
+        raise ParseError(
+            path, "version_major", f"{str(version)[:20]} is not known.", _POLYGON_VOLUME_AGAIN
+        )
+    axis = values.get("orthogonal_axis")
+    if not isinstance(axis, str) or axis.upper() not in _PLANES:
+        raise ParseError(path, "orthogonal_axis", "X, Y or Z was expected.", _POLYGON_VOLUME_AGAIN)
+    low, high = (_number(path, key, values.get(key)) for key in ("axis_min", "axis_max"))
+    if not low < high:
+        raise ParseError(
+            path, "axis_min", f"{low:g} is not below axis_max {high:g}.", _POLYGON_VOLUME_AGAIN
+        )
+    rows = values.get("bounding_polygon")
+    if not isinstance(rows, list) or len(rows) < 3:
+        raise ParseError(
+            path, "bounding_polygon", "at least 3 corners were expected.", _POLYGON_VOLUME_AGAIN
+        )
+    corners = []
+    for i, row in enumerate(rows):
+        place = f"bounding_polygon[{i}]"
+        if not isinstance(row, list) or len(row) != 3:
+            raise ParseError(path, place, "three numbers were expected.", _POLYGON_VOLUME_AGAIN)
+        corners.append([_number(path, place, value) for value in row])
+    return PolygonVolume(np.array(corners, np.float64), axis.upper(), low, high)
+
+
+def _number(path: Path, place: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ParseError(path, place, "a number was expected.", _POLYGON_VOLUME_AGAIN)
+    if not math.isfinite(value):
+        raise ParseError(path, place, "the number is not finite.", _POLYGON_VOLUME_AGAIN)
+    return float(value)
+
+
+# -- Read, align and score scenes of Tanks and Temples in their original layout -------------------
+#
+# See docs/method.md, section 9.1.
+#
+# A folder holds ``<Scene>.ply`` (the scanned cloud), ``<Scene>.json`` (crop volume),
+# ``<Scene>_trans.txt`` (4x4, truth from the log's frame) and ``<Scene>_COLMAP_SfM.log`` (for
+# every photo a line ``i i 0`` and a 4x4 matrix, world from camera).
+
+
+THRESHOLDS = {
+    "barn": 0.01, "caterpillar": 0.005, "courthouse": 0.025, "ignatius": 0.003,
+    "meetingroom": 0.01, "truck": 0.005,
+}  # fmt: skip
+"""Distance threshold by scene (docs/method.md, section 9.1)."""
+RANSAC_DISTANCE = 0.2
+RANSAC_ITERATIONS = 100_000
+MIN_AGREEING_SHARE = 0.5
+"""With a smaller share of cameras on the reference trajectory, photos were paired wrongly."""
+SAMPLES = 10_000_000
+ALIGNMENT_SAMPLES = 1_000_000
+SCAN_KEPT_POINTS = 20_000_000
+"""Scanned points are downsampled together whenever there are more than this."""
+
+_TRUTH_SUFFIX, _LOG_SUFFIX = "_trans.txt", "_COLMAP_SfM.log"
+_ROTATION_TOLERANCE = 1e-2
+_TANKS_AGAIN = "Use the file that belongs to the data set."
+
+
+@dataclass(frozen=True)
+class TanksScene:
+    """Ground truth of one scene, in the frame of the scanned cloud."""
+
+    name: str
+    threshold: float
+    cloud: np.ndarray
+    """(n, 3) float64."""
+    crop: PolygonVolume
+    log_numbers: np.ndarray
+    """(m,) int64, photo number of each entry of the trajectory."""
+    log_centers: np.ndarray
+    """(m, 3) camera centres of the trajectory, transformed by ``_trans.txt``."""
+
+
+def is_tanks_folder(folder: Path) -> bool:
+    """Return whether the folder holds a trajectory or an alignment matrix of the data set."""
+    return any(any(folder.glob(f"*{suffix}")) for suffix in (_TRUTH_SUFFIX, _LOG_SUFFIX))
+
+
+def read_tanks(folder: Path, threshold: float | None = None) -> TanksScene:
+    """Read a scene.
+
+    Parameters
+    ----------
+    folder : Path
+        Must have the name of the scene if it holds the files of several.
+    threshold : float or None
+        Replaces that of :data:`THRESHOLDS`.
+
+    Raises
+    ------
+    ParseError
+        States the file and the location in it.
+    DatasetError
+        A file is missing, or the scene is ambiguous.
+    UsageError
+        The scene has no known threshold and none was given.
+    """
+    name = _scene_name(folder)
+    paths = {s: folder / f"{name}{s}" for s in (".ply", ".json", _TRUTH_SUFFIX, _LOG_SUFFIX)}
+    for path in paths.values():
+        if not path.is_file():
+            raise DatasetError(
+                f"{folder.name} holds no {path.name}.",
+                "A scene of Tanks and Temples needs NAME.ply, NAME.json, NAME_trans.txt and "
+                "NAME_COLMAP_SfM.log.",
+            )
+    if threshold is None:
+        threshold = THRESHOLDS.get(name.lower(), THRESHOLDS.get(folder.name.lower()))
+    if threshold is None:
+        raise UsageError(
+            f"No threshold is known for the scene {name}.",
+            f"Give --distances; known are {', '.join(n.capitalize() for n in THRESHOLDS)}.",
+        )
+    crop = read_polygon_volume(paths[".json"])
+    truth_from_log = read_matrix(paths[_TRUTH_SUFFIX])
+    numbers, world_from_camera = read_trajectory(paths[_LOG_SUFFIX])
+    centers = truth_from_log.points(world_from_camera[:, :3, 3])
+    return TanksScene(name, threshold, read_cloud(paths[".ply"]), crop, numbers, centers)
+
+
+def _scene_name(folder: Path) -> str:
+    if not folder.is_dir():
+        raise DatasetError(f"{folder} is not a folder.", "Give the folder of one scene.")
+    names = sorted(
+        {
+            path.name.removesuffix(suffix)
+            for suffix in (_TRUTH_SUFFIX, _LOG_SUFFIX)
+            for path in folder.glob(f"*{suffix}")
+        }
+    )
+    same = [name for name in names if name.lower() == folder.name.lower()]
+    if len(names) == 1 or len(same) == 1:
+        return (same or names)[0]
+    if not names:
+        return folder.name
+    raise DatasetError(
+        f"{folder.name} holds the scenes {', '.join(names)}.",
+        "Put each into a folder of its name.",
+    )
+
+
+def read_matrix(path: Path) -> Similarity:
+    """Read a 4x4 similarity in plain text.
+
+    Raises
+    ------
+    ParseError
+        Not 4x4 finite numbers, or not rotation, scale and translation.
+    """
+    rows = [line.split() for _, line in _lines(path) if line.strip()]
+    if len(rows) != 4 or any(len(row) != 4 for row in rows):
+        shape = f"{len(rows)} lines of {sorted({len(r) for r in rows})} numbers"
+        raise ParseError(
+            path, "whole file", f"a 4x4 matrix was expected, not {shape}.", _TANKS_AGAIN
+        )
+    return _similarity(path, "whole file", _numbers(path, "whole file", rows))
+
+
+def read_trajectory(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read a trajectory log.
+
+    Returns
+    -------
+    numbers : (m,) int64
+        First number of each entry's line ``i i 0``: index of the photo in sorted order, from 0.
+    world_from_camera : (m, 4, 4) float64
+
+    Raises
+    ------
+    ParseError
+        With the line: truncated, not numbers, or not a pose.
+    """
+    lines = [(number, line.split()) for number, line in _lines(path) if line.strip()]
+    if len(lines) < 15 or len(lines) % 5:
+        raise ParseError(
+            path, f"line {lines[-1][0] if lines else 1}",
+            f"{len(lines)} lines are not at least 3 entries of 5; the file may be cut off.",
+            _TANKS_AGAIN,
+        )  # fmt: skip
+    numbers, poses = [], []
+    for begin in range(0, len(lines), 5):
+        line, words = lines[begin]
+        place = f"line {line}"
+        if len(words) != 3 or not words[0].isdecimal() or len(words[0]) > 9:
+            raise ParseError(path, place, "three whole numbers were expected.", _TANKS_AGAIN)
+        rows = [row for _, row in lines[begin + 1 : begin + 5]]
+        if any(len(row) != 4 for row in rows):
+            raise ParseError(path, place, "four rows of four numbers must follow.", _TANKS_AGAIN)
+        matrix = _numbers(path, place, rows)
+        _similarity(path, place, matrix)
+        numbers.append(int(words[0]))
+        poses.append(matrix)
+    if len(set(numbers)) != len(numbers):
+        raise ParseError(path, "whole file", "a photo has two poses.", _TANKS_AGAIN)
+    return np.array(numbers, np.int64), np.array(poses)
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    try:
+        size_bytes = path.stat().st_size
+        if size_bytes > limits.MAX_JSON_BYTES:
+            raise ParseError(path, "whole file", f"{size_bytes} bytes are too many.", _TANKS_AGAIN)
+        text = path.read_bytes().decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise ParseError(
+            path, "whole file", f"cannot be read: {error.strerror}.", _TANKS_AGAIN
+        ) from None
+    return list(enumerate(text.splitlines(), 1))
+
+
+def _numbers(path: Path, place: str, rows: list[list[str]]) -> np.ndarray:
+    try:
+        values = np.array([[float(word) for word in row] for row in rows])
+    except ValueError as error:
+        raise ParseError(path, place, f"{error}.", _TANKS_AGAIN) from None
+    if not np.isfinite(values).all():
+        raise ParseError(path, place, "a number is not finite.", _TANKS_AGAIN)
+    return values
+
+
+def _similarity(path: Path, place: str, matrix: np.ndarray) -> Similarity:
+    linear = matrix[:3, :3]
+    determinant = float(np.linalg.det(linear))
+    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+        raise ParseError(path, place, "the last row must be 0 0 0 1.", _TANKS_AGAIN)
+    if not determinant > 0:
+        raise ParseError(path, place, "the matrix mirrors or flattens.", _TANKS_AGAIN)
+    scale = determinant ** (1.0 / 3.0)
+    u, _, vt = np.linalg.svd(linear / scale)
+    if np.abs(u @ vt - linear / scale).max() > _ROTATION_TOLERANCE:
+        raise ParseError(path, place, "not a rotation with a scale.", _TANKS_AGAIN)
+    return Similarity(scale, u @ vt, matrix[:3, 3])
+
+
+def photo_numbers(names: Sequence[str], log_numbers: np.ndarray) -> np.ndarray:
+    """Return the row of the trajectory for each photo, -1 if it is missing.
+
+    The trajectory counts the photos in sorted order of their names, from 0. If there are as many
+    photos as entries, the sorted names are the entries in order. Otherwise (a job with fewer
+    photos) the last number in the name is used: the data set names its photos 000001.jpg and on,
+    so entry i is photo i + 1.
+
+    Raises
+    ------
+    DatasetError
+        A name without a number where one is needed.
+    """
+    row_of = {int(number): row for row, number in enumerate(log_numbers)}
+    if len(names) == len(log_numbers):
+        order = np.argsort(np.array(names))
+        rows = np.empty(len(names), np.int64)
+        rows[order] = np.argsort(log_numbers)
+        return rows
+    rows = np.full(len(names), -1)
+    for i, name in enumerate(names):
+        digits = re.findall(r"\d+", Path(name).stem)
+        if not digits:
+            raise DatasetError(
+                f"The photo {name!r} has no number, and {len(names)} photos are not the "
+                f"{len(log_numbers)} of the trajectory.",
+                "Keep the data set's photo names.",
+            )
+        rows[i] = row_of.get(int(digits[-1]) - 1, -1)
+    return rows
+
+
+def align_to_log(cameras: Sequence[Camera], scene: TanksScene, *, seed: int) -> RansacResult:
+    """Return ``truth_from_job`` from the camera centres by RANSAC, with scale.
+
+    See docs/method.md, section 9.1.
+
+    Raises
+    ------
+    DatasetError
+        Fewer than three photos are in the trajectory, their centres are degenerate, or fewer than
+        half of them are inliers of one similarity.
+    """
+    rows = photo_numbers([camera.name for camera in cameras], scene.log_numbers)
+    known = np.flatnonzero(rows >= 0)
+    if len(known) < 3:
+        raise DatasetError(
+            f"{len(known)} of {len(cameras)} photos are in the trajectory of {scene.name}.",
+            "Keep the data set's photo names (000001.jpg and on).",
+        )
+    centers = np.array([cameras[i].center for i in known])
+    found = umeyama_ransac(
+        centers,
+        scene.log_centers[rows[known]],
+        threshold=RANSAC_DISTANCE,
+        iterations=RANSAC_ITERATIONS,
+        seed=seed,
+        with_scale=True,
+    )
+    if found.inliers.mean() < MIN_AGREEING_SHARE:
+        raise DatasetError(
+            f"{int(found.inliers.sum())} of {len(known)} cameras match the trajectory of "
+            f"{scene.name} within {RANSAC_DISTANCE:g}.",
+            "Photos and trajectory do not match, or the cameras were solved wrongly.",
+        )
+    return found
+
+
+def score_tanks(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: Sequence[Camera],
+    scene: TanksScene,
+    start: Similarity,
+    *,
+    refine: bool,
+    protocols: Sequence[str],
+    samples: int = SAMPLES,
+    seed: int = 0,
+    threads: int = 1,
+    progress: Progress | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Score a mesh by the data set's protocol: sampling, refinement, crop, voxel tau / 2, F1.
+
+    ``uniform`` samples uniformly (1e6 samples, or ``samples`` if that is less, for the refinement);
+    samples outside the crop are dropped individually, so faces need no cropping. ``scan`` uses the
+    surface seen by the cameras, downsampled to voxels of tau / 4. ``legacy`` uses vertices and
+    face centres. Each is refined separately, as in the original scripts.
+
+    Parameters
+    ----------
+    vertices, faces : (v, 3), (f, 3)
+        In the job's frame, like the cameras.
+    start : Similarity
+        ``truth_from_job`` before the refinement.
+
+    Returns
+    -------
+    dict
+        For each protocol ``score``, ``transform``, ``refinement`` (or ``None``); plain JSON values.
+
+    Raises
+    ------
+    UsageError
+        Unknown protocol, or a scan without cameras.
+    DatasetError
+        The refinement finds no correspondences, or the crop holds no truth.
+    """
+    progress = progress or Progress()
+    truth = scene.cloud[scene.crop.inside(scene.cloud)]
+    if len(truth) == 0:
+        raise DatasetError(
+            f"The crop of {scene.name} holds no point of its cloud.",
+            "Crop and cloud may belong to different scenes.",
+        )
+    results: dict[str, dict[str, Any]] = {}
+    for index, protocol in enumerate(protocols):
+        progress.update(index / len(protocols), f"{protocol}: refining the alignment")
+        transform, refinement = start, None
+        near = _near_faces(vertices, faces, scene, start, reach=80.0 if refine else 0.0)
+        points = np.zeros((0, 3))
+        if protocol == "scan":
+            points = _scan(vertices, faces, cameras, scene, start, threads, progress)
+        elif protocol == "legacy":
+            points = sample_legacy(vertices, near).points if len(near) else points
+        elif protocol != "uniform":
+            raise UsageError(f"Protocol {protocol!r} is unknown.", "Use uniform, scan or legacy.")
+        if refine:
+            probe = points
+            if protocol == "uniform" and len(near):
+                probe = sample_uniformly(
+                    vertices, near, min(samples, ALIGNMENT_SAMPLES), seed=seed
+                ).points
+            refinement = refine_as_tanks(
+                probe, truth, start, scene.threshold, inside=scene.crop.inside, threads=threads
+            )
+            transform = refinement.transform
+        progress.update((index + 0.5) / len(protocols), f"{protocol}: measuring distances")
+        if protocol == "uniform":
+            near = _near_faces(vertices, faces, scene, transform, reach=0.0)
+            if len(near):
+                points = sample_uniformly(vertices, near, samples, seed=seed + 1).points
+        placed = transform.points(points)
+        placed = placed[scene.crop.inside(placed)]
+        score = score_clouds(
+            placed, truth, scene.threshold, voxel=scene.threshold / 2, threads=threads
+        )
+        results[protocol] = {
+            "score": score.to_json(),
+            "points_in_crop": len(placed),
+            "transform": transform.to_json(),
+            "refinement": None if refinement is None else refinement.to_json(),
+        }
+    return results
+
+
+def _near_faces(
+    vertices: np.ndarray, faces: np.ndarray, scene: TanksScene, start: Similarity, *, reach: float
+) -> np.ndarray:
+    """Return the faces whose box intersects the crop's, widened by ``reach`` thresholds."""
+    low, high = scene.crop.bounds()
+    margin = reach * scene.threshold
+    corners = start.points(vertices)[faces]  # (f, 3, 3)
+    touches = (corners.max(1) >= low - margin) & (corners.min(1) <= high + margin)
+    return faces[touches.all(1)]
+
+
+def _scan(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: Sequence[Camera],
+    scene: TanksScene,
+    start: Similarity,
+    threads: int,
+    progress: Progress,
+) -> np.ndarray:
+    """Return the points that cameras see in the (widened) crop, downsampled to tau / 4."""
+    if not cameras:
+        raise UsageError(
+            "A virtual scan needs cameras.",
+            "Evaluate a job folder, give --cameras, or omit the scan.",
+        )
+    voxel = scene.threshold / 4
+    low, high = scene.crop.bounds()
+    margin = 80.0 * scene.threshold
+    back = start.inverse()
+    kept: list[np.ndarray] = []
+    count = 0
+    for camera in cameras:
+        progress.check()
+        seen = start.points(scan_virtually(vertices, faces, [camera], threads=threads).points)
+        near = ((seen >= low - margin) & (seen <= high + margin)).all(1)
+        kept.append(voxel_downsample_points(seen[near], voxel))
+        count += len(kept[-1])
+        if count > SCAN_KEPT_POINTS:
+            kept = [voxel_downsample_points(np.concatenate(kept), voxel)]
+            # The rest cannot get sparser: downsample again only after as many new points.
+            count = 0
+    return back.points(voxel_downsample_points(np.concatenate(kept), voxel))
+
+
+# -- Read, align and score scans of the DTU data set in their original layout ---------------------
+#
+# See docs/method.md, section 9.2.
+#
+# The folder holds ``Points/stl/stl024_total.ply``, ``ObsMask/ObsMask24_10.mat`` and
+# ``ObsMask/Plane24.mat`` (itself or in a folder ``MVS Data``), and the true cameras: either
+# ``Calibration/cal18/pos_001.txt`` and on (3x4 projections), or ``cameras.npz`` (``world_mat_0``
+# and on, 4x4), there or in ``scan24/`` or ``dtu_scan24/``. All in millimetres.
+
+
+MAX_MISFIT_SHARE = 0.05
+"""Maximum root mean square distance of aligned centres from the true ones, as a share of the
+cameras' spread; wrongly paired cameras have about the full spread."""
+NUMBER_OFFSETS = (0, 1, -1)
+"""Photo names and camera files count from 0 or from 1: the offset that fits best is used."""
+
+_DTU_AGAIN = "Use the file that belongs to the data set."
+_CAMERA_FOLDERS = ("", "scan{scan}", "dtu_scan{scan}")
+_ARCHIVES = ("cameras.npz", "cameras_sphere.npz")
+
+
+@dataclass(frozen=True)
+class DtuScan:
+    """Ground truth of one scan, millimetres."""
+
+    scan: int
+    cloud: np.ndarray
+    """(n, 3) float64."""
+    mask: ObservationMask
+    plane: np.ndarray
+    """(4,) ground plane; true points with ``plane . [x, 1] > 0`` are evaluated."""
+    camera_numbers: np.ndarray
+    """(m,) int64; empty if no camera files were found."""
+    camera_centers: np.ndarray
+    """(m, 3) float64."""
+    camera_source: str
+    """Name of the file or folder of the cameras."""
+
+
+@dataclass(frozen=True)
+class DtuAlignment:
+    """Alignment of the job's cameras to the true ones."""
+
+    transform: Similarity
+    """``truth_from_job``."""
+    cameras: int
+    number_offset: int
+    """Number in the camera files minus the number in the photo's name."""
+    rmse_mm: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "transform": self.transform.to_json(),
+            "cameras": self.cameras,
+            "number_offset": self.number_offset,
+            "rmse_mm": self.rmse_mm,
+        }
+
+
+def is_dtu_folder(folder: Path) -> bool:
+    """Return whether the folder holds the data set's ``Points`` or ``ObsMask``."""
+    return any((root / n).is_dir() for root in _roots(folder) for n in ("Points/stl", "ObsMask"))
+
+
+def _roots(folder: Path) -> list[Path]:
+    return [folder, folder / "MVS Data", folder / "SampleSet" / "MVS Data"]
+
+
+def _find(folder: Path, name: str) -> Path:
+    for root in _roots(folder):
+        if (root / name).is_file():
+            return root / name
+    raise DatasetError(
+        f"{folder.name} holds no {name}.",
+        "Required: Points/stl/stl024_total.ply, ObsMask/ObsMask24_10.mat and ObsMask/Plane24.mat "
+        "(for scan 24).",
+    )
+
+
+def read_dtu(folder: Path, scan: int) -> DtuScan:
+    """Read one scan.
+
+    Raises
+    ------
+    DatasetError
+        A file is missing.
+    ParseError
+        States the file and the entry that is missing or invalid.
+    """
+    if not folder.is_dir():
+        raise DatasetError(f"{folder} is not a folder.", "Give the folder of the data set.")
+    cloud_path = _find(folder, f"Points/stl/stl{scan:03}_total.ply")
+    mask = read_observation_mask(_find(folder, f"ObsMask/ObsMask{scan}_10.mat"))
+    plane = read_plane(_find(folder, f"ObsMask/Plane{scan}.mat"))
+    numbers, centers, source = _read_cameras(folder, scan)
+    return DtuScan(scan, read_cloud(cloud_path), mask, plane, numbers, centers, source)
+
+
+def read_observation_mask(path: Path) -> ObservationMask:
+    """Read ``ObsMask`` (volume), ``BB`` (2x3) and ``Res`` of a MATLAB file.
+
+    Raises
+    ------
+    ParseError
+    """
+    values = _read_mat(path, ("ObsMask", "BB", "Res"))
+    volume = values["ObsMask"]
+    if volume.ndim != 3 or volume.dtype.kind not in "bui" or volume.size == 0:
+        raise ParseError(
+            path, "ObsMask", f"{volume.dtype} {volume.shape} is not a volume.", _DTU_AGAIN
+        )
+    box = _floats(path, "BB", values["BB"], (2, 3))
+    resolution = float(_floats(path, "Res", values["Res"].reshape(-1), (1,))[0])
+    if not (box[1] > box[0]).all():
+        raise ParseError(path, "BB", "the box is empty.", _DTU_AGAIN)
+    if not resolution > 0:
+        raise ParseError(path, "Res", f"{resolution:g} is not positive.", _DTU_AGAIN)
+    return ObservationMask(volume != 0, box[0], box[1], resolution)
+
+
+def read_plane(path: Path) -> np.ndarray:
+    """Read the ground plane ``P``, (4,), of a MATLAB file.
+
+    Raises
+    ------
+    ParseError
+    """
+    plane = _floats(path, "P", _read_mat(path, ("P",))["P"].reshape(-1), (4,))
+    if not plane[:3].any():
+        raise ParseError(path, "P", "the plane has no direction.", _DTU_AGAIN)
+    return plane
+
+
+def _read_mat(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
+    from scipy.io import loadmat
+
+    try:
+        values = loadmat(path, variable_names=keys)
+    except Exception as error:  # a broken file can make the reader raise anything
+        raise ParseError(
+            path, "whole file", f"cannot be read as a MATLAB file up to version 7.2 ({error}).",
+            _DTU_AGAIN,
+        ) from None  # fmt: skip
+    for key in keys:
+        if not isinstance(values.get(key), np.ndarray):
+            raise ParseError(path, key, "there is no such entry.", _DTU_AGAIN)
+    return {key: values[key] for key in keys}
+
+
+def _floats(path: Path, place: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    if value.shape != shape or value.dtype.kind not in "fiub":
+        raise ParseError(path, place, f"{value.shape} is not {shape} numbers.", _DTU_AGAIN)
+    values = value.astype(np.float64)
+    if not np.isfinite(values).all():
+        raise ParseError(path, place, "a number is not finite.", _DTU_AGAIN)
+    return values
+
+
+def _read_cameras(folder: Path, scan: int) -> tuple[np.ndarray, np.ndarray, str]:
+    for place in _CAMERA_FOLDERS:
+        for name in _ARCHIVES:
+            path = folder / place.format(scan=scan) / name
+            if path.is_file():
+                return (*_archive_centers(path), path.name)
+    for root in _roots(folder):
+        texts = sorted((root / "Calibration" / "cal18").glob("pos_*.txt"))
+        if texts:
+            return (*_text_centers(texts), "Calibration/cal18")
+    return np.zeros(0, np.int64), np.zeros((0, 3)), ""
+
+
+def _archive_centers(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    numbers, centers = [], []
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            for key in arrays.files:
+                found = re.fullmatch(r"world_mat_(\d{1,6})", key)
+                if found:
+                    matrix = _floats(path, key, arrays[key], (4, 4))
+                    numbers.append(int(found.group(1)))
+                    centers.append(_center(path, key, matrix[:3]))
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ParseError(path, "whole file", f"cannot be read ({error}).", _DTU_AGAIN) from None
+    if not numbers:
+        raise ParseError(path, "world_mat_0", "there is no such entry.", _DTU_AGAIN)
+    return np.array(numbers, np.int64), np.array(centers)
+
+
+def _text_centers(paths: list[Path]) -> tuple[np.ndarray, np.ndarray]:
+    numbers, centers = [], []
+    for path in paths:
+        digits = re.fullmatch(r"pos_(\d{1,6})", path.stem)
+        if digits is None:
+            continue
+        try:
+            words = path.read_bytes().decode(errors="replace").split()
+            values = np.array([float(word) for word in words])
+        except (OSError, ValueError) as error:
+            raise ParseError(path, "whole file", f"{error}.", _DTU_AGAIN) from None
+        if len(values) != 12 or not np.isfinite(values).all():
+            raise ParseError(
+                path, "whole file", f"12 finite numbers (3x4) were expected, not {len(values)}.",
+                _DTU_AGAIN,
+            )  # fmt: skip
+        numbers.append(int(digits.group(1)))
+        centers.append(_center(path, "whole file", values.reshape(3, 4)))
+    return np.array(numbers, np.int64), np.array(centers).reshape(-1, 3)
+
+
+def _center(path: Path, place: str, projection: np.ndarray) -> np.ndarray:
+    """Return the centre of a (3, 4) projection, its null space."""
+    linear = projection[:, :3]
+    if not np.linalg.cond(linear) < 1e12:
+        raise ParseError(path, place, "the projection has no centre.", _DTU_AGAIN)
+    return -np.linalg.solve(linear, projection[:, 3])
+
+
+def align_to_scan(cameras: Sequence[Camera], truth: DtuScan) -> DtuAlignment:
+    """Return ``truth_from_job`` from the camera centres (Umeyama, with scale).
+
+    The first number in a photo's name (``rect_001_3_r5000.png``, ``000000.png``) is that of its
+    camera file; whether it counts from 0 or 1 is decided by the better fit.
+
+    Raises
+    ------
+    DatasetError
+        No camera files, names without numbers, fewer than three matches, or no pairing that fits.
+    """
+    if not len(truth.camera_numbers):
+        raise DatasetError(
+            f"No true cameras of scan {truth.scan} were found.",
+            "Add Calibration/cal18/pos_*.txt or cameras.npz, or place the mesh yourself and use "
+            "--align none.",
+        )
+    row_of = {int(number): row for row, number in enumerate(truth.camera_numbers)}
+    numbers = []
+    for camera in cameras:
+        digits = re.findall(r"\d+", Path(camera.name).stem)
+        if not digits:
+            raise DatasetError(
+                f"The photo {camera.name!r} has no number.", "Keep the data set's photo names."
+            )
+        numbers.append(int(digits[0]))
+    centers = np.array([camera.center for camera in cameras]).reshape(-1, 3)
+    best: DtuAlignment | None = None
+    matched = 0
+    for offset in NUMBER_OFFSETS:
+        rows = np.array([row_of.get(n + offset, -1) for n in numbers], np.int64)
+        known = rows >= 0
+        matched = max(matched, int(known.sum()))
+        # Every photo must have a camera under the right offset.
+        if known.sum() < 3 or not known.all():
+            continue
+        true = truth.camera_centers[rows]
+        fit = umeyama(centers, true, with_scale=True)
+        rmse = float(np.sqrt(((fit.points(centers) - true) ** 2).sum(1).mean()))
+        if best is None or rmse < best.rmse_mm:
+            best = DtuAlignment(fit, len(rows), offset, rmse)
+    if best is None:
+        raise DatasetError(
+            f"{matched} of {len(cameras)} photos have a camera in {truth.camera_source}.",
+            "Keep the data set's photo names; at least 3 photos are needed.",
+        )
+    true_spread = truth.camera_centers - truth.camera_centers.mean(0)
+    spread = float(np.sqrt((true_spread**2).sum(1).mean()))
+    if best.rmse_mm > MAX_MISFIT_SHARE * spread:
+        raise DatasetError(
+            f"The cameras are off those of {truth.camera_source} by {best.rmse_mm:.3g} mm (RMS).",
+            "Photos and cameras do not match, or the cameras were solved wrongly.",
+        )
+    return best
+
+
+def score_dtu(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    truth: DtuScan,
+    truth_from_job: Similarity,
+    *,
+    seed: int = 0,
+    threads: int = 1,
+) -> DtuScore:
+    """Align a mesh, resample it as points, and compare (see :func:`~.dtu_chamfer.dtu_chamfer`).
+
+    Faces farther than the patch from the observed box are left out, as they would not count.
+
+    Raises
+    ------
+    UsageError, MeshingError, ResourceError
+        See :mod:`~.dtu_chamfer`.
+    """
+    placed = truth_from_job.points(vertices)
+    corners = placed[faces]  # (f, 3, 3)
+    near = (corners.max(1) >= truth.mask.low - PATCH_MM) & (
+        corners.min(1) <= truth.mask.high + PATCH_MM
+    )
+    points = resample_mesh(placed, faces[near.all(1)], DENSITY_MM)
+    return dtu_chamfer(points, truth.cloud, truth.mask, truth.plane, seed=seed, threads=threads)

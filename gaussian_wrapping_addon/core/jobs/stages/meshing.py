@@ -1,0 +1,759 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The stage of the meshes: field of a region, mesh in one piece or in tiles."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ...devices import CPU, DeviceChoice, stage_device
+from ...devices.checks import is_device_failure
+from ...errors import DatasetError, MeshingError, WrapError
+from ...files import is_whole
+from ...meshing.tiles.plan import Field, TilePlan
+from ...meshing.tiles.store import (
+    faces_path,
+    gathered_path,
+    load_gathered,
+    load_plan,
+    load_points,
+    points_path,
+    save_gathered,
+    save_points,
+    save_surface,
+)
+from ...meshing.tiles.tile import GatheredPoints, gather, tile_faces, tile_points, tile_surface
+from ...names import AUTOMATIC_REGIONS, GATHER, POINTS, TILE_KINDS
+from ...progress import Progress, ReportWarning
+from ...settings import MeshingSettings, key_values
+from ..store.job_file import JobFile
+from ..store.job_folder import (
+    STAGE_VERSIONS,
+    JobFolder,
+    Stage,
+    record_interrupted_time,
+    run_stage,
+    stage_key,
+)
+
+if TYPE_CHECKING:
+    from ...field.samples import DepthSamples
+    from ...field.vacancy import VacancyField
+    from ...gaussians.model import GaussianArrays, OrientedGaussians
+    from ...mesh.surface_mesh import SurfaceMesh
+    from ...meshing.estimate import MeshEstimate, PivotEstimate
+    from ...regions.shapes import Region
+    from ...scene.camera import Camera
+    from ...scene.scene import PhotoSource, Scene
+    from ...settings import TrainingSettings
+
+
+# -- Keys of a job's mesh stages ------------------------------------------------------------------
+
+
+def mesh_key(job: JobFile, request: str, name: str, trained_key: str) -> str:
+    """Return the key of a region's mesh stage: the hash of everything its mesh depends on."""
+    body = job.region_bodies.get(request)
+    return stage_key(
+        STAGE_VERSIONS["mesh"], trained_key, request if body is None else body, name,
+        key_values(job.meshing_of(request)), job.settings.seed,
+    )  # fmt: skip
+
+
+# -- Build the vacancy field of a region with the job's cameras, masks and unseen space -----------
+
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RegionInputs:
+    """What the mesh of a region is made from."""
+
+    scene: Scene
+    gaussians: OrientedGaussians
+    arrays: GaussianArrays
+    region: Region
+    """Scene frame."""
+    world_region: Region
+    field: Field
+
+
+def load_region(
+    job: JobFile, request: str, cameras: Stage, trained: Stage, device: DeviceChoice, threads: int
+) -> RegionInputs:
+    """Load a finished training and build the field of a region from it.
+
+    Parameters
+    ----------
+    request : str
+        The region's entry in the job's settings.
+    device : DeviceChoice
+        Where vacancy is evaluated, if it fits there.
+
+    Raises
+    ------
+    ParseError, DatasetError
+        A file of the stages is damaged or missing.
+    DeviceError
+        As :func:`field_device`.
+    """
+    from ...field.vector_field import VectorField
+    from ...gaussians.files import load_gaussians
+    from ...meshing.tiles.plan import Field
+    from ...scene.scene import load_refined_scene
+
+    scene = load_refined_scene(cameras.folder, trained.folder)
+    gaussians = load_gaussians(trained.folder / "gaussians.npz")
+    arrays = gaussians.arrays()
+    body = job.region_bodies.get(request)
+    region, world_region = requested_region(request, body, scene, arrays)
+    vacancy = region_field(
+        scene, arrays, region, job.settings.training, job.meshing_of(request), threads=threads,
+        device=field_device(device, job.settings.device, arrays).device,
+    )  # fmt: skip
+    field = Field(vacancy, VectorField(arrays, threads=threads), threads)
+    return RegionInputs(scene, gaussians, arrays, region, world_region, field)
+
+
+def requested_region(
+    request: str, body: Any, scene: Scene, arrays: GaussianArrays | None
+) -> tuple[Region, Region]:
+    """Return the requested region in the scene frame, on its grid, and in the world frame.
+
+    The world-frame region of a file is returned as read: transforming it to the scene frame and
+    back would change its last digits each time.
+
+    Parameters
+    ----------
+    request : str
+        ``"auto"``, ``"all"`` or the path of a region file.
+    body : object
+        Content of that file.
+    arrays : GaussianArrays, optional
+        Of the training; only the region ``"all"`` needs them.
+    """
+    from ...regions.scene_regions import (
+        automatic_region,
+        on_scene_grid,
+        parse_region,
+        region_in_scene,
+        whole_region,
+    )
+
+    if request in AUTOMATIC_REGIONS:
+        if request == "auto":
+            region = automatic_region(scene)
+        else:
+            assert arrays is not None
+            region = whole_region(scene, arrays)
+        region = on_scene_grid(region)
+        return region, region.transformed(scene.world_from_scene)
+    world_region = parse_region(body, Path(request))
+    return region_in_scene(world_region, scene.world_from_scene), world_region
+
+
+def reject_short_edges(job: JobFile, cameras: Path) -> None:
+    """Refuse edges far too short for their region, which would else fail after the training.
+
+    The region of all Gaussians is known only then, and is left out.
+
+    Parameters
+    ----------
+    cameras : Path
+        Folder of the finished cameras stage.
+
+    Raises
+    ------
+    ResourceError
+        Names the region.
+    """
+    from ...meshing.surface_points import checked_request
+    from ...scene.scene import load_saved_scene
+
+    lengths = {
+        request: meshing.edge_length
+        for request in job.settings.regions
+        if (meshing := job.meshing_of(request)).method == "pam" and request != "all"
+    }
+    if not any(lengths.values()):
+        return
+    scene = load_saved_scene(cameras)
+    for request, length in lengths.items():
+        region, _ = requested_region(request, job.region_bodies.get(request), scene, None)
+        checked_request(length / scene.world_from_scene.scale, 0, region)
+
+
+def field_views(scene: Scene, photos: PhotoSource, holdout_every: int, cameras: str) -> list[int]:
+    """Return the views whose cameras a mesh is made from (docs/method.md, section 5.3).
+
+    Parameters
+    ----------
+    holdout_every : int
+        Setting of the training.
+    cameras : str
+        Setting of the meshing: ``"training"`` leaves out held-out photos and photos that their
+        masks cover; ``"all"`` uses every camera.
+
+    Raises
+    ------
+    DatasetError
+        No camera is left.
+    """
+    from ...scene.scene import training_views
+
+    if cameras == "all":
+        return list(range(len(scene.views)))
+    views = training_views(scene, photos, holdout_every)
+    if not views:
+        raise DatasetError(
+            "The masks cover every photo that was trained on.",
+            "Check the masks, or mesh with the cameras of all photos.",
+        )
+    return views
+
+
+def field_device(chosen: DeviceChoice, setting: str, arrays: GaussianArrays) -> DeviceChoice:
+    """Return where the field of these Gaussians is evaluated: the job's device if it fits there.
+
+    Raises
+    ------
+    DeviceError
+        As :func:`~.choice.stage_device`.
+    """
+    if not chosen.is_cuda:
+        return chosen
+    from ...field.cuda_vacancy import needed_bytes
+
+    return stage_device(chosen, setting, needed_bytes(len(arrays)), "Vacancy")
+
+
+def region_field(
+    scene: Scene,
+    arrays: GaussianArrays,
+    region: Region,
+    training: TrainingSettings,
+    meshing: MeshingSettings,
+    *,
+    threads: int,
+    device: str = "cpu",
+) -> VacancyField:
+    """Return the field in and around a region, limited to the mesher's halo.
+
+    Parameters
+    ----------
+    region : Region
+        Scene frame.
+    training : TrainingSettings
+        ``mask_mode``, ``holdout_every`` and the size of the photos that masks are read at.
+    meshing : MeshingSettings
+        ``unseen`` and ``cameras`` are read.
+    device : str
+        Torch device of the field, from :func:`field_device`. If the kernels of a GPU cannot run,
+        the field is evaluated on the processor and the log says why.
+
+    Raises
+    ------
+    DatasetError
+        A mask does not fit its photo, or masks cover every photo that was trained on.
+    """
+    from ...field.vacancy import PackedMask, VacancyField
+    from ...meshing.surface_points import halo_bounds
+    from ...photos.store import PhotoStore
+
+    photos = PhotoStore(scene, training.max_image_px)
+    views = field_views(scene, photos, training.holdout_every, meshing.cameras)
+    cameras = [scene.views[index].camera for index in views]
+    options: dict[str, Any] = {
+        "threads": threads,
+        "unseen": meshing.unseen,
+        "region_bounds": halo_bounds(region),
+        "masks": [PackedMask.of(photos.mask(index)) for index in views],
+        "mask_mode": scene.mask_mode(training.mask_mode),
+    }
+    if device.startswith("cuda"):
+        from ...field.cuda_vacancy import CudaVacancyField
+
+        try:
+            return CudaVacancyField(arrays, cameras, device=device, **options)
+        except (WrapError, RuntimeError) as error:
+            if not is_device_failure(error):
+                raise
+            reason = getattr(error, "message", error)
+            _logger.warning("Vacancy is evaluated on the processor, not on the GPU: %s", reason)
+    return VacancyField(arrays, cameras, **options)
+
+
+def field_figures(field: VacancyField) -> dict[str, Any]:
+    """Return the report's figures of a field: device, cameras, evaluations, what is unseen."""
+    return {
+        "field_device": field.device,
+        "field_cameras": len(field.cameras),
+        "unseen": field.unseen,
+        "field_evaluations": field.evaluations,
+        "unseen_evaluations": field.unseen_evaluations,
+    }
+
+
+# -- Mesh a region in its stage folder, whole or in tiles, as requested or as memory allows -------
+#
+# Tiles are parts of a job, which other processes may make (:mod:`..parts`): a region in tiles is
+# planned here, and joined here once its tiles are there.
+
+
+TILES_FOLDER = "tiles"
+"""Subfolder of the stage's folder while tiles are being meshed."""
+
+MAX_SPACING_SAMPLES = 5_000
+"""Approximate number of depth samples at which the resolution of the photos is evaluated."""
+
+
+class TilesPlanned(Exception):  # noqa: N818 - no error: the tiles are made next
+    """A region is planned in tiles, some of which are not made yet."""
+
+    def __init__(self, stage_folder: Path) -> None:
+        super().__init__(stage_folder)
+        self.stage_folder = stage_folder
+
+
+def mesh_in_stage(
+    stage_folder: Path,
+    field: Field,
+    arrays: GaussianArrays,
+    cameras: Sequence[Camera],
+    region: Region,
+    meshing: MeshingSettings,
+    progress: Progress,
+    *,
+    seed: int,
+    edge_length_scene: float,
+    sampled: Callable[[], DepthSamples],
+    warnings: Sequence[ReportWarning] = (),
+) -> tuple[SurfaceMesh, dict[str, Any]]:
+    """Estimate the mesh of a region, then make it; or plan its tiles; or join them.
+
+    Parameters
+    ----------
+    sampled : callable
+        Samples depth maps; not called where tiles are planned already.
+    warnings : sequence of ReportWarning
+        Of the plan, for the report.
+
+    Returns
+    -------
+    mesh : SurfaceMesh
+    expected : dict
+        The estimate, for the report.
+
+    Raises
+    ------
+    TilesPlanned
+        Tiles are to be made first.
+    ResourceError
+        The mesh does not fit into memory.
+    MeshingError
+        The region holds no surface.
+    """
+    from ...meshing.primal_adaptive import mesh_region
+    from ...meshing.tiles.store import is_planned, save_plan
+    from ...meshing.tiles.tiled_mesh import plan_tiles
+
+    folder = stage_folder / TILES_FOLDER
+    if is_planned(folder):
+        return _joined(stage_folder, field, meshing, progress)
+    depth_samples = sampled()
+    expected = estimate_region_mesh(
+        field.vacancy, cameras, region, meshing, edge_length_scene, depth_samples
+    )
+    for line in expected.lines():
+        _logger.info("region %s, estimated %s", region.name, line)
+    memory_bytes = free_bytes(stage_folder, field.threads)
+    tiled = meshing.tiles != "off" and (
+        meshing.tiles != "auto" or bool(expected.tiles_for(memory_bytes))
+    )
+    expected.refuse(memory_bytes, tiled=tiled)
+    told = {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": tiled}
+    if tiled:
+        tiles = 0 if meshing.tiles == "auto" else int(meshing.tiles)
+        plan = plan_tiles(
+            field, arrays, cameras, region, meshing, progress, tiles=tiles, seed=seed,
+            edge_length_scene=edge_length_scene, depth_samples=depth_samples,
+        )  # fmt: skip
+        noted = {"estimate": told, "warnings": [warning.to_json() for warning in warnings]}
+        save_plan(folder, plan, noted)
+        raise TilesPlanned(stage_folder)
+    mesh = mesh_region(
+        field.vacancy, field.vectors, arrays, cameras, region, meshing, progress, seed=seed,
+        threads=field.threads, edge_length_scene=edge_length_scene, depth_samples=depth_samples,
+    )  # fmt: skip
+    _note(mesh, warnings)
+    return mesh, told
+
+
+def _note(mesh: SurfaceMesh, warnings: Sequence[ReportWarning]) -> None:
+    if warnings:
+        before = mesh.provenance.get("warnings", [])
+        mesh.provenance["warnings"] = [*before, *(warning.to_json() for warning in warnings)]
+
+
+def _joined(
+    stage_folder: Path, field: Field, meshing: MeshingSettings, progress: Progress
+) -> tuple[SurfaceMesh, dict[str, Any]]:
+    """Join the tiles of a planned region.
+
+    Raises
+    ------
+    TilesPlanned
+        Some are missing.
+    """
+    from ...meshing.tiles.store import (
+        faces_path,
+        gathered_path,
+        load_plan,
+        load_point_figures,
+        load_surface,
+    )
+    from ...meshing.tiles.tiled_mesh import join_tiles
+
+    folder = stage_folder / TILES_FOLDER
+    plan, noted = load_plan(folder)
+    paths = [faces_path(folder, tile) for tile in range(len(plan.tiling))]
+    if not all(path.is_file() for path in [gathered_path(folder), *paths]):
+        raise TilesPlanned(stage_folder)
+    mesh = join_tiles(
+        field, plan, load_point_figures(gathered_path(folder)),
+        lambda tile: load_surface(paths[tile]), meshing, progress,
+    )  # fmt: skip
+    if noted.get("warnings"):
+        mesh.provenance["warnings"] = list(noted["warnings"])
+    return mesh, dict(noted.get("estimate", {}))
+
+
+def mesh_by_pivots_in_stage(
+    stage_folder: Path,
+    vacancy: VacancyField,
+    arrays: GaussianArrays,
+    cameras: Sequence[Camera],
+    region: Region,
+    meshing: MeshingSettings,
+    progress: Progress,
+    *,
+    seed: int,
+    threads: int,
+    depth_samples: DepthSamples | None,
+    warnings: Sequence[ReportWarning] = (),
+) -> tuple[SurfaceMesh, dict[str, Any]]:
+    """Estimate the mesh of a region by pivots, then make it; see :func:`mesh_in_stage`."""
+    from ...meshing.pivot_meshing import mesh_by_pivots
+
+    expected = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
+    for line in expected.lines():
+        _logger.info("region %s, estimated %s", region.name, line)
+    memory_bytes = free_bytes(stage_folder, threads)
+    expected.refuse(memory_bytes)
+    mesh = mesh_by_pivots(
+        vacancy, arrays, cameras, region, meshing, progress, seed=seed, depth_samples=depth_samples
+    )
+    _note(mesh, warnings)
+    return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": False}
+
+
+def estimate_region_pivots(
+    vacancy: VacancyField,
+    arrays: GaussianArrays,
+    region: Region,
+    meshing: MeshingSettings,
+    depth_samples: DepthSamples | None,
+) -> PivotEstimate:
+    """Estimate the mesh of a region by pivots from the Gaussians and depth samples in it."""
+    from ...meshing.estimate import estimate_pivot_mesh, evaluation_seconds
+
+    if depth_samples is None:
+        samples, near = 0, arrays.means[region.contains(arrays.means, 0.0)]
+    else:
+        samples, near = len(depth_samples), depth_samples.points
+    return estimate_pivot_mesh(
+        arrays, region, meshing.pivots, samples,
+        box=meshing.pivot_box, alone=meshing.pivot_samples == "none",
+        evaluation_s=evaluation_seconds(vacancy, near),
+    )  # fmt: skip
+
+
+def estimate_region_mesh(
+    vacancy: VacancyField,
+    cameras: Sequence[Camera],
+    region: Region,
+    meshing: MeshingSettings,
+    edge_length_scene: float,
+    depth_samples: DepthSamples,
+) -> MeshEstimate:
+    """Estimate the mesh of a region from the depth samples of its surface."""
+    from ...meshing.estimate import (
+        box_counting_area,
+        estimate_mesh,
+        evaluation_seconds,
+        occupied_boundary_area,
+    )
+    from ...meshing.surface_points import checked_request, resolved_edges
+
+    adaptive = meshing.spacing == "adaptive"
+    subset = depth_samples.points[:: max(1, len(depth_samples) // MAX_SPACING_SAMPLES)]
+    return estimate_mesh(
+        box_counting_area(depth_samples.points),
+        occupied_boundary_area(region, vacancy.is_empty),
+        checked_request(edge_length_scene, meshing.points, region),
+        adaptive=adaptive,
+        evaluation_s=evaluation_seconds(vacancy, depth_samples.points),
+        resolved=resolved_edges(subset, cameras) if adaptive else None,
+    )
+
+
+def free_bytes(folder: Path, threads: int) -> int:
+    """Return how much memory a mesh may use on this machine; 0 if unknown."""
+    from ...training.estimate import MEMORY_SHARE_LEFT, this_machine
+
+    return int(MEMORY_SHARE_LEFT * this_machine(folder, threads).memory_bytes)
+
+
+def remove_tiles(stage_folder: Path) -> None:
+    """Remove the tile files once the mesh is saved."""
+    folder = stage_folder / TILES_FOLDER
+    if not folder.is_dir():
+        return
+    aside = stage_folder / f"{TILES_FOLDER}-joined"
+    try:
+        os.replace(folder, aside)  # atomic: no process finds a partly deleted list
+    except OSError:
+        aside = folder
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+# -- The parts of a tiled mesh: points of a tile, all points, faces of a tile ---------------------
+
+
+def tile_file(folder: Path, kind: str, tile: int) -> Path:
+    """Return the file that a part of a tiled mesh makes."""
+    if kind == GATHER:
+        return gathered_path(folder)
+    return (points_path if kind == POINTS else faces_path)(folder, tile)
+
+
+class TileMaker:
+    """Makes the parts of one planned region; each can be made again, with the same result.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the tiles, with their plan.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    @cached_property
+    def plan(self) -> TilePlan:
+        """The plan of the region."""
+        return load_plan(self._folder)[0]
+
+    @cached_property
+    def _all_points(self) -> GatheredPoints:
+        return load_gathered(gathered_path(self._folder))
+
+    def make_all(self, field: Field, progress: Progress) -> None:
+        """Make all parts that are missing, one after another."""
+        count = len(self.plan.tiling)
+        todo = [(kind, tile) for kind in TILE_KINDS for tile in range(count)]
+        todo = [(kind, tile) for kind, tile in todo if kind != GATHER or tile == 0]
+        for number, (kind, tile) in enumerate(todo):
+            if not tile_file(self._folder, kind, tile).is_file():
+                span = progress.span(number / len(todo), (number + 1) / len(todo))
+                self.make(kind, tile, field, span)
+
+    def make(self, kind: str, tile: int, field: Field, progress: Progress) -> Path:
+        """Make a part and return its file."""
+        path = tile_file(self._folder, kind, tile)
+        if kind == POINTS:
+            save_points(path, tile_points(field, self.plan, tile, progress))
+        elif kind == GATHER:
+            progress.update(0.0, "bringing the tiles' points together")
+            count = len(self.plan.tiling)
+            parts = [load_points(points_path(self._folder, number)) for number in range(count)]
+            save_gathered(path, gather(self.plan, parts))
+        else:
+            faces = tile_faces(field, self.plan, self._all_points, tile, progress.span(0.0, 0.9))
+            save_surface(path, tile_surface(self.plan, self._all_points, faces))
+        return path
+
+
+# -- Mesh stage: mesh a region of a finished training and clean the mesh up -----------------------
+
+
+if TYPE_CHECKING:
+    Loader = Callable[[JobFile, str, Stage, Stage, DeviceChoice, int], RegionInputs]
+
+
+ON_PROCESSOR = DeviceChoice(CPU, "", "The GPU failed.")
+
+DENSE_MESH = "dense.npz"
+"""In a mesh stage: the mesh before decimation, if it was decimated; texture maps use it."""
+
+
+def run_mesh(
+    folder: JobFolder,
+    job: JobFile,
+    request: str,
+    name: str,
+    cameras: Stage,
+    trained: Stage,
+    progress: Progress,
+    *,
+    threads: int,
+    device: DeviceChoice,
+    load: Loader = load_region,
+    tile_processes: int = 1,
+    warnings: Sequence[ReportWarning] = (),
+) -> Stage:
+    """Mesh a region, or plan or join its tiles, or re-use its finished mesh stage.
+
+    Parameters
+    ----------
+    request : str
+        The region's entry in the job's settings.
+    name : str
+        Name of the region's folder.
+    device : DeviceChoice
+        The job's; vacancy is evaluated and depth maps are rendered there. Everything else gets
+        arrays and CPU tensors.
+    load : callable
+        Takes the place of :func:`load_region`, to keep what it loads.
+    tile_processes : int
+        How many processes made the tiles, for the report.
+    warnings : sequence of ReportWarning
+        Of what was tried before.
+
+    Raises
+    ------
+    TilesPlanned
+        The region is planned in tiles, which are to be made before this is called again.
+    MeshingError, ResourceError
+        The region holds no surface, or its mesh does not fit into memory.
+    """
+    meshing = job.meshing_of(request)
+    key = mesh_key(job, request, name, trained.key)
+
+    def meshed(
+        chosen: DeviceChoice,
+        stage_folder: Path,
+        progress: Progress,
+        warnings: Sequence[ReportWarning],
+    ) -> dict[str, Any]:
+        import numpy as np
+
+        from ...devices.checks import with_renderer
+        from ...field.samples import sample_depth_maps
+        from ...mesh.surface_mesh import save_mesh
+        from ...meshing.checks import mesh_statistics, validate_manifold
+        from ...meshing.clean_up import clean_up, without_caps
+        from ...regions.scene_regions import write_region
+        from ...render.types import Renderer
+        from ...scene.frames import snapped_length
+
+        inputs = load(job, request, cameras, trained, chosen, threads)
+        region, vacancy = inputs.region, inputs.field.vacancy
+
+        def sampled() -> DepthSamples:
+            def on(renderer: Renderer) -> DepthSamples:
+                return sample_depth_maps(
+                    inputs.gaussians, vacancy.cameras, lambda points: region.contains(points, 0.0),
+                    progress.span(0.0, 0.15), threads=threads, renderer=renderer,
+                )  # fmt: skip
+
+            return with_renderer(vacancy.device, "Depth maps", on)
+
+        if meshing.method == "pivots":
+            alone = meshing.pivot_samples == "none"
+            mesh, expected = mesh_by_pivots_in_stage(
+                stage_folder, vacancy, inputs.arrays, vacancy.cameras, region, meshing,
+                progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
+                depth_samples=None if alone else sampled(), warnings=warnings,
+            )  # fmt: skip
+        else:
+            mesh, expected = mesh_in_stage(
+                stage_folder, inputs.field, inputs.arrays, vacancy.cameras, region, meshing,
+                progress.span(0.15, 0.9), seed=job.settings.seed, sampled=sampled,
+                edge_length_scene=snapped_length(
+                    meshing.edge_length / inputs.scene.world_from_scene.scale
+                ),
+                warnings=warnings,
+            )  # fmt: skip
+        if expected.get("tiled"):
+            mesh.provenance["tile_processes"] = tile_processes
+        mesh, dense = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))
+        open_at = region if meshing.boundary == "open" else None
+        if open_at is not None:
+            mesh = without_caps(mesh, open_at, meshing.min_component_share)
+            if dense is not None:
+                dense = without_caps(dense, open_at, meshing.min_component_share)
+        mesh.provenance.update(field_figures(vacancy), cameras=meshing.cameras)
+        if not np.isfinite(mesh.vertices).all():
+            raise MeshingError(
+                "The mesh has vertices that are not finite.",
+                "Send the job folder's log.txt with a bug report.",
+            )
+        save_mesh(stage_folder / "mesh.npz", mesh)
+        if dense is not None:
+            save_mesh(stage_folder / DENSE_MESH, dense)
+        remove_tiles(stage_folder)
+        write_region(stage_folder / "region.json", inputs.world_region)
+        progress.update(0.97, "measuring the mesh")
+        return {
+            "statistics": mesh_statistics(mesh).to_json(),
+            "check": validate_manifold(mesh.vertices, mesh.faces, open_at).to_json(),
+            "provenance": mesh.provenance,
+            "edge_length_world": meshing.edge_length,
+            "estimate": expected,
+        }
+
+    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        from ...devices.checks import is_device_failure
+
+        begun_s = time.monotonic()
+        try:
+            try:
+                return meshed(device, stage_folder, progress, warnings)
+            except Exception as error:
+                if not (device.is_cuda and is_device_failure(error)):
+                    raise
+                failed = device_warning(device, name, error)
+            # Tiles of two devices differ by rounding where they join.
+            remove_tiles(stage_folder)
+            return meshed(ON_PROCESSOR, stage_folder, progress, [*warnings, failed])
+        except TilesPlanned:
+            spent_s = time.monotonic() - begun_s
+            record_interrupted_time(folder.stages, f"mesh-{name}", key, spent_s)
+            raise
+
+    def whole(stage_folder: Path) -> bool:
+        dense = stage_folder / DENSE_MESH
+        return is_whole(stage_folder / "mesh.npz") and (not dense.exists() or is_whole(dense))
+
+    return run_stage(folder.stages, f"mesh-{name}", key, progress, work, whole=whole)
+
+
+def device_warning(device: DeviceChoice, name: str, error: Exception) -> ReportWarning:
+    """Return the warning that a region is meshed on the processor, and log it."""
+    warning = ReportWarning(
+        "device-failed",
+        f"{device.device} failed while region {name!r} was meshed "
+        f"({getattr(error, 'message', error)}); it was meshed again on the processor.",
+        "Close other programs that use the GPU.",
+    )
+    _logger.warning("%s", warning.text)
+    return warning

@@ -1,0 +1,961 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Points on the surface at the wanted spacing: candidates, spacing field, caps."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from .. import limits
+from ..errors import MeshingError, ResourceError, UsageError
+from ..field.isosurface_projection import TOLERANCE, project_to_isosurface
+from ..field.samples import DepthSamples, bracket_pairs
+from ..gaussians.model import GaussianArrays
+from ..mesh.sampling import EDGE_PER_RADIUS, POINTS_PER_SQUARE, sample_triangles, thin
+from ..mesh.surface_mesh import normals_and_areas
+from ..parallel import balanced_bounds
+from ..progress import Progress, ReportWarning
+from ..regions.shapes import Region
+from ..scene.camera import Camera
+from .delaunay import bounding_points, delaunay
+from .marching_tetrahedra import IsEmpty, bisect, marching_tetrahedra
+from .pivots import (
+    MAX_PIVOT_GAUSSIANS,
+    PivotRule,
+    gaussians_reaching,
+    representative_gaussians,
+    two_pivots,
+)
+
+# -- Resolution of a mesh: requested edge length or number of points, and their limits ------------
+
+
+AUTOMATIC_POINTS = 24_000
+"""Surface points without a request: about 50 thousand faces (48 to 55 thousand in jobs; caps add
+some where the region cuts the solid)."""
+
+MIN_VERTICES = 100
+"""Least number of vertices of an adaptive mesh."""
+
+COARSEST_SHARE = 1 / 8
+"""Edges longer than this share of the diagonal would not show a region's contents."""
+
+DENSE_FACTOR = 6.0
+"""Vertices of the dense mesh per vertex that adaptive spacing keeps. With fewer, the errors of the
+dense mesh dominate; more cost time and lower the error little."""
+DENSE_POINTS, LEAST_DENSE_FACTOR = 200_000, 2.0
+"""Beyond this many points the factor falls, to this minimum: time stays proportional to points."""
+
+VERTICES_PER_UNIFORM = 0.5
+"""Vertices of an adaptive mesh, as a share of the uniform mesh with the requested edge length; both
+have the same distance to the surface (benchmarks/meshing_tables.py)."""
+
+FINEST_SHARE = 1e-6
+"""Edges shorter than this share of the diagonal are refused outright."""
+
+
+@dataclass(frozen=True)
+class ResolutionRequest:
+    """A requested edge length or number of points, or neither (0 and 0)."""
+
+    edge_length: float
+    """Scene units."""
+    points: int
+    notes: tuple[ReportWarning, ...] = ()
+    """Changes to the request, for the report."""
+
+
+def checked_request(edge_length: float, points: int, region: Region) -> ResolutionRequest:
+    """Validate a request before any work is done; clamp edges that are too long.
+
+    Raises
+    ------
+    UsageError
+        A value is not finite or negative, or both are given.
+    ResourceError
+        The resolution is too fine.
+    """
+    if not math.isfinite(edge_length) or edge_length < 0 or points < 0:
+        raise UsageError(
+            f"Edge length {edge_length} with {points} points is invalid.",
+            "Give a positive edge length, or a number of points, or leave both 0.",
+        )
+    if edge_length > 0 and points > 0:
+        raise UsageError("Both an edge length and a number of points are given.", "Give one.")
+    if points > limits.MAX_MESH_POINTS:
+        raise ResourceError(
+            f"{points} surface points are too many.", f"Ask for {limits.MAX_MESH_POINTS} at most."
+        )
+    if 0 < edge_length < FINEST_SHARE * region.diagonal:
+        raise ResourceError(
+            f"Region {region.name!r} is {region.diagonal / edge_length:.2g} edges long: too many.",
+            "Use edges of a thousandth of the region's diagonal, a smaller region, or leave the "
+            "edge length out.",
+        )
+    coarsest = COARSEST_SHARE * region.diagonal
+    if edge_length > coarsest:
+        share = f"1/{1 / COARSEST_SHARE:.0f} of the region's diagonal"
+        text = f"The edge length was larger than {share} and was reduced to that."
+        return ResolutionRequest(coarsest, 0, (ReportWarning("edge-length-reduced", text),))
+    return ResolutionRequest(edge_length, points)
+
+
+def thinning_radius(request: ResolutionRequest, area: float, region: Region) -> float:
+    """Return the thinning radius that meets the request with uniform spacing.
+
+    Parameters
+    ----------
+    area : float
+        Area of the candidate surface in the region.
+    """
+    if request.edge_length > 0:
+        return request.edge_length / EDGE_PER_RADIUS
+    points = request.points or AUTOMATIC_POINTS
+    radius = float(np.sqrt(POINTS_PER_SQUARE * area / points))
+    return min(radius, COARSEST_SHARE * region.diagonal)
+
+
+def check_expected_points(points: float, request: ResolutionRequest) -> None:
+    """Refuse an edge length that needs too many points.
+
+    Raises
+    ------
+    ResourceError
+        More than ``limits.MAX_MESH_POINTS`` are expected.
+    """
+    if request.edge_length > 0 and points > limits.MAX_MESH_POINTS:
+        factor = times_longer(points, limits.MAX_MESH_POINTS)
+        raise ResourceError(
+            f"This edge length needs about {points:.1e} surface points; "
+            f"the limit is {limits.MAX_MESH_POINTS:.0e}.",
+            f"Use edges {factor} times longer, or a smaller region.",
+        )
+
+
+def times_longer(points: float, most: float) -> str:
+    """Return by how much edges must be longer for fewer points: rounded up, with some to spare."""
+    return f"{math.ceil(105.0 * math.sqrt(points / most)) / 100.0:.2f}"
+
+
+@dataclass(frozen=True)
+class DenseRequest:
+    """Resolution of the dense mesh that an adaptive mesh is simplified from."""
+
+    request: ResolutionRequest
+    target: int
+    """Vertices to keep, for the surface without caps."""
+    share: float
+    """The same as a share of the dense mesh, which also has vertices on caps."""
+
+
+def dense_points(stay: float) -> float:
+    """Return the points of the dense mesh for a number of vertices to keep."""
+    return max(min(DENSE_FACTOR * stay, DENSE_POINTS), LEAST_DENSE_FACTOR * stay)
+
+
+def kept_from_dense(points: float) -> float:
+    """Return the vertices kept, at most, of a dense mesh: the inverse of :func:`dense_points`."""
+    return points / (LEAST_DENSE_FACTOR if points >= DENSE_POINTS else DENSE_FACTOR)
+
+
+def dense_request(request: ResolutionRequest, area: float, region: Region) -> DenseRequest:
+    """Return the resolution of the dense mesh, and how many of its vertices to keep.
+
+    Raises
+    ------
+    ResourceError
+        The dense mesh needs more points than the limit.
+    """
+    expected = POINTS_PER_SQUARE * area / thinning_radius(request, area, region) ** 2
+    share = VERTICES_PER_UNIFORM if request.edge_length > 0 else 1.0
+    target, notes = round(share * expected), request.notes
+    if target < MIN_VERTICES:
+        asked = request.points or target  # with an edge length, the points that it implies
+        text = (
+            f"An adaptive mesh has at least {MIN_VERTICES} surface points; {asked} were requested."
+        )
+        notes = (*notes, ReportWarning("points-raised", text))
+        target = MIN_VERTICES
+    dense = dense_points(target)
+    if request.edge_length > 0:
+        check_expected_points(dense, request)
+        edge = request.edge_length * math.sqrt(expected / dense)
+        return DenseRequest(ResolutionRequest(edge, 0, notes), target, target / dense)
+    return DenseRequest(ResolutionRequest(0.0, round(dense), notes), target, target / dense)
+
+
+def nominal_edge(request: ResolutionRequest, area: float, region: Region) -> float:
+    """Return the edge length of the uniform mesh that meets a request."""
+    return EDGE_PER_RADIUS * thinning_radius(request, area, region)
+
+
+# -- Local spacing of surface points: no finer than the photos resolve, with bounded gradation ----
+
+
+EDGE_PER_PIXEL = 0.5
+"""Shortest edge, in pixels of the nearest camera. The finest pattern in a photo has a period of two
+pixels; four vertices represent it."""
+
+GRADING = 0.4
+"""Edges lengthen by at most this share of the distance, so that triangles stay well shaped."""
+
+LONGEST_SHARE = 8.0
+"""Edges are lengthened to at most this many nominal ones, however far the nearest camera is."""
+
+
+def footprints(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the smallest pixel footprint over the cameras at each point, (n,).
+
+    0 where no camera sees the point.
+    """
+    finest = np.full(len(points), np.inf)
+    for camera in cameras:
+        pixel, depth = camera.project(points)
+        inside = (depth > 0) & (pixel >= 0).all(1)
+        inside &= (pixel[:, 0] <= camera.width) & (pixel[:, 1] <= camera.height)
+        size = depth / max(camera.fx, camera.fy)
+        finest = np.where(inside, np.minimum(finest, size), finest)
+    return np.where(np.isfinite(finest), finest, 0.0)
+
+
+def resolved_edges(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the shortest edge that the photos resolve at each point, (n,); 0 where unseen."""
+    return EDGE_PER_PIXEL * footprints(points, cameras)
+
+
+@dataclass(frozen=True)
+class Spacing:
+    """Local thinning radii, sampled at points of the surface."""
+
+    points: np.ndarray
+    """(n, 3) float64."""
+    radii: np.ndarray
+    """(n,) float64."""
+    nominal: float
+    """Radius where the photos do not limit it: the smallest one."""
+    limited: float
+    """Share of the area where the photos limit the radius."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_tree", cKDTree(self.points))
+
+    @classmethod
+    def uniform(cls, radius: float) -> Spacing:
+        """Return the same spacing everywhere."""
+        return cls(np.zeros((1, 3)), np.array([radius]), radius, 0.0)
+
+    def at(self, where: np.ndarray, threads: int = 1) -> np.ndarray:
+        """Return the radius at (m, 3) points; it grows with the distance to samples."""
+        if len(self.points) == 1:
+            return np.full(len(where), self.radii[0])
+        k = min(4, len(self.points))
+        distance, index = self._tree.query(where, k=k, workers=threads)  # type: ignore[attr-defined]
+        weight = 1.0 / (distance**2 + (0.5 * self.radii[index]) ** 2)
+        mean = (weight * self.radii[index]).sum(1) / weight.sum(1)
+        return mean + GRADING / EDGE_PER_RADIUS * np.maximum(distance[:, 0] - mean, 0.0)
+
+
+def footprint_spacing(points: np.ndarray, cameras: Sequence[Camera], radius: float) -> Spacing:
+    """Return a radius everywhere, larger where the photos resolve no edges so short.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Spread evenly over the surface.
+    cameras : sequence of Camera
+    radius : float
+        Thinning radius of the nominal edge length.
+    """
+    edge = EDGE_PER_RADIUS * radius
+    resolved = np.minimum(resolved_edges(points, cameras), LONGEST_SHARE * edge)
+    limited = float(np.mean(resolved > edge)) if len(points) else 0.0
+    if limited == 0.0:
+        return Spacing.uniform(radius)
+    near = cKDTree(points).query(points, k=min(8, len(points)))
+    edges = graded(np.maximum(resolved, edge), *near)
+    return Spacing(points, edges / EDGE_PER_RADIUS, radius, limited)
+
+
+def graded(edges: np.ndarray, distance: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Shorten edges until neighbours differ by at most :data:`GRADING` times their distance.
+
+    Parameters
+    ----------
+    edges : (n,) float64
+    distance, index : (n, k)
+        Nearest neighbours of each point.
+    """
+    result = edges
+    step = GRADING * distance
+    while True:
+        # In both directions: nearest-neighbour relations are not symmetric.
+        lower = np.minimum(result, (result[index] + step).min(1))
+        np.minimum.at(lower, index, lower[:, None] + step)
+        if (lower > 0.99 * result).all():
+            return lower
+        result = lower
+
+
+# -- Cap points: samples of a region's boundary where it cuts the solid, to close the mesh there
+
+
+MAX_CANDIDATES = 1_500_000
+"""Most samples of the region's boundary; finer requests get coarser caps, which are flat anyway."""
+
+OVERSAMPLING = 5.0
+RIM_TOLERANCE_SHARE = 1e-3
+"""Length of the bracket around the rim of a cap, in edge lengths."""
+
+INNER_RADII = 2.0
+"""Spacing inside a cap, in local radii: caps are flat."""
+
+# Corners first, then edges, rims and the interior: the points that define the shape are kept.
+PRIORITY_CORNER, PRIORITY_EDGE, PRIORITY_RIM, PRIORITY_INNER = 0.0, 1.0, 2.0, 4.0
+
+
+@dataclass(frozen=True)
+class Caps:
+    """Occupied points on a region's boundary, thinned."""
+
+    points: np.ndarray
+    """(n, 3) float64."""
+    normals: np.ndarray
+    """(n, 3) float64: outward normal of the face; zero on edges and corners."""
+    radii: np.ndarray
+    """(n,) float64 for :func:`.sampling.thin`."""
+    priority: np.ndarray
+    """(n,) float64 for the same."""
+
+
+def no_caps() -> Caps:
+    """Return empty caps, for a region whose boundary stays open."""
+    return Caps(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+
+
+def cap_points(
+    region: Region,
+    is_empty: IsEmpty,
+    spacing: Spacing,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> Caps:
+    """Sample the region's faces, sharp edges and corners where they lie in the solid.
+
+    Segments between neighbouring occupied and empty samples of one face are bisected; the resulting
+    points form the rim, where the isosurface meets the face.
+
+    Parameters
+    ----------
+    spacing : Spacing
+        Spacing of the surface; inside a cap it grows with the distance to the rim.
+    """
+    radius = max(spacing.nominal, np.sqrt(region.area * OVERSAMPLING / MAX_CANDIDATES))
+    points, normals, face = _face_samples(region, radius, rng)
+    progress.update(0.1, f"sampling the region's boundary ({len(points)} samples)")
+    empty = is_empty(points)
+    rim_in, rim_out, rim_face = _face_crossings(points, empty, face, radius)
+    edge_points, edge_in, edge_out, corner_points = _edge_samples(region, is_empty, radius)
+    progress.update(0.5, "sampling the region's boundary")
+    inside, _ = bisect(
+        np.concatenate([rim_in, edge_in]),
+        np.concatenate([rim_out, edge_out]),
+        is_empty,
+        RIM_TOLERANCE_SHARE * radius,
+        progress.span(0.5, 1.0),
+    )
+    face_normals = region.half_spaces[0]
+    rim, edge_rim = inside[: len(rim_in)], inside[len(rim_in) :]
+    inner = ~empty
+    groups = (
+        (corner_points, None, PRIORITY_CORNER),
+        (edge_rim, None, PRIORITY_CORNER),
+        (edge_points, None, PRIORITY_EDGE),
+        (rim, face_normals[rim_face], PRIORITY_RIM),
+        (points[inner], normals[inner], PRIORITY_INNER),
+    )
+    all_points = np.concatenate([g[0] for g in groups])
+    all_normals = np.concatenate([np.zeros_like(g[0]) if g[1] is None else g[1] for g in groups])
+    priority = np.concatenate([np.full(len(g[0]), g[2]) for g in groups])
+    local = spacing.at(all_points)  # (n,)
+    radii = np.where(priority == PRIORITY_INNER, INNER_RADII * local, local)
+    kept = thin(all_points, all_normals, radii, priority)
+    return Caps(all_points[kept], all_normals[kept], radii[kept], priority[kept])
+
+
+def _face_samples(
+    region: Region, radius: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return thinned samples of the whole boundary, their normals and planar faces."""
+    count = int(min(MAX_CANDIDATES, OVERSAMPLING * region.area / radius**2)) + 16
+    pieces = region.faces()
+    corners = np.concatenate(pieces)  # (t, 3, 3)
+    owner = np.repeat(np.arange(len(pieces)), [len(p) for p in pieces])
+    triangles = np.arange(3 * len(corners)).reshape(-1, 3)
+    points, triangle = sample_triangles(corners.reshape(-1, 3), triangles, count, rng)
+    face = owner[triangle]
+    normals = region.half_spaces[0][face]
+    kept = thin(points, normals, np.full(count, radius), rng.random(count))
+    return points[kept], normals[kept], face[kept]
+
+
+def _face_crossings(
+    points: np.ndarray, empty: np.ndarray, face: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pair occupied with empty neighbours on one planar face."""
+    none = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)
+    occupied, vacant = np.flatnonzero(~empty), np.flatnonzero(empty)
+    if len(occupied) == 0 or len(vacant) == 0:
+        return none
+    pairs = cKDTree(points[occupied]).sparse_distance_matrix(
+        cKDTree(points[vacant]), 1.6 * radius, output_type="coo_matrix"
+    )
+    order = np.lexsort((pairs.col, pairs.row))
+    first, second = occupied[pairs.row[order]], vacant[pairs.col[order]]
+    same = face[first] == face[second]
+    return points[first[same]], points[second[same]], face[first[same]]
+
+
+def _edge_samples(
+    region: Region, is_empty: IsEmpty, radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return occupied points on sharp edges, crossing segments on these, and occupied corners."""
+    rows, owners = [], []
+    for index, (begin, end) in enumerate(region.edges()):
+        steps = max(1, round(float(np.linalg.norm(end - begin)) / radius / 1.2))
+        share = np.linspace(0.0, 1.0, steps + 1)[:, None]  # (steps + 1, 1)
+        rows.append(begin * (1 - share) + end * share)
+        owners.append(np.full(steps + 1, index))
+    points, owner = np.concatenate(rows), np.concatenate(owners)
+    empty = is_empty(points)
+    ends = np.append(True, owner[1:] != owner[:-1]) | np.append(owner[1:] != owner[:-1], True)
+    change = np.flatnonzero((empty[1:] != empty[:-1]) & (owner[1:] == owner[:-1]))
+    low_empty = empty[change]
+    inside = np.where(low_empty, change + 1, change)
+    outside = np.where(low_empty, change, change + 1)
+    corners = np.unique(points[ends & ~empty], axis=0)
+    return points[~empty & ~ends], points[inside], points[outside], corners
+
+
+# -- Candidate surface: a first, coarse isosurface by two-pivot marching tetrahedra ---------------
+#
+# See docs/method.md, section 6.
+
+
+PROBES = 4096
+"""Sample points through the region besides the pivots: a Gaussian as large as the region may have
+both pivots outside it."""
+
+MARGIN_SHARE = 0.02
+"""Gaussians up to this share of the diagonal beyond the region are included, so that the surface
+near the boundary is not the hull of too few pivots."""
+
+HALO_SHARE = 0.5
+"""Pivots farther from the region than this share of its diagonal are left out: the bounding points
+close the triangulation, and the field need not be known there."""
+
+NO_SURFACE_HINT = "Draw the region around something that was photographed."
+
+BRACKET_SHARE = 0.003
+"""Edges are bisected to this share of the region's diagonal; later steps refine the position."""
+
+
+@dataclass(frozen=True)
+class CandidateSurface:
+    """A triangle soup near the isosurface, in the region and slightly beyond it."""
+
+    vertices: np.ndarray
+    """(v, 3) float64."""
+    faces: np.ndarray
+    """(f, 3) int64, facing the empty side."""
+    gaussians: int
+    """Gaussians that reach the region."""
+    pivots: int
+    """Points that were triangulated."""
+
+
+def candidate_surface(
+    arrays: GaussianArrays,
+    region: Region,
+    is_empty: IsEmpty,
+    tolerance: float,
+    seed: int,
+    progress: Progress,
+    depth_samples: DepthSamples | None = None,
+) -> CandidateSurface:
+    """Extract the isosurface on the Delaunay edges of two pivots per Gaussian and depth sample.
+
+    Parameters
+    ----------
+    tolerance : float
+        Length of the bracket on crossing edges; 0 stands for :data:`BRACKET_SHARE`.
+    depth_samples : DepthSamples, optional
+        Of the region: parts about as thin as a pixel are found only by these.
+
+    Raises
+    ------
+    MeshingError
+        No Gaussian reaches the region, or nothing in it is occupied by the solid.
+    """
+    margin = MARGIN_SHARE * region.diagonal
+    is_empty = _within_halo(is_empty, region)
+    cloud = pivot_cloud(arrays, region, is_empty, seed, depth_samples)
+    pivots = cloud.points
+    points = np.concatenate([pivots, bounding_points(pivots, seed)])
+    tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
+    progress.update(0.3, f"evaluating {len(pivots)} pivots")
+    inside = np.zeros(len(points), np.bool_)  # bounding points are empty by definition
+    inside[: len(pivots)] = ~is_empty(pivots)
+    edges, faces = marching_tetrahedra(_near(points, tetrahedra, region, margin), inside)
+    if len(faces) == 0:
+        raise no_surface_error(region)
+    tolerance = tolerance or BRACKET_SHARE * region.diagonal
+    ends = bisect(points[edges[:, 0]], points[edges[:, 1]], is_empty, tolerance,
+                  progress.span(0.6, 1.0))  # fmt: skip
+    vertices = (ends[0] + ends[1]) / 2
+    kept = region.distance(vertices[faces].mean(1)) <= margin
+    if not kept.any():
+        raise no_surface_error(region)
+    return CandidateSurface(vertices, faces[kept], cloud.gaussians, len(pivots))
+
+
+@dataclass(frozen=True)
+class PivotCloud:
+    """Points whose Delaunay edges are searched for the isosurface of a region."""
+
+    points: np.ndarray
+    """(p, 3) float64, all within :func:`halo_bounds`."""
+    gaussians: int
+    """Gaussians that reach the region."""
+    chosen: int
+    """Those of them that contributed pivots."""
+
+
+def pivot_cloud(
+    arrays: GaussianArrays,
+    region: Region,
+    is_empty: IsEmpty,
+    seed: int,
+    depth_samples: DepthSamples | None,
+    *,
+    pivots_of: PivotRule = two_pivots,
+) -> PivotCloud:
+    """Collect pivots, probes and pairs that bracket the visible surface, in and around a region.
+
+    Raises
+    ------
+    MeshingError
+        No Gaussian reaches the region.
+    """
+    own = pivots_and_probes(arrays, region, seed, pivots_of)
+    if depth_samples is None:
+        return own
+    points = np.concatenate(bracket_pairs(depth_samples, is_empty))
+    return replace(own, points=np.concatenate([own.points, _in_halo(points, region)]))
+
+
+def pivots_and_probes(
+    arrays: GaussianArrays,
+    region: Region,
+    seed: int,
+    pivots_of: PivotRule,
+) -> PivotCloud:
+    """Collect pivots and probes alone, in and around a region, without evaluating the field.
+
+    Raises
+    ------
+    MeshingError
+        No Gaussian reaches the region.
+    """
+    margin = MARGIN_SHARE * region.diagonal
+    index = gaussians_reaching(arrays, region, margin)
+    if len(index) == 0:
+        raise no_gaussian_error(region)
+    chosen = representative_gaussians(arrays, index, MAX_PIVOT_GAUSSIANS)
+    pivots = pivots_of(arrays, chosen)
+    near = pivots[region.distance(pivots) <= HALO_SHARE * region.diagonal]
+    points = np.concatenate([near, _probes(region, margin, seed)])
+    return PivotCloud(_in_halo(points, region), len(index), len(chosen))
+
+
+def pivots_alone(arrays: GaussianArrays, region: Region, pivots_of: PivotRule) -> PivotCloud:
+    """Collect the pivots of all Gaussians that reach a region, faint ones too, and nothing else.
+
+    These are the points of the paper (docs/method.md, section 6.1): without samples of depth maps,
+    probes, or a limit on the number of Gaussians. Pivots in the region's halo are kept.
+
+    Raises
+    ------
+    MeshingError
+        No Gaussian reaches the region.
+    """
+    index = gaussians_reaching(arrays, region, MARGIN_SHARE * region.diagonal, faint=True)
+    if len(index) == 0:
+        raise no_gaussian_error(region)
+    return PivotCloud(_in_halo(pivots_of(arrays, index), region), len(index), len(index))
+
+
+def _in_halo(points: np.ndarray, region: Region) -> np.ndarray:
+    low, high = halo_bounds(region)
+    return points[((points >= low) & (points <= high)).all(1)]
+
+
+def halo_bounds(region: Region) -> np.ndarray:
+    """Return the box, (2, 3) float64, of all points whose label matters for a region."""
+    low, high = region.bounds
+    halo = HALO_SHARE * region.diagonal
+    return np.stack([low - halo, high + halo])
+
+
+def _within_halo(is_empty: IsEmpty, region: Region) -> IsEmpty:
+    """Restrict ``is_empty`` to the halo; all other points are empty, as the bounding points are."""
+    low, high = halo_bounds(region)
+
+    def inside_only(points: np.ndarray) -> np.ndarray:
+        near = ((points >= low) & (points <= high)).all(1)
+        empty = np.ones(len(points), np.bool_)
+        empty[near] = is_empty(points[near])
+        return empty
+
+    return inside_only
+
+
+def no_gaussian_error(region: Region) -> MeshingError:
+    """Return the error of a region that no Gaussian reaches."""
+    return MeshingError(f"No Gaussian reaches region {region.name!r}.", NO_SURFACE_HINT)
+
+
+def no_surface_error(region: Region) -> MeshingError:
+    """Return the error of a region without a surface."""
+    return MeshingError(f"Region {region.name!r} holds no surface.", NO_SURFACE_HINT)
+
+
+def _probes(region: Region, margin: float, seed: int) -> np.ndarray:
+    """Return about :data:`PROBES` jittered lattice points in and just around the region."""
+    low, high = region.bounds[0] - margin, region.bounds[1] + margin
+    side = float(np.prod(high - low) / PROBES) ** (1 / 3)
+    counts = np.maximum(1, np.ceil((high - low) / side)).astype(int)
+    lattice = np.stack(np.meshgrid(*(np.arange(c) for c in counts), indexing="ij"), -1)
+    lattice = lattice.reshape(-1, 3)  # (k, 3)
+    jitter = np.random.default_rng(seed).random(lattice.shape)
+    points = low + (lattice + jitter) / counts * (high - low)
+    return points[region.distance(points) <= margin]
+
+
+def _near(points: np.ndarray, tetrahedra: np.ndarray, region: Region, margin: float) -> np.ndarray:
+    """Drop the tetrahedra that lie wholly beyond one face of the region."""
+    normals, offsets = region.half_spaces
+    kept = np.ones(len(tetrahedra), np.bool_)
+    for normal, offset in zip(normals, offsets, strict=True):
+        beyond = (points - region.center) @ normal - offset > margin
+        kept &= ~beyond[tetrahedra].all(1)
+    return tetrahedra[kept]
+
+
+# -- Sample evenly spaced points on the isosurface, starting from a candidate surface -------------
+#
+# See docs/method.md, section 7.2.
+
+
+KIND_SURFACE, KIND_CAP, KIND_JUMP = 0, 1, 2
+"""On the isosurface; on the region's boundary; where vacancy jumps across 0.5 (at the limit of what
+the cameras see)."""
+
+PRIORITY_SURFACE = 3.0
+"""Between the rims and the inner part of the caps; see region_caps."""
+
+POINT_OVERSAMPLING = 20.0
+"""Candidates per point before the first thinning."""
+FIRST_THINNING = 0.4
+"""Candidates closer than this share of the radius are not projected. These two constants determine
+how even the points are (and surface_sampling.POINTS_PER_SQUARE)."""
+MAX_BLOCK = 2_000_000
+"""Candidates drawn at a time, to limit memory."""
+FOOTPRINT_SAMPLES = 20_000
+"""Samples of the candidate surface at which the photos' pixel footprint is evaluated."""
+REPORTED_SHARE = 0.1
+"""The report notes that the photos limit the edges where they do so on more than this share of the
+surface."""
+
+MAX_PROJECTION_STEPS = 14
+"""Nearly all points need two or three; each further step evaluates all cameras again."""
+
+SEARCH_SHARES = (0.25, -0.25, 0.5, -0.5, 1.0, -1.0)
+"""Offsets along the normal, in radii, at which points that did not converge search a crossing."""
+SURFACE_POINTS_BRACKET_SHARE = 1e-3
+"""A found crossing is bracketed to this share of the radius."""
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points to become vertices of the mesh."""
+
+    points: np.ndarray
+    """(n, 3) float64."""
+    normals: np.ndarray
+    """(n, 3) float64 unit vectors towards the empty side; 0 on edges of the region."""
+    kind: np.ndarray
+    """(n,) uint8."""
+    radii: np.ndarray
+    """(n,) float64 local thinning radius."""
+    radius: float
+    """Nominal thinning radius, the smallest."""
+    notes: tuple[ReportWarning, ...]
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _ProjectedPoints:
+    """Candidates that converged to a surface."""
+
+    points: np.ndarray
+    """(n, 3) float64."""
+    normals: np.ndarray
+    """(n, 3) float64."""
+    kind: np.ndarray
+    """(n,) uint8."""
+    evaluations: int
+
+
+class SurfaceSampler:
+    """Samples a candidate surface and projects the points onto the isosurface."""
+
+    def __init__(
+        self,
+        vacancy: Any,
+        vectors: Any,
+        region: Region,
+        surface: CandidateSurface,
+        threads: int,
+        *,
+        cameras: Sequence[Camera] = (),
+    ) -> None:
+        """Limit the spacing to what ``cameras`` resolve, if any are given."""
+        self._vacancy, self._vectors, self._region = vacancy, vectors, region
+        self._cameras = cameras
+        self._vertices = surface.vertices
+        centers = surface.vertices[surface.faces].mean(1)
+        self._faces = surface.faces[region.contains(centers, 0.0)]
+        if len(self._faces) == 0:  # the whole surface lies in the margin
+            self._faces = surface.faces
+        self._normals, areas = normals_and_areas(self._vertices, self._faces)
+        self.area = float(areas.sum())
+        self._threads = threads
+
+    def spacing(
+        self, request: ResolutionRequest, rng: np.random.Generator
+    ) -> tuple[Spacing, tuple[ReportWarning, ...]]:
+        """Return the local radii that meet a request, and notes for the report.
+
+        Raises
+        ------
+        ResourceError
+            The request needs more points than the limit.
+        """
+        spacing, notes = self._spacing(request, rng)
+        check_expected_points(self._expected(spacing)[1], request)
+        return spacing, notes
+
+    def _expected(self, spacing: Spacing) -> tuple[np.ndarray, float]:
+        """Return the radius at each face as a share of the nominal one, and the expected points."""
+        share = spacing.at(self._vertices[self._faces].mean(1), self._threads) / spacing.nominal
+        _, areas = normals_and_areas(self._vertices, self._faces)
+        weight = float((areas * share**-2.0).sum())
+        return share, POINTS_PER_SQUARE * weight / spacing.nominal**2
+
+    def sample(
+        self,
+        request: ResolutionRequest,
+        rng: np.random.Generator,
+        progress: Progress,
+        *,
+        spacing: Spacing | None = None,
+        owned: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> SurfacePoints:
+        """Return surface, jump and cap points at the requested density.
+
+        Parameters
+        ----------
+        spacing : Spacing, optional
+            Precomputed by :meth:`spacing` for the whole surface.
+        owned : callable, optional
+            Maps (n, 3) points to (n,) bool: only these are kept, and no cap points are made. For
+            tiles, whose boundary does not bound the solid.
+
+        Raises
+        ------
+        ResourceError
+            The request needs more points than the limit.
+        """
+        notes: tuple[ReportWarning, ...] = ()
+        if spacing is None:
+            spacing, notes = self._spacing(request, rng)
+        progress.update(0.0, "sampling the surface")
+        share, expected = self._expected(spacing)
+        check_expected_points(expected, request)
+        points, face = self._candidates(
+            spacing.nominal, share, int(POINT_OVERSAMPLING * expected) + 64, rng
+        )
+        progress.update(0.1, f"projecting {len(points)} points onto the surface")
+        radii = spacing.at(points, self._threads)
+        projected = self._project(points, face, radii, progress.span(0.1, 0.8))
+        moved, normals, kind = projected.points, projected.normals, projected.kind
+        caps = no_caps()
+        if owned is None:
+            caps = cap_points(
+                self._region, self._vacancy.is_empty, spacing, rng, progress.span(0.8, 1.0)
+            )
+        else:
+            mine = owned(moved)
+            moved, normals, kind = moved[mine], normals[mine], kind[mine]
+        radii = spacing.at(moved, self._threads)
+        # Jumps come last among surface points: points on the isosurface are preferred.
+        priority = PRIORITY_SURFACE + 0.5 * (rng.random(len(moved)) + (kind == KIND_JUMP))
+        all_points = np.concatenate([caps.points, moved])
+        normals = np.concatenate([caps.normals, normals])
+        radii = np.concatenate([caps.radii, radii])
+        kept = thin(all_points, normals, radii, np.concatenate([caps.priority, priority]))
+        kinds = np.concatenate([np.full(len(caps.points), KIND_CAP, np.uint8), kind])[kept]
+        figures = {
+            "candidates": len(points),
+            "dropped_candidates": len(points) - len(moved),
+            "surface_points": int((kinds == KIND_SURFACE).sum()),
+            "jump_points": int((kinds == KIND_JUMP).sum()),
+            "cap_points": int((kinds == KIND_CAP).sum()),
+            "projection_evaluations": projected.evaluations,
+            "shortest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].min(initial=np.inf)),
+            "longest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].max(initial=0.0)),
+            "limited_by_photos_share": spacing.limited,
+        }
+        return SurfacePoints(
+            all_points[kept], normals[kept], kinds, radii[kept], spacing.nominal, notes, figures
+        )
+
+    def _spacing(
+        self, request: ResolutionRequest, rng: np.random.Generator
+    ) -> tuple[Spacing, tuple[ReportWarning, ...]]:
+        """Choose the local radii, and note how much of the surface the photos limit."""
+        radius = thinning_radius(request, self.area, self._region)
+        if len(self._cameras) == 0:
+            return Spacing.uniform(radius), ()
+        points, _ = sample_triangles(self._vertices, self._faces, FOOTPRINT_SAMPLES, rng)
+        spacing = footprint_spacing(points, self._cameras, radius)
+        notes: tuple[ReportWarning, ...] = ()
+        if spacing.limited > REPORTED_SHARE:
+            share = f"On {spacing.limited:.0%} of the surface"
+            text = f"{share} the photos resolve no shorter edges; uniform spacing would make them."
+            notes = (ReportWarning("photos-limit-edges", text),)
+        return spacing, notes
+
+    def _project(
+        self, points: np.ndarray, face: np.ndarray, radii: np.ndarray, progress: Progress
+    ) -> _ProjectedPoints:
+        """Project points of the candidate surface onto the isosurface or a jump of vacancy."""
+        normals = self._normals_at(points, self._normals[face])
+        found = project_to_isosurface(
+            points,
+            self._vacancy,
+            self._vectors,
+            progress.span(0.0, 0.8),
+            max_steps=MAX_PROJECTION_STEPS,
+        )
+        kind = np.full(len(points), KIND_SURFACE, np.uint8)
+        lost = np.flatnonzero(~found.on_surface)
+        moved = found.points.copy()
+        searched, kind_of_lost = self._search_along_normals(
+            points[lost], normals[lost], radii[lost], progress.span(0.8, 1.0)
+        )
+        moved[lost] = searched
+        good = found.on_surface.copy()
+        good[lost] = kind_of_lost >= 0
+        kind[lost] = np.maximum(kind_of_lost, 0)
+        good &= self._region.contains(moved, 0.0)
+        normals = self._normals_at(moved[good], normals[good])
+        return _ProjectedPoints(moved[good], normals, kind[good], int(found.vacancy_evaluations))
+
+    def _candidates(
+        self, radius: float, share: np.ndarray, count: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Draw ``count`` candidates and thin them, block by block.
+
+        Returns
+        -------
+        points : (n, 3) float64
+        face : (n,) int64
+        """
+        _, areas = normals_and_areas(self._vertices, self._faces)
+        weight = areas * share**-2.0  # (f,)
+        blocks = -(-count // MAX_BLOCK)
+        bounds = balanced_bounds(weight, blocks)
+        points, face = [], []
+        for begin, end in itertools.pairwise(bounds.tolist()):
+            part = int(count * weight[begin:end].sum() / weight.sum()) + 1
+            drawn, where = sample_triangles(
+                self._vertices, self._faces[begin:end], part, rng, share[begin:end] ** -2.0
+            )
+            kept = self._thinned(drawn, where + begin, radius * share, rng)
+            points.append(drawn[kept])
+            face.append(where[kept] + begin)
+        all_points, all_faces = np.concatenate(points), np.concatenate(face)
+        if len(points) > 1:  # blocks touch
+            kept = self._thinned(all_points, all_faces, radius * share, rng)
+            all_points, all_faces = all_points[kept], all_faces[kept]
+        return all_points, all_faces
+
+    def _thinned(
+        self, points: np.ndarray, face: np.ndarray, radii: np.ndarray, rng: np.random.Generator
+    ) -> np.ndarray:
+        priority = rng.random(len(points))
+        return thin(points, self._normals[face], FIRST_THINNING * radii[face], priority)
+
+    def _normals_at(self, points: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+        """Return the field's outward directions, or the triangle's normal where there is none or
+        the two disagree (the far side of a thin wall, a wrongly oriented Gaussian)."""
+        outward = self._vectors.evaluate(points).outward  # (n, 3) unit or 0
+        agree = (outward * fallback).sum(1) > 0  # false for NaN
+        return np.where(agree[:, None], outward, fallback)
+
+    def _search_along_normals(
+        self, points: np.ndarray, normals: np.ndarray, radii: np.ndarray, progress: Progress
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Search a crossing along the normal where the projection found none.
+
+        Returns
+        -------
+        points : (k, 3)
+            Midpoint of the bracket.
+        kind : (k,) int
+            :data:`KIND_SURFACE`, :data:`KIND_JUMP`, or -1 without a crossing.
+        """
+        kind = np.full(len(points), -1)
+        moved = points.copy()
+        if len(points) == 0:
+            return moved, kind
+        start = self._vacancy.is_empty(points)
+        other, pending = points.copy(), np.arange(len(points))
+        for share in SEARCH_SHARES:
+            step = share * radii[pending, None]
+            trial = points[pending] + step * normals[pending]
+            hit = self._vacancy.is_empty(trial) != start[pending]
+            other[pending[hit]] = trial[hit]
+            kind[pending[hit]] = KIND_JUMP
+            pending = pending[~hit]
+        rows = np.flatnonzero(kind >= 0)
+        empty = start[rows, None]
+        inside, outside = bisect(
+            np.where(empty, other[rows], points[rows]),
+            np.where(empty, points[rows], other[rows]),
+            self._vacancy.is_empty,
+            SURFACE_POINTS_BRACKET_SHARE * float(radii.min()),
+            progress,
+        )
+        moved[rows] = (inside + outside) / 2
+        value = self._vacancy.vacancy(moved[rows]).vacancy
+        exact = np.abs(value - limits.ISO_LEVEL) <= TOLERANCE
+        kind[rows[exact]] = KIND_SURFACE
+        return moved, kind

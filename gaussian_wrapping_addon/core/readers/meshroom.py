@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Read ``cameras.sfm`` and ``sfm.json`` of Meshroom (AliceVision), and landmarks if there are any.
+
+Numbers are written as text. A pose's rotation leads from world to camera (x right, y down, z
+forward) and is written column by column; ``center`` is the camera's. AliceVision counts pixels from
+the first one's centre: half a pixel is added here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import limits
+from ..errors import ParseError
+from ..files import read_json
+from .program_values import (
+    AGAIN,
+    PhotoList,
+    checked_lens,
+    fisheye_lens,
+    image_size,
+    number,
+    numbers,
+    pose_at,
+    relative_names,
+    rotation,
+    unsupported,
+)
+from .source_model import Brown, LensCamera, SourceModel
+
+KIND = "Meshroom cameras"
+
+_MAX_BYTES = 64 * 1024 * 1024
+"""A landmark takes about 0.6 kB with its observations: 256 MB are 400 000 of them."""
+_JSON_NAMES = ("sfm.json", "sfmdata.json")
+"""In small letters; other programs have an ``sfm_data.json`` of another content."""
+_HALF_PIXEL = 0.5
+_OTHER_LENS = (
+    "Choose the camera type pinhole, radial3, brown or fisheye in Meshroom, and solve again."
+)
+_OLD_TYPES = {
+    "pinhole": "none", "radial1": "radialk1", "radial3": "radialk3", "brown": "brown",
+    "fisheye": "fisheye4", "fisheye4": "fisheye4",
+}  # fmt: skip
+"""Before version 1.2.6 the type of an intrinsic named its distortion."""
+_COUNTS = {"none": 0, "radialk1": 1, "radialk3": 3, "brown": 5, "fisheye4": 4}
+
+
+def is_meshroom(path: Path) -> bool:
+    """Whether a file is named as the program names its cameras."""
+    name = path.name.lower()
+    return path.is_file() and (name.endswith(".sfm") or name in _JSON_NAMES)
+
+
+def read_meshroom(path: Path) -> SourceModel:
+    """Read views with their intrinsics and poses, and landmarks.
+
+    Raises
+    ------
+    ParseError
+        Names the entry, such as ``intrinsics[0].type``.
+    DatasetError
+        No photo is usable.
+    """
+    values = read_json(path, most_bytes=_MAX_BYTES, follow_links=True)
+    if not isinstance(values, dict) or "views" not in values:
+        raise ParseError(path, "top level", "an object with views was expected.", AGAIN)
+    version = tuple(
+        int(number(path, "version", part)) for part in _list(path, values, "version") or (1, 0, 0)
+    )
+    views = _list(path, values, "views")
+    photos = PhotoList(path)
+    photos.check_count("views", len(views))
+    poses = _poses(path, _list(path, values, "poses"))
+    intrinsics = {
+        str(entry.get("intrinsicId")): (f"intrinsics[{i}]", entry)
+        for i, entry in enumerate(_list(path, values, "intrinsics"))
+    }
+    lenses: dict[str, LensCamera] = {}
+    names = relative_names(str(view.get("path", "")) for view in views)
+    for i, view in enumerate(views):
+        name = names[str(view.get("path", ""))]
+        pose_id, lens_id = str(view.get("poseId")), str(view.get("intrinsicId"))
+        if pose_id not in poses:
+            photos.leave_out(name, "not being placed")
+            continue
+        if "rigId" in view and str(view["rigId"]) != str(2**32 - 1):
+            raise unsupported(path, f"views[{i}].rigId", "a rig", "Solve without rigs.")
+        if lens_id not in lenses:
+            if lens_id not in intrinsics:
+                raise ParseError(
+                    path, f"views[{i}].intrinsicId", "not among the intrinsics.", AGAIN
+                )
+            lenses[lens_id] = _lens(path, *intrinsics[lens_id], version)
+        photos.add(name, lenses[lens_id], poses[pose_id])
+    usable = photos.finished()
+    points, colors = _points(path, _list(path, values, "structure"))
+    facts = {
+        "views": len(views),
+        "camera_models": sorted({lens.model for lens in lenses.values()}),
+        "points_in_model": len(points),
+    }
+    return SourceModel(KIND, usable, points, colors, tuple(photos.warnings), facts)
+
+
+def _list(path: Path, values: dict[str, Any], key: str) -> list[Any]:
+    """Return a list of the file, empty where it is missing or the text that stands for none."""
+    found = values.get(key, [])
+    if found == "":
+        return []
+    if not isinstance(found, list):
+        raise ParseError(path, key, "a list was expected.", AGAIN)
+    if key != "version":
+        for i, entry in enumerate(found):
+            if not isinstance(entry, dict):
+                raise ParseError(path, f"{key}[{i}]", "an object was expected.", AGAIN)
+    return found
+
+
+def _poses(path: Path, entries: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Return (3, 4) cam_from_world of each pose's number."""
+    poses = {}
+    for i, entry in enumerate(entries):
+        place = f"poses[{i}].pose.transform"
+        pose = entry.get("pose")
+        transform = pose.get("transform") if isinstance(pose, dict) else None
+        if not isinstance(transform, dict):
+            raise ParseError(path, place, "an object was expected.", AGAIN)
+        written = numbers(path, f"{place}.rotation", transform.get("rotation"), 9)
+        turned = rotation(path, f"{place}.rotation", written.reshape(3, 3).T)
+        center = numbers(path, f"{place}.center", transform.get("center"), 3)
+        poses[str(entry.get("poseId"))] = pose_at(turned, center)
+    return poses
+
+
+def _lens(path: Path, place: str, entry: dict[str, Any], version: tuple[int, ...]) -> LensCamera:
+    width, height = image_size(path, place, entry.get("width"), entry.get("height"))
+    written = str(entry.get("type", "pinhole"))
+    kind = (
+        str(entry["distortionType"]) if "distortionType" in entry else _OLD_TYPES.get(written, "")
+    )
+    if written not in _OLD_TYPES or kind not in _COUNTS:
+        raise unsupported(path, f"{place}.type", f"the lens {written} {kind}".strip(), _OTHER_LENS)
+    if str(entry.get("undistortionType", "none")) != "none":
+        raise unsupported(path, f"{place}.undistortionType", "a lens grid", _OTHER_LENS)
+    focal = _focal(path, place, entry, version, width)
+    principal = numbers(path, f"{place}.principalPoint", entry.get("principalPoint"), 2)
+    if version >= (1, 2, 1):
+        principal = principal + np.array([0.5 * width, 0.5 * height])
+    center = float(principal[0]) + _HALF_PIXEL, float(principal[1]) + _HALF_PIXEL
+    params = entry.get("distortionParams") or []
+    k = numbers(path, f"{place}.distortionParams", params, _COUNTS[kind]).tolist()
+    if kind == "fisheye4":
+        lens = fisheye_lens(width, height, focal, center, (k[0], k[1], k[2], k[3]))
+    elif kind == "brown":
+        brown = Brown(k[0], k[1], k[2], p1=k[3], p2=k[4])
+        lens = brown.lens(width, height, focal, center)
+    else:
+        lens = Brown(*k).lens(width, height, focal, center)
+    return checked_lens(path, place, lens)
+
+
+def _focal(
+    path: Path, place: str, entry: dict[str, Any], version: tuple[int, ...], width: int
+) -> tuple[float, float]:
+    """Return the focal lengths in pixels, which versions of the file write in four ways."""
+    if version < (1, 2, 2):
+        written = entry.get("pxFocalLength")
+        if isinstance(written, list):
+            fx, fy = numbers(path, f"{place}.pxFocalLength", written, 2)
+            return float(fx), float(fy)
+        fx = number(path, f"{place}.pxFocalLength", written)
+        return fx, fx
+    length = number(path, f"{place}.focalLength", entry.get("focalLength"))
+    sensor = number(path, f"{place}.sensorWidth", entry.get("sensorWidth", "36"))
+    ratio = number(path, f"{place}.pixelRatio", entry.get("pixelRatio", "1"))
+    if not (length > 0 and sensor > 0 and ratio > 0):
+        raise ParseError(path, f"{place}.focalLength", "a length is not positive.", AGAIN)
+    fx = length / sensor * width
+    return fx, fx * ratio if version >= (1, 2, 5) else fx / ratio
+
+
+def _points(path: Path, entries: Sequence[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return (n, 3) float64 positions and (n, 3) uint8 colours of the landmarks."""
+    if len(entries) > limits.MAX_POINTS:
+        raise ParseError(path, "structure", f"{len(entries)} points are too many.", AGAIN)
+    points = np.zeros((len(entries), 3))
+    colors = np.full((len(entries), 3), 128, np.uint8)
+    for i, entry in enumerate(entries):
+        points[i] = numbers(path, f"structure[{i}].X", entry.get("X"), 3)
+        if "color" in entry:
+            color = numbers(path, f"structure[{i}].color", entry["color"], 3)
+            colors[i] = color.clip(0, 255).astype(np.uint8)
+    return points, colors

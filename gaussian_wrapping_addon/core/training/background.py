@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Train on masked photos as empty space: composite render and photo over a random background.
+
+With ``mask_mode="ignore"`` masked pixels enter no loss and may show anything. With ``"background"``
+the space behind them must be empty: over a colour that changes every iteration, no Gaussian can
+imitate the background, so that only transparency lowers the loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from .. import limits
+from ..errors import UsageError
+from ..parallel import ArrayStore
+from ..scene.camera import Camera
+
+MIN_SHARE = 0.75
+"""Points of the object lie inside its mask in every photo; this tolerates some bad masks."""
+
+
+def draw_background(random: np.random.Generator) -> np.ndarray:
+    """Return a random colour (3,) float32 in [0, 1); three numbers are drawn."""
+    return random.random(3).astype(np.float32)
+
+
+def composited(
+    color: np.ndarray,
+    alpha: np.ndarray,
+    photo: np.ndarray,
+    mask: np.ndarray | None,
+    background: np.ndarray,
+    *,
+    store: ArrayStore | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Composite render and photo over a background colour, to be compared without a mask.
+
+    Parameters
+    ----------
+    color : (h, w, 3) float32 or float64
+        Render, blended over black (``sum w c``).
+    alpha : (h, w), the same type
+    photo : (h, w, 3) uint8, or floats in [0, 1]
+    mask : (h, w) bool, optional
+        False where the photo must be empty. Without it, the photo is unchanged.
+    background : (3,)
+        In [0, 1].
+    store : ArrayStore, optional
+        Memory for both, which are then valid until the next call with it.
+
+    Returns
+    -------
+    image : (h, w, 3), of the colour's type
+        ``color + (1 - alpha) background``.
+    target : (h, w, 3), the same type
+        The photo inside the mask, the background elsewhere.
+
+    Raises
+    ------
+    UsageError
+        If the shapes differ.
+    """
+    color, alpha = np.asarray(color), np.asarray(alpha)
+    if (
+        color.shape != np.shape(photo)
+        or alpha.shape != color.shape[:2]
+        or (mask is not None and np.shape(mask) != alpha.shape)
+    ):
+        raise UsageError(
+            f"Render {color.shape}, alpha {alpha.shape}, photo {np.shape(photo)} and mask differ "
+            "in size.",
+            "Use the images of one camera.",
+        )
+    behind = np.asarray(background, color.dtype)
+    image, target = (_take(store, name, color) for name in ("over background", "target"))
+    np.multiply((1 - alpha)[..., None], behind, out=image)  # (h, w, 3)
+    image += color
+    white = 255.0 if np.asarray(photo).dtype == np.uint8 else 1.0
+    np.multiply(photo, color.dtype.type(1.0 / white), out=target, casting="unsafe")
+    if mask is not None:
+        target[~np.asarray(mask, np.bool_)] = behind
+    return image, target
+
+
+def background_gradient(by_image: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Return the gradient of :func:`composited` on alpha (h, w); on colour it is ``by_image``."""
+    return -(by_image @ np.asarray(background, by_image.dtype))
+
+
+def inside_masks(
+    points: np.ndarray,
+    cameras: Sequence[Camera],
+    masks: Iterable[np.ndarray | None],
+    min_share: float = MIN_SHARE,
+) -> np.ndarray:
+    """Tell which points lie inside the masks in a sufficient share of the photos.
+
+    Other points would initialise Gaussians in empty space, and would extend an automatic region
+    over what was masked out.
+
+    Parameters
+    ----------
+    points : (n, 3)
+        Scene frame.
+    cameras : sequence of Camera
+    masks : iterable of (h, w) bool or None
+        Of the cameras' sizes; ``None`` masks nothing. One is held at a time.
+    min_share : float
+        Share of the cameras with the point in their image whose masks must contain it; with 0 one
+        of them suffices.
+
+    Returns
+    -------
+    (n,) bool
+        False also for points outside all images.
+
+    Raises
+    ------
+    UsageError
+        Cameras and masks differ in number or size.
+    """
+    points = np.asarray(points, np.float64).reshape(-1, 3)
+    held, inside = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
+    count = 0
+    for count, mask in enumerate(masks, start=1):
+        if count > len(cameras):
+            break
+        camera = cameras[count - 1]
+        size = (camera.height, camera.width)
+        if mask is not None and mask.shape != size:
+            raise UsageError(
+                f"The mask of {camera.name} is {mask.shape}, its camera {size}.",
+                "Use a mask of the camera's size.",
+            )
+        rows, columns, _, seen = pixels_of(points, camera)
+        held[seen] += 1
+        inside[seen] += 1 if mask is None else mask[rows, columns]
+    if count != len(cameras):
+        raise UsageError("The numbers of cameras and masks differ.", "Give one mask a camera.")
+    return (inside > 0) & (inside >= min_share * held)
+
+
+def pixels_of(
+    points: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return rows, columns and depths (m,) of the points in an image, and their indices (m,)."""
+    where, depth = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        held = (depth > limits.NEAR_Z) & (where >= 0).all(axis=1)
+        held &= (where[:, 0] < camera.width) & (where[:, 1] < camera.height)
+    seen = np.nonzero(held)[0]
+    column, row = np.floor(where[seen]).astype(np.int64).T
+    return row, column, depth[seen], seen
+
+
+def _take(store: ArrayStore | None, name: str, like: np.ndarray) -> np.ndarray:
+    if store is None:
+        return np.empty(like.shape, like.dtype)
+    return store.take(f"{name} {like.dtype}", like.shape, like.dtype)

@@ -1,0 +1,523 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Gain and offset per photo."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..compiled import kernel
+from ..errors import UsageError
+from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
+
+# -- Adam for values of single photos: exposures, camera poses ------------------------------------
+#
+# A step moves the values of one photo only, so that each photo has its own moments and count of
+# steps, and the rate follows from how many turns a photo has.
+
+
+BETAS = (0.9, 0.99)
+"""Decay rates of the moments. A photo has only some dozens of steps in a short run, and its
+gradient, a mean over all its pixels, has little noise: a shorter memory than 0.999 works better."""
+
+_STATE = ("first", "second", "steps")
+
+
+def photo_rate(
+    iteration: int,
+    iterations: int,
+    photos: int,
+    *,
+    travel: float,
+    bounds: tuple[float, float],
+    last_share: float,
+) -> float:
+    """Return the learning rate of an iteration.
+
+    Parameters
+    ----------
+    photos : int
+        Number of photos that take turns.
+    travel : float
+        Total of a photo's steps if its rate stayed at the first one.
+    bounds : (float, float)
+        Smallest and largest first rate.
+    last_share : float
+        Ratio of the last rate to the first; between them the rate falls log-linearly.
+    """
+    turns = max(1.0, iterations / max(1, photos))
+    first = min(bounds[1], max(bounds[0], travel / turns))
+    return first * last_share ** min(1.0, iteration / max(1, iterations))
+
+
+class PhotoAdam:
+    """Moments of the values of all photos.
+
+    Parameters
+    ----------
+    count : int
+        Number of the scene's views.
+    values : int
+        Number of values per view.
+    dtype : numpy dtype
+        Of the moments.
+    epsilon : float
+        Added to the root of the second moment.
+    """
+
+    def __init__(self, count: int, values: int, dtype: type[np.floating], epsilon: float) -> None:
+        self.first = np.zeros((count, values), dtype)
+        self.second = np.zeros((count, values), dtype)
+        self.steps = np.zeros(count, np.int64)
+        self._dtype, self._epsilon = dtype, epsilon
+
+    def step(self, view: int, gradient: np.ndarray, rate: float) -> np.ndarray:
+        """Take in a photo's (values,) gradient; return the (values,) float64 to subtract."""
+        gradient = gradient.astype(self._dtype)
+        self.steps[view] += 1
+        taken = int(self.steps[view])
+        shares = [self._dtype(1.0 - beta) for beta in BETAS]
+        self.first[view] += shares[0] * (gradient - self.first[view])
+        self.second[view] += shares[1] * (gradient**2 - self.second[view])
+        mean = self.first[view].astype(np.float64) / (1.0 - BETAS[0] ** taken)
+        size = np.sqrt(self.second[view].astype(np.float64) / (1.0 - BETAS[1] ** taken))
+        return rate * mean / (size + self._epsilon)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of the arrays that the next step depends on, by name."""
+        return {name: getattr(self, name).copy() for name in _STATE}
+
+    def load(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take over arrays of :meth:`to_arrays`.
+
+        Raises
+        ------
+        KeyError, ValueError
+            An array is missing, or its shape or type is another.
+        """
+        for name in _STATE:
+            own, given = getattr(self, name), arrays[name]
+            if given.shape != own.shape or given.dtype != own.dtype:
+                raise ValueError(f"{name} of the photos' steps: {given.dtype} {given.shape}")
+            own[...] = given
+
+
+# -- Kernels of the trained exposure: an affine map per colour channel and its gradients ----------
+
+
+@kernel(fast=True)
+def apply_rows(
+    begin: int, end: int, color: Any, alpha: Any, gains: Any, offsets: Any, out: Any
+) -> None:
+    """Write ``gains color + offsets alpha`` of rows; an ``alpha`` without rows stands for 1."""
+    with_alpha = alpha.shape[0] > 0
+    red, green, blue = gains[0], gains[1], gains[2]
+    for y in range(begin, end):
+        for x in range(color.shape[1]):
+            cover = alpha[y, x] if with_alpha else color.dtype.type(1)
+            out[y, x, 0] = red * color[y, x, 0] + offsets[0] * cover
+            out[y, x, 1] = green * color[y, x, 1] + offsets[1] * cover
+            out[y, x, 2] = blue * color[y, x, 2] + offsets[2] * cover
+
+
+@kernel(fast=True)
+def backward_rows(
+    begin: int, end: int, color: Any, alpha: Any, by_out: Any, gains: Any, offsets: Any,
+    by_color: Any, by_alpha: Any, sums: Any,
+) -> None:  # fmt: skip
+    """Write the gradients on colour and alpha, and each row's six sums for gains and offsets.
+
+    ``sums[y]`` = sums over the row of ``by_out color`` (3) and ``by_out alpha`` (3), in float64:
+    a row is summed by one thread, so that the total does not depend on the number of threads.
+    """
+    with_alpha = alpha.shape[0] > 0
+    for y in range(begin, end):
+        gain_r = gain_g = gain_b = 0.0
+        offset_r = offset_g = offset_b = 0.0
+        for x in range(color.shape[1]):
+            cover = alpha[y, x] if with_alpha else color.dtype.type(1)
+            r, g, b = by_out[y, x, 0], by_out[y, x, 1], by_out[y, x, 2]
+            gain_r += r * color[y, x, 0]
+            gain_g += g * color[y, x, 1]
+            gain_b += b * color[y, x, 2]
+            offset_r += r * cover
+            offset_g += g * cover
+            offset_b += b * cover
+            by_color[y, x, 0] = gains[0] * r
+            by_color[y, x, 1] = gains[1] * g
+            by_color[y, x, 2] = gains[2] * b
+            if with_alpha:
+                by_alpha[y, x] = offsets[0] * r + offsets[1] * g + offsets[2] * b
+        sums[y, 0], sums[y, 1], sums[y, 2] = gain_r, gain_g, gain_b
+        sums[y, 3], sums[y, 4], sums[y, 5] = offset_r, offset_g, offset_b
+
+
+# -- Trained exposure of each photo: a gain and an offset per colour channel ----------------------
+#
+# See docs/method.md, section 1.6.
+#
+# The method's ``exp(a) I + b`` has one gain and one offset per photo. Cameras in automatic mode
+# also change the white balance, so here every channel has its own. The offset is necessary: with
+# the sRGB curve ``s = 1.055 L^(1/2.4) - 0.055``, light ``L`` times ``g`` maps ``s`` exactly to
+# ``k s + 0.055 (k - 1)`` with ``k = g^(1/2.4)``, which a gain alone cannot fit in dark parts.
+#
+# The corrected image enters the whole colour loss. In the method, SSIM is computed on the raw
+# render; its luminance and contrast terms then demand a different brightness of the same
+# Gaussians for every photo, which is the contradiction that the exposure removes.
+#
+# The Gaussians have the mean exposure of the training photos: the means over these of all log
+# gains and of all offsets (at middle grey) are held at 0; otherwise colours and exposures could
+# drift against each other.
+
+
+SRGB_PEDESTAL = 0.055
+"""Offset of the sRGB curve: display values plus this are a power of the light."""
+
+PIVOT = 0.5
+"""Display value about which gains act: an offset then shifts the mean of a typical image and a gain
+its contrast. This decorrelates them, which helps Adam, as it scales every value separately. Middle
+grey is also the value that zero means leave unchanged."""
+
+REFERENCE_RATE = 1e-3
+"""Learning rate of docs/method.md, section 1.4."""
+
+TRAVEL = 1.5
+"""Total change that a short run's first rate allows over all steps of a photo; as the rate decays,
+it is 0.6. Light altered by a factor of 1.35 either way is a log gain of 0.13."""
+
+LARGEST_RATE = 0.02
+LAST_SHARE = 0.1
+"""Ratio of the last rate to the first: Adam's steps are about as large as its rate, and the last
+ones remain as an error of colour."""
+
+MAX_LOG_GAIN = 1.5
+"""Bound of the log gains; larger ones stem from photos without content, not from exposure."""
+MAX_OFFSET = 1.0
+
+EPSILON = 1e-15
+
+_NO_ALPHA = {np.dtype(t): np.zeros((0, 0), t) for t in (np.float32, np.float64)}
+
+
+def exposure_rate(iteration: int, iterations: int, photos: int) -> float:
+    """Return the learning rate of an iteration: :data:`TRAVEL` over a photo's steps, decaying.
+
+    Never below :data:`REFERENCE_RATE` nor above :data:`LARGEST_RATE` at the start; then log-linear
+    to :data:`LAST_SHARE` of that.
+    """
+    return photo_rate(
+        iteration,
+        iterations,
+        photos,
+        travel=TRAVEL,
+        bounds=(REFERENCE_RATE, LARGEST_RATE),
+        last_share=LAST_SHARE,
+    )
+
+
+class Exposure:
+    """Gains and offsets of all photos, with their optimiser state.
+
+    Parameters
+    ----------
+    count : int
+        Number of the scene's views.
+    trained : sequence of int
+        Training views; the others stay neutral and are excluded from the mean.
+    log_gains : (count, 3), optional
+        Initial log gains of display values plus :data:`SRGB_PEDESTAL`, as estimated by
+        :mod:`.exposure_selection`; a short run then only refines them. Non-finite
+        values count as 0.
+
+    Raises
+    ------
+    UsageError
+        A trained view does not exist, or the gains have the wrong shape.
+    """
+
+    def __init__(
+        self, count: int, trained: Sequence[int], log_gains: np.ndarray | None = None
+    ) -> None:
+        self.trained = np.unique(np.asarray(trained, np.int64))
+        if len(self.trained) and (self.trained[0] < 0 or self.trained[-1] >= count):
+            raise UsageError(
+                f"Exposures of {count} views cannot hold view {int(self.trained[-1])}.",
+                "Number the views of the scene from 0.",
+            )
+        self.values = np.zeros((count, 6), np.float32)
+        """Log gains of red, green, blue, then offsets at :data:`PIVOT`; display values."""
+        self.adam = PhotoAdam(count, 6, np.float32, EPSILON)
+        self.gradient = np.zeros(6)
+        """Gradient of the last backward pass, for the next step; not part of the state."""
+        self._store = ArrayStore()
+        self.active = True
+        """Whether steps change exposures."""
+        if log_gains is not None:
+            start = np.asarray(log_gains, np.float64)
+            if start.shape != (count, 3):
+                raise UsageError(
+                    f"Gains to start from have the shape {start.shape}.", f"Give ({count}, 3)."
+                )
+            start = np.where(np.isfinite(start), start, 0.0)[self.trained]
+            self.values[self.trained, :3] = start
+            self.values[self.trained, 3:] = (SRGB_PEDESTAL + PIVOT) * np.expm1(start)
+        self.pin()
+
+    def corrected(
+        self, view: int, color: np.ndarray, alpha: np.ndarray | None = None, *, threads: int = 0
+    ) -> np.ndarray:
+        """Apply the photo's exposure to a render: ``exp(a) color + b``.
+
+        Parameters
+        ----------
+        view : int
+        color : (h, w, 3) float32 or float64
+        alpha : (h, w), the same type, optional
+            The offset is then ``b alpha``, as for a colour blended over emptiness. For images that
+            are composited afterwards (:mod:`.background`).
+
+        Returns
+        -------
+        (h, w, 3), of the colour's type
+            Valid until the next call.
+        """
+        color, alpha = self._arrays(color, alpha)
+        out = self._store.take(f"corrected {color.dtype}", color.shape, color.dtype)
+        gains, offsets = self.factors(view, color.dtype)
+
+        def run(begin: int, end: int) -> None:
+            apply_rows(begin, end, color, alpha, gains, offsets, out)
+
+        threads = threads or default_threads()
+        run_chunks(run, even_bounds(len(color), threads, 1), threads)
+        return out
+
+    def backward(
+        self,
+        view: int,
+        color: np.ndarray,
+        by_corrected: np.ndarray,
+        alpha: np.ndarray | None = None,
+        *,
+        threads: int = 0,
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return the gradients on colour and alpha; store that of the exposure for :meth:`step`.
+
+        Parameters
+        ----------
+        view, color, alpha
+            As passed to :meth:`corrected`.
+        by_corrected : (h, w, 3), of the colour's type
+            Gradient of the loss on the corrected image.
+
+        Returns
+        -------
+        by_color : (h, w, 3)
+            Valid until the next call.
+        by_alpha : (h, w) or None
+            ``None`` without alpha. Both are bitwise the same for any number of threads.
+        """
+        color, cover = self._arrays(color, alpha)
+        by_out = np.ascontiguousarray(by_corrected, color.dtype)
+        if by_out.shape != color.shape:
+            raise UsageError(
+                f"Image {color.shape} and gradient {by_out.shape} differ in size.",
+                "Pass the gradient of the corrected image.",
+            )
+        by_color = self._store.take(f"by color {color.dtype}", color.shape, color.dtype)
+        by_alpha = self._store.take(f"by alpha {color.dtype}", cover.shape, color.dtype)
+        gains, offsets = self.factors(view, color.dtype)
+        sums = np.zeros((len(color), 6))
+
+        def run(begin: int, end: int) -> None:
+            backward_rows(
+                begin, end, color, cover, by_out, gains, offsets, by_color, by_alpha, sums
+            )
+
+        threads = threads or default_threads()
+        run_chunks(run, even_bounds(len(color), threads, 1), threads)
+        self.gradient[:] = sums.sum(axis=0)
+        # d/da of exp(a) (color - PIVOT alpha)
+        self.gradient[:3] = gains * (self.gradient[:3] - PIVOT * self.gradient[3:])
+        return by_color, None if alpha is None else by_alpha
+
+    def step(self, view: int, rate: float) -> None:
+        """Apply an Adam step of a photo's exposure with the last gradient, then pin the mean.
+
+        A non-finite gradient is skipped.
+        """
+        if not self.active or not np.isfinite(self.gradient).all():
+            return
+        self.values[view] -= self.adam.step(view, self.gradient, rate).astype(np.float32)
+        self.pin()
+
+    def pin(self) -> None:
+        """Subtract the means over the trained photos (0 to rounding) and clip values to bounds."""
+        if len(self.trained) == 0:
+            return
+        kept = self.values[self.trained].astype(np.float64)
+        limit = np.repeat([MAX_LOG_GAIN, MAX_OFFSET], 3)
+        kept = np.clip(kept - kept.mean(axis=0), -limit, limit)
+        self.values[self.trained] = kept - kept.mean(axis=0)
+
+    def factors(self, view: int, dtype: np.dtype | type = np.float64) -> tuple[np.ndarray, ...]:
+        """Return ``exp(a)`` (3,) and the offset at black ``b`` (3,) of a photo."""
+        value = self.values[view].astype(np.float64)
+        gains = np.exp(value[:3])
+        return gains.astype(dtype), (value[3:] + PIVOT * (1.0 - gains)).astype(dtype)
+
+    def spread(self) -> float:
+        """Return the standard deviation of the trained photos' log gains over all channels."""
+        return float(np.sqrt(np.mean(self.values[self.trained, :3].astype(np.float64) ** 2)))
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of the arrays that the next iteration depends on, by name."""
+        own: dict[str, np.ndarray] = {"values": self.values.copy(), "trained": self.trained.copy()}
+        if not self.active:
+            own["active"] = np.array(False)
+        return own | self.adam.to_arrays()
+
+    @classmethod
+    def restore(cls, arrays: dict[str, np.ndarray]) -> Exposure:
+        """Build from :meth:`to_arrays`, bit for bit; the arrays are copied.
+
+        Raises
+        ------
+        KeyError, ValueError
+            An array is missing, or arrays are inconsistent.
+        """
+        count = len(arrays["values"])
+        trained = arrays["trained"]
+        if trained.ndim != 1 or (
+            len(trained) and not (0 <= trained.min() <= trained.max() < count)
+        ):
+            raise ValueError("the trained views of the exposures are not among the scene's")
+        made = cls(count, trained.tolist())
+        values = arrays["values"]
+        if values.shape != made.values.shape or values.dtype != made.values.dtype:
+            raise ValueError(f"values of the exposures: {values.dtype} {values.shape}")
+        made.values[...] = values
+        made.adam.load(arrays)
+        made.active = bool(arrays.get("active", True))
+        return made
+
+    @staticmethod
+    def _arrays(color: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        color = np.ascontiguousarray(color)
+        if color.ndim != 3 or color.shape[2] != 3 or color.dtype not in _NO_ALPHA:
+            raise UsageError(
+                f"An image is {color.dtype} {color.shape}.", "Give (height, width, 3) floats."
+            )
+        if alpha is None:
+            return color, _NO_ALPHA[color.dtype]
+        cover = np.ascontiguousarray(alpha, color.dtype)
+        if cover.shape != color.shape[:2]:
+            raise UsageError(
+                f"Image {color.shape} and alpha {cover.shape} differ in size.",
+                "Pass the alpha of the same render.",
+            )
+        return color, cover
+
+
+FIT_ROUNDS = 8
+FIT_PRIOR_SQ = 0.02**2
+"""Weight of the prior on a fitted gain of 1, as a variance of display values: a photo of uniform
+colour does not separate gain and offset."""
+FIT_SCALE = 0.05
+"""Errors beyond this display value have decreasing weight."""
+FIT_DARKEST, FIT_BRIGHTEST = 2.5 / 255, 252.5 / 255
+"""Values of the photo outside this range may be clipped and are ignored."""
+MIN_FIT_PIXELS = 64
+
+
+def fit_exposure(
+    render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fit gain and offset per channel of a render to a photo.
+
+    Least squares in closed form, reweighted with ``1 / max(|error|, 0.05)`` (Huber), with a weak
+    prior :data:`FIT_PRIOR_SQ` on a gain of 1. For photos whose exposure was not trained. Metrics on
+    the fitted pixels are too optimistic; report those of :func:`corrected_for_measuring`.
+
+    Parameters
+    ----------
+    render : (h, w, 3) floats
+    photo : (h, w, 3) uint8, or floats in [0, 1]
+    mask : (h, w) bool, optional
+        Pixels to use.
+
+    Returns
+    -------
+    gain, offset : (3,) float64
+        ``photo ~ gain render + offset``; 1 and 0 for a channel with fewer than
+        :data:`MIN_FIT_PIXELS` usable pixels.
+
+    Raises
+    ------
+    UsageError
+        If the shapes differ.
+    """
+    x, y = np.asarray(render, np.float64), np.asarray(photo)
+    y = y / 255.0 if y.dtype == np.uint8 else y.astype(np.float64)
+    if x.shape != y.shape or (mask is not None and np.shape(mask) != x.shape[:2]):
+        raise UsageError(
+            f"Render {x.shape}, photo {y.shape} and mask differ in size.",
+            "Compare images of one camera.",
+        )
+    gain, offset = np.ones(3), np.zeros(3)
+    for channel in range(3):
+        value = y[..., channel]
+        usable = (value >= FIT_DARKEST) & (value <= FIT_BRIGHTEST) & np.isfinite(x[..., channel])
+        if mask is not None:
+            usable &= np.asarray(mask, np.bool_)
+        if np.count_nonzero(usable) >= MIN_FIT_PIXELS:
+            gain[channel], offset[channel] = _fit(x[..., channel][usable], value[usable])
+    return gain, offset
+
+
+def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    weight = np.ones(len(x))
+    gain = offset = 0.0
+    for _ in range(FIT_ROUNDS):
+        total = weight.sum()
+        mean_x, mean_y = float(weight @ x / total), float(weight @ y / total)
+        variance = float(weight @ (x - mean_x) ** 2 / total)
+        covariance = float(weight @ ((x - mean_x) * (y - mean_y)) / total)
+        gain = (covariance + FIT_PRIOR_SQ) / (variance + FIT_PRIOR_SQ)
+        gain = min(max(gain, math.exp(-MAX_LOG_GAIN)), math.exp(MAX_LOG_GAIN))
+        offset = mean_y - gain * mean_x
+        weight = 1.0 / np.maximum(np.abs(gain * x + offset - y), FIT_SCALE)
+    return gain, offset
+
+
+def corrected_for_measuring(
+    render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the render in the photo's exposure, each half corrected by a fit to the other half.
+
+    The exposure of a held-out photo was never trained. As each half of the image (left, right) is
+    corrected by the fit to the other, metrics of the whole image measure how well the scene is
+    reconstructed and not how well six numbers fit. They must be named as such: "PSNR after an
+    exposure fitted crosswise on the image's halves".
+
+    Parameters
+    ----------
+    render, photo, mask
+        As for :func:`fit_exposure`. A half whose other half has too few pixels is not corrected.
+
+    Returns
+    -------
+    (h, w, 3) float32
+        In [0, 1].
+    """
+    middle = np.shape(render)[1] // 2
+    halves = (slice(None, middle), slice(middle, None))
+    result = np.array(render, np.float64)
+    for half, other in (halves, halves[::-1]):
+        part = None if mask is None else mask[:, other]
+        gain, offset = fit_exposure(render[:, other], photo[:, other], part)
+        result[:, half] = gain * result[:, half] + offset
+    return np.clip(result, 0.0, 1.0).astype(np.float32)

@@ -1,0 +1,963 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Multi-view losses: neighbours, photometric and geometric terms on sampled pixels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .. import limits
+from ..compiled import inline, kernel
+from ..errors import UsageError
+from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
+from ..render.depth_query import (
+    QueryResult,
+    QueryView,
+    add_query_gradients,
+    query_view,
+    solve_depths,
+)
+from ..render.projection import RawArrays, project_backward_visible
+from ..render.types import ImageGradients, RenderOptions, VisibleGradients
+from ..render.view_renderer import ViewPass
+from ..resampling import LUMA
+from ..scene.camera import Camera
+from ..settings import CORRELATIONS, TrainingSettings
+from .adam import add_image_gradients, merge_gradients
+
+# -- Select neighbouring cameras for the multi-view terms (docs/method.md, section 3.4) -----------
+
+
+_MOST_POINTS = 2000
+"""Most points for estimating the overlap of two images, subsampled from those given."""
+_FEW_POINTS = 10
+"""The overlap criterion is skipped for cameras that see fewer of them."""
+
+
+@dataclass(frozen=True)
+class NeighbourLimits:
+    """Criteria for candidate cameras; lengths in scene units.
+
+    40 photos around an object are 16 to 28 degrees and 0.25 to 0.4 scene radii apart: with the
+    method's 0.3 radii 23 of 40 have no neighbour, with these all have; on a
+    capture of 50 to 80 photos every camera has eight, the nearest of which are the method's. In a
+    room, where axes differ by 28 to 101 degrees, 32 of 40 have none, with these all have. Angles
+    beyond 30 degrees would add pairs with too different views of a patch, and no camera needs them.
+    """
+
+    max_angle_deg: float = 30.0
+    """Between the optical axes."""
+    min_distance: float = 0.002 * limits.SCENE_RADIUS
+    """Between the centres: without a baseline, depth is not constrained."""
+    max_distance: float = TrainingSettings.neighbour_distance * limits.SCENE_RADIUS
+    min_overlap: float = TrainingSettings.neighbour_overlap
+    """Share of the sparse points in a camera's image that must also lie in the other's image."""
+    most: int = 8
+    """Most neighbours of each camera; the nearest are kept."""
+
+    @classmethod
+    def of_settings(cls, settings: TrainingSettings) -> NeighbourLimits:
+        """Return the limits of a training's settings."""
+        return cls(
+            max_distance=settings.neighbour_distance * limits.SCENE_RADIUS,
+            min_overlap=settings.neighbour_overlap,
+        )
+
+
+def find_neighbours(
+    cameras: Sequence[Camera],
+    limits: NeighbourLimits | None = None,
+    *,
+    points: np.ndarray | None = None,
+) -> list[np.ndarray]:
+    """Return the neighbours of each camera (docs/method.md, section 3.4).
+
+    Candidates have a similar direction and position, and share part of the visible sparse points.
+    Sorted by distance, then by angle, then by index. The neighbours of one camera do not depend on
+    those of others.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Scene frame.
+    limits : NeighbourLimits, optional
+    points : (n, 3) array, optional
+        Sparse points, scene frame; without them the overlap criterion is skipped.
+
+    Returns
+    -------
+    list of (k,) int64
+        Indices into ``cameras``, for each camera; empty without candidates.
+    """
+    limits = limits or NeighbourLimits()
+    if len(cameras) == 0:
+        return []
+    centers = np.stack([camera.center for camera in cameras])  # (c, 3)
+    axes = np.stack([camera.forward for camera in cameras])  # (c, 3)
+    seen = _seen_points(cameras, points)
+    found = []
+    for index in range(len(cameras)):
+        distance = np.linalg.norm(centers - centers[index], axis=1)  # (c,)
+        # The arc sine of half the chord keeps small angles exact, the arc cosine does not.
+        chord = np.linalg.norm(axes - axes[index], axis=1)
+        angle_deg = np.degrees(2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0)))
+        good = (angle_deg < limits.max_angle_deg) & (distance > limits.min_distance)
+        good &= distance < limits.max_distance
+        good[index] = False
+        here = seen[index]
+        if here.sum() >= _FEW_POINTS:
+            good &= (seen & here).sum(1) >= limits.min_overlap * here.sum()
+        candidates = np.flatnonzero(good)
+        order = np.lexsort((candidates, angle_deg[candidates], distance[candidates]))
+        found.append(candidates[order[: limits.most]])
+    return found
+
+
+def _seen_points(cameras: Sequence[Camera], points: np.ndarray | None) -> np.ndarray:
+    """Return (c, n) bool: a point projects into the image of a camera, ignoring occlusion."""
+    if points is None or len(points) == 0:
+        return np.zeros((len(cameras), 0), np.bool_)
+    step = -(-len(points) // _MOST_POINTS)
+    some = np.asarray(points, np.float64)[::step]
+    seen = np.zeros((len(cameras), len(some)), np.bool_)
+    for index, camera in enumerate(cameras):
+        pixels, depth = camera.project(some)
+        inside = (pixels >= 0.0).all(1) & (pixels <= [camera.width, camera.height]).all(1)
+        seen[index] = inside & (depth > limits.NEAR_Z)
+    return seen
+
+
+# -- Sample the pixels for the multi-view terms: stratified, with more of them on texture ---------
+
+
+BORDER_PX = 2
+"""Pixels closer to the border than this have patches that leave the image."""
+BLOCK_PX = 8
+"""Pixels are traversed in blocks of this side, so that a stratum is a patch and not a line."""
+NO_MASK = np.zeros((0, 0), np.bool_)
+RED, GREEN, BLUE = LUMA
+
+
+def grey_image(
+    photo: np.ndarray, name: str, *, threads: int, store: ArrayStore | None = None
+) -> np.ndarray:
+    """Return (h, w) float32 grey in [0, 1] of an (h, w, 3) photo: uint8, or floats in [0, 1].
+
+    ``name`` is its key in ``store``.
+    """
+    shape = photo.shape[:2]
+    grey = np.empty(shape, np.float32) if store is None else store.take(name, shape, np.float32)
+    scale = 1.0 / 255.0 if photo.dtype == np.uint8 else 1.0
+
+    def run(begin: int, end: int) -> None:
+        _grey_rows(begin, end, photo, scale, grey)
+
+    run_chunks(run, even_bounds(shape[0], threads, 2), threads)
+    return grey
+
+
+def choose_pixels(
+    grey: np.ndarray,
+    depth: np.ndarray,
+    mask: np.ndarray | None,
+    count: int,
+    random: np.random.Generator,
+    *,
+    threads: int,
+    store: ArrayStore | None = None,
+) -> np.ndarray:
+    """Sample up to ``count`` distinct pixels with depth, inside the mask; all, if it has no more.
+
+    Stratified along blocks of pixels. The probability of a pixel is proportional to its brightness
+    gradient plus the mean one: half of the pixels follow texture, half are uniform.
+
+    Parameters
+    ----------
+    grey, depth : (h, w) float32
+        Depth is > 0 where defined.
+    mask : (h, w) bool, optional
+        False pixels are never chosen.
+    random : numpy Generator
+        ``count`` numbers are drawn, whatever the images contain; none if ``count`` is not less
+        than the number of pixels.
+
+    Returns
+    -------
+    (m,) int32
+        ``row * width + column``, m <= count.
+    """
+    height = len(grey)
+    takes_all = count >= grey.size
+    jitter = random.random(0 if takes_all else count)
+    steepness = (
+        np.empty(grey.shape, np.float32)
+        if store is None
+        else store.take("steepness", grey.shape, np.float32)
+    )
+    sums = np.empty((height, 2))
+    flat_mask = NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
+
+    def run(begin: int, end: int) -> None:
+        _steepness_rows(begin, end, grey, depth, flat_mask, steepness, sums)
+
+    run_chunks(run, even_bounds(height, threads, 2), threads)
+    steep, usable = sums.sum(0).tolist()
+    if usable == 0:
+        return np.zeros(0, np.int32)
+    if takes_all:
+        return np.flatnonzero(steepness.reshape(-1) >= 0.0).astype(np.int32)
+    even = steep / usable if steep > 0.0 else 1.0
+    chosen = np.empty(count, np.int32)
+    found = _pick(steepness, even, steep + even * usable, jitter, chosen)
+    return chosen[:found]
+
+
+@kernel(fast=False, fused=True)
+def _grey_rows(begin: int, end: int, photo: np.ndarray, scale: float, grey: np.ndarray) -> None:
+    red, green = np.float32(RED * scale), np.float32(GREEN * scale)
+    blue = np.float32(BLUE * scale)
+    for i in range(begin, end):
+        for j in range(photo.shape[1]):
+            grey[i, j] = (
+                red * np.float32(photo[i, j, 0])
+                + green * np.float32(photo[i, j, 1])
+                + blue * np.float32(photo[i, j, 2])
+            )
+
+
+@kernel(fast=False)
+def _steepness_rows(
+    begin: int,
+    end: int,
+    grey: np.ndarray,
+    depth: np.ndarray,
+    mask: np.ndarray,
+    steepness: np.ndarray,
+    sums: np.ndarray,
+) -> None:
+    """Write the length of the brightness gradient, -1 for pixels that cannot be chosen, and for
+    each row their sum and number."""
+    height, width = grey.shape
+    for i in range(begin, end):
+        total, usable = 0.0, 0
+        for j in range(width):
+            steepness[i, j] = np.float32(-1.0)
+            if not (BORDER_PX <= i < height - BORDER_PX and BORDER_PX <= j < width - BORDER_PX):
+                continue
+            if not depth[i, j] > 0.0 or (len(mask) > 0 and not mask[i, j]):
+                continue
+            across = grey[i, j + 1] - grey[i, j - 1]
+            down = grey[i + 1, j] - grey[i - 1, j]
+            length = np.sqrt(across * across + down * down)
+            if not length < math.inf:
+                continue
+            steepness[i, j] = length
+            total += steepness[i, j]
+            usable += 1
+        sums[i, 0] = total
+        sums[i, 1] = usable
+
+
+@kernel(fast=False)
+def _pick(
+    steepness: np.ndarray, even: float, total: float, jitter: np.ndarray, chosen: np.ndarray
+) -> Any:
+    """Write the pixel selected by each stratum's draw, without duplicates; return their number."""
+    height, width = steepness.shape
+    stratum = total / len(jitter)
+    found, drawn, running = 0, 0, 0.0
+    for top in range(0, height, BLOCK_PX):
+        for left in range(0, width, BLOCK_PX):
+            for i in range(top, min(top + BLOCK_PX, height)):
+                for j in range(left, min(left + BLOCK_PX, width)):
+                    if steepness[i, j] < 0.0:
+                        continue
+                    running += steepness[i, j] + even
+                    hit = False
+                    while drawn < len(jitter) and (drawn + jitter[drawn]) * stratum < running:
+                        drawn += 1
+                        hit = True
+                    if hit:
+                        chosen[found] = i * width + j
+                        found += 1
+    return found
+
+
+# -- Compiled kernels of the multi-view terms: reprojection between two views, patch comparison
+#
+# All values are float64, except images, depths and positions. Derivatives are written by hand.
+# With ``r_p`` the ray of the reference pixel, ``r_o`` that of a sample of its patch, depth z and
+# any multiple n of the plane's normal, the homography of docs/method.md, section 3.4, takes
+# ``r_o`` to ``R r_o + s t`` with ``s = (n . r_o) / (z n . r_p)``; only s depends on z and n.
+
+
+# Cameras are (6,): fx, fy, cx, cy, width, height.
+
+HALF_PATCH = limits.HALF_PATCH
+PATCH_STEP_PX = limits.PATCH_STEP_PX
+SAMPLES = (2 * HALF_PATCH + 1) ** 2
+MAX_NOISE_PX, MIN_NOISE_PX = limits.MAX_NOISE_PX, limits.MIN_NOISE_PX
+SPREAD_PRODUCT = limits.SPREAD_PRODUCT
+MAX_ERROR = limits.MAX_PATCH_ERROR
+MIN_NORMAL, MIN_FACING = limits.MIN_PLANE_NORMAL, limits.MIN_PLANE_FACING
+SKIPPED, KEPT = limits.PATCH_SKIPPED, limits.PATCH_KEPT
+BROKEN = limits.PATCH_BROKEN
+
+
+@inline
+def _on_image(x: Any, y: Any, camera: Any) -> Any:
+    return x >= 0.0 and y >= 0.0 and x <= camera[4] and y <= camera[5]
+
+
+@inline
+def _masked(mask: Any, x: Any, y: Any) -> Any:
+    """Whether the pixel at an image position is masked."""
+    return (
+        mask.shape[0] > 0
+        and not mask[min(int(y), mask.shape[0] - 1), min(int(x), mask.shape[1] - 1)]
+    )
+
+
+@kernel(fast=False, fused=True)
+def lift_range(
+    begin: int,
+    end: int,
+    pixels: np.ndarray,
+    depth: np.ndarray,
+    camera: np.ndarray,
+    other: np.ndarray,
+    pose: np.ndarray,
+    near_z: float,
+    other_mask: np.ndarray,
+    positions: np.ndarray,
+    position_slopes: np.ndarray,
+) -> None:
+    """Project pixels into the other view, with derivatives by their depth.
+
+    Parameters
+    ----------
+    pixels : (m,) int32
+        ``row * width + column``.
+    depth : (h, w) float32
+    camera, other : (6,) float64
+    pose : (3, 4) float64
+        Other camera from reference camera.
+    positions : (m, 2) float32
+        Written: pixels of the other view; NaN behind ``near_z``, outside the image or masked.
+    position_slopes : (m, 2) float64
+        Written: derivative with respect to the depth.
+    """
+    width = depth.shape[1]
+    for k in range(begin, end):
+        row, column = pixels[k] // width, pixels[k] % width
+        z = float(depth[row, column])
+        x = (column + 0.5 - camera[2]) / camera[0]
+        y = (row + 0.5 - camera[3]) / camera[1]
+        a0 = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]
+        a1 = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]
+        a2 = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
+        h2 = a2 * z + pose[2, 3]
+        positions[k, 0] = positions[k, 1] = np.float32(math.nan)
+        position_slopes[k, 0] = position_slopes[k, 1] = 0.0
+        if not h2 > near_z:
+            continue
+        u, v = (a0 * z + pose[0, 3]) / h2, (a1 * z + pose[1, 3]) / h2
+        at_x, at_y = other[0] * u + other[2], other[1] * v + other[3]
+        if not _on_image(at_x, at_y, other) or _masked(other_mask, at_x, at_y):
+            continue
+        positions[k, 0], positions[k, 1] = np.float32(at_x), np.float32(at_y)
+        position_slopes[k, 0] = other[0] * (a0 - u * a2) / h2
+        position_slopes[k, 1] = other[1] * (a1 - v * a2) / h2
+
+
+@kernel(fast=False, fused=True)
+def return_range(
+    begin: int,
+    end: int,
+    pixels: np.ndarray,
+    width: int,
+    positions: np.ndarray,
+    found: np.ndarray,
+    camera: np.ndarray,
+    other: np.ndarray,
+    pose: np.ndarray,
+    near_z: float,
+    noise: np.ndarray,
+    by_found: np.ndarray,
+    by_positions: np.ndarray,
+) -> None:
+    """Compute the reprojection error of pixels (the noise), with derivatives.
+
+    Parameters
+    ----------
+    positions : (m, 2) float32
+        Positions in the other view.
+    found : (m,) float32
+        Depth of the other view there; 0 where undefined.
+    noise : (m,) float64
+        Written: pixels; inf where undefined or not below :data:`MAX_NOISE_PX`.
+    by_found : (m,), by_positions : (m, 2) float64
+        Written: derivative of the noise; 0 where it is inf or nearly 0.
+    """
+    for k in range(begin, end):
+        noise[k] = math.inf
+        by_found[k] = by_positions[k, 0] = by_positions[k, 1] = 0.0
+        z = float(found[k])
+        if not z > near_z:
+            continue
+        x = (float(positions[k, 0]) - other[2]) / other[0]
+        y = (float(positions[k, 1]) - other[3]) / other[1]
+        c0, c1, c2 = x * z - pose[0, 3], y * z - pose[1, 3], z - pose[2, 3]
+        b0 = pose[0, 0] * c0 + pose[1, 0] * c1 + pose[2, 0] * c2
+        b1 = pose[0, 1] * c0 + pose[1, 1] * c1 + pose[2, 1] * c2
+        b2 = pose[0, 2] * c0 + pose[1, 2] * c1 + pose[2, 2] * c2
+        if not b2 > near_z:
+            continue
+        row, column = pixels[k] // width, pixels[k] % width
+        at_x = camera[0] * b0 / b2 + camera[2]
+        at_y = camera[1] * b1 / b2 + camera[3]
+        off_x, off_y = at_x - (column + 0.5), at_y - (row + 0.5)
+        length = math.sqrt(off_x * off_x + off_y * off_y)
+        if not (length < MAX_NOISE_PX and _on_image(at_x, at_y, camera)):
+            continue
+        noise[k] = length
+        if length < MIN_NOISE_PX:
+            continue
+        g0, g1 = camera[0] * off_x / (length * b2), camera[1] * off_y / (length * b2)
+        g2 = -(g0 * b0 + g1 * b1) / b2
+        # In the other camera's frame.
+        e0 = pose[0, 0] * g0 + pose[0, 1] * g1 + pose[0, 2] * g2
+        e1 = pose[1, 0] * g0 + pose[1, 1] * g1 + pose[1, 2] * g2
+        e2 = pose[2, 0] * g0 + pose[2, 1] * g1 + pose[2, 2] * g2
+        by_found[k] = e0 * x + e1 * y + e2
+        by_positions[k, 0], by_positions[k, 1] = e0 * z / other[0], e1 * z / other[1]
+
+
+@inline
+def _corner(grey: Any, x: Any, y: Any) -> Any:
+    """Upper left of the four pixels around a position, and the right and lower weights."""
+    at_x, at_y = x - 0.5, y - 0.5
+    column = min(max(int(at_x), 0), grey.shape[1] - 2)
+    row = min(max(int(at_y), 0), grey.shape[0] - 2)
+    return row, column, at_x - column, at_y - row
+
+
+@inline
+def _between(grey: Any, x: Any, y: Any) -> Any:
+    """Whether a position lies between pixel centres; false for NaN."""
+    return x >= 0.5 and y >= 0.5 and x <= grey.shape[1] - 0.5 and y <= grey.shape[0] - 0.5
+
+
+@inline
+def _all_count(mask: Any, row: Any, column: Any) -> Any:
+    """Whether a pixel and those to its right and below are unmasked."""
+    return mask.shape[0] == 0 or (
+        mask[row, column]
+        and mask[row, column + 1]
+        and mask[row + 1, column]
+        and mask[row + 1, column + 1]
+    )
+
+
+@kernel(fast=False, fused=True)
+def compare_range(  # type: ignore[no-untyped-def]
+    begin, end, pixels, noise, depth, normals, alpha, rotation, camera, other, pose, near_z,
+    grey, other_grey, mask, other_mask, squared, sizes, max_rise, min_spread, states, errors,
+    by_depth, by_normals,
+):  # fmt: skip
+    """Compare patches around pixels with the other photo, warped by their planes.
+
+    Parameters
+    ----------
+    pixels : (m,) int32, noise : (m,) float64
+        Pixels whose noise is inf are skipped.
+    depth, alpha : (h, w) float32, normals : (h, w, 3) float32
+        Images of the reference view; blended normals, scene frame.
+    rotation : (3, 3) float64
+        Reference camera from scene.
+    grey, other_grey : (h, w) float32, mask, other_mask : bool or (0, 0) for none
+    squared : bool
+        Correlation -1 is as good as 1.
+    sizes : int
+        Number of patch sizes, each twice the one before, tried until a patch is not flat.
+    max_rise : float
+        Largest deviation of the surface from the plane within a patch, in half sides of the patch.
+    min_spread : float
+        Smallest sum of squared deviations of the grey of a patch.
+    states : (m,) uint8
+        Written: :data:`KEPT` for compared patches, :data:`BROKEN` for non-finite values.
+    errors : (m,) float64
+        Written: ``1 - correlation``; 0 if not kept, as are the derivatives.
+    by_depth : (m,), by_normals : (m, 3) float64
+        Written: derivatives with respect to the depth and the normal (scene frame, any length).
+    """
+    width = depth.shape[1]
+    ours, theirs = np.empty(SAMPLES), np.empty(SAMPLES)
+    slopes, ratios = np.empty(SAMPLES), np.empty(SAMPLES)
+    for k in range(begin, end):
+        states[k] = SKIPPED
+        errors[k] = by_depth[k] = by_normals[k, 0] = by_normals[k, 1] = by_normals[k, 2] = 0.0
+        if not noise[k] < math.inf:
+            continue
+        row, column = pixels[k] // width, pixels[k] % width
+        s0, s1, s2 = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
+        z, cover = float(depth[row, column]), float(alpha[row, column])
+        length = math.sqrt(float(s0) * s0 + float(s1) * s1 + float(s2) * s2)
+        if not (length >= MIN_NORMAL * cover and length > 0.0):
+            continue
+        n0 = (rotation[0, 0] * s0 + rotation[0, 1] * s1 + rotation[0, 2] * s2) / length
+        n1 = (rotation[1, 0] * s0 + rotation[1, 1] * s1 + rotation[1, 2] * s2) / length
+        n2 = (rotation[2, 0] * s0 + rotation[2, 1] * s1 + rotation[2, 2] * s2) / length
+        px, py = (column + 0.5 - camera[2]) / camera[0], (row + 0.5 - camera[3]) / camera[1]
+        facing = n0 * px + n1 * py + n2  # n . r_p
+        if not abs(facing) >= MIN_FACING * math.sqrt(px * px + py * py + 1.0):
+            continue
+        step_px, flat = 0.5 * PATCH_STEP_PX, True
+        rise = max_rise * HALF_PATCH / camera[0]
+        our_spread, their_spread, common = 0.0, 0.0, 0.0
+        for _ in range(sizes):
+            step_px *= 2.0
+            whole, sample = True, 0
+            our_sum, their_sum = 0.0, 0.0
+            for i in range(-HALF_PATCH, HALF_PATCH + 1):
+                for j in range(-HALF_PATCH, HALF_PATCH + 1):
+                    at_x, at_y = column + 0.5 + step_px * j, row + 0.5 + step_px * i
+                    if not _between(grey, at_x, at_y):
+                        whole = False
+                        break
+                    top, left, right, low = _corner(grey, at_x, at_y)
+                    if not _all_count(mask, top, left):
+                        whole = False
+                        break
+                    high = grey[top, left] + right * (grey[top, left + 1] - grey[top, left])
+                    below = grey[top + 1, left] + right * (
+                        grey[top + 1, left + 1] - grey[top + 1, left]
+                    )
+                    ours[sample] = high + low * (below - high)
+                    x, y = (at_x - camera[2]) / camera[0], (at_y - camera[3]) / camera[1]
+                    ratio = (n0 * x + n1 * y + n2) / (facing * z)
+                    h0 = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] + ratio * pose[0, 3]
+                    h1 = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] + ratio * pose[1, 3]
+                    h2 = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] + ratio * pose[2, 3]
+                    # The point of the plane has depth 1 / ratio in the reference.
+                    if not (ratio > 0.0 and h2 > near_z * ratio):
+                        whole = False
+                        break
+                    if i % HALF_PATCH == 0 and j % HALF_PATCH == 0 and (i != 0 or j != 0):
+                        there = float(depth[int(at_y), int(at_x)])
+                        if not abs(there * ratio - 1.0) < rise * step_px:
+                            whole = False
+                            break
+                    u, v = h0 / h2, h1 / h2
+                    to_x, to_y = other[0] * u + other[2], other[1] * v + other[3]
+                    if not _between(other_grey, to_x, to_y):
+                        whole = False
+                        break
+                    top, left, right, low = _corner(other_grey, to_x, to_y)
+                    if not _all_count(other_mask, top, left):
+                        whole = False
+                        break
+                    g00, g01 = float(other_grey[top, left]), float(other_grey[top, left + 1])
+                    g10, g11 = (
+                        float(other_grey[top + 1, left]),
+                        float(other_grey[top + 1, left + 1]),
+                    )
+                    high, below = g00 + right * (g01 - g00), g10 + right * (g11 - g10)
+                    theirs[sample] = high + low * (below - high)
+                    across = (g01 - g00) + low * ((g11 - g10) - (g01 - g00))
+                    # Derivative of the sample by the ratio.
+                    slopes[sample] = (
+                        across * other[0] * (pose[0, 3] - u * pose[2, 3])
+                        + (below - high) * other[1] * (pose[1, 3] - v * pose[2, 3])
+                    ) / h2
+                    ratios[sample] = ratio
+                    our_sum += ours[sample]
+                    their_sum += theirs[sample]
+                    sample += 1
+                if not whole:
+                    break
+            if not whole:
+                break
+            our_mean, their_mean = our_sum / SAMPLES, their_sum / SAMPLES
+            our_spread = their_spread = common = 0.0
+            for sample in range(SAMPLES):
+                a, b = ours[sample] - our_mean, theirs[sample] - their_mean
+                our_spread += a * a
+                their_spread += b * b
+                common += a * b
+            flat = not (our_spread > min_spread and their_spread > min_spread)
+            if not flat:
+                break
+        if flat:
+            continue
+        product = our_spread * their_spread + SPREAD_PRODUCT
+        root = math.sqrt(product)
+        correlation = common / root
+        agreement = correlation * correlation if squared else correlation
+        error = min(max(1.0 - agreement, 0.0), 2.0)
+        if not math.isfinite(error):
+            states[k] = BROKEN
+            continue
+        if not error < MAX_ERROR:
+            continue
+        chain = -2.0 * correlation if squared else -1.0
+        pull = common * our_spread / product
+        of_depth, d0, d1, d2 = 0.0, 0.0, 0.0, 0.0
+        sample = 0
+        for i in range(-HALF_PATCH, HALF_PATCH + 1):
+            for j in range(-HALF_PATCH, HALF_PATCH + 1):
+                a, b = ours[sample] - our_mean, theirs[sample] - their_mean
+                by_ratio = chain * (a - pull * b) / root * slopes[sample]
+                share = ratios[sample] * z
+                of_depth -= by_ratio * ratios[sample]
+                x = px + step_px * j / camera[0]
+                y = py + step_px * i / camera[1]
+                d0 += by_ratio * (x - share * px)
+                d1 += by_ratio * (y - share * py)
+                d2 += by_ratio * (1.0 - share)
+                sample += 1
+        inverse = 1.0 / (facing * z * length)
+        of_depth, d0, d1, d2 = of_depth / z, d0 * inverse, d1 * inverse, d2 * inverse
+        if not math.isfinite(of_depth + d0 + d1 + d2):
+            states[k] = BROKEN
+            continue
+        states[k] = KEPT
+        errors[k] = error
+        by_depth[k] = of_depth
+        for c in range(3):
+            by_normals[k, c] = rotation[0, c] * d0 + rotation[1, c] * d1 + rotation[2, c] * d2
+
+
+# -- Multi-view losses between two views, with gradients on both (docs/method.md, section 3.4) ----
+#
+# Sampled pixels of the rendered view are lifted to its isosurface and projected into another
+# view. *Geometric*: the depth of the other view there, reprojected, should meet the pixel again.
+# *Photometric*: the plane through the point should show the same patch in both photos. The other
+# view is not rendered: its depth is solved at the projected positions only.
+
+
+__all__ = [
+    "MultiViewLoss",
+    "MultiViewMetrics",
+    "MultiViewOptions",
+    "add_image_gradients",
+    "merge_gradients",
+    "multi_view_losses",
+]
+
+_GEOMETRY_COLUMNS = 13
+"""Columns of the screen parameters that a depth depends on."""
+
+
+@dataclass(frozen=True)
+class MultiViewOptions:
+    """Weights and sizes of the multi-view terms."""
+
+    lambda_photometric: float = TrainingSettings.lambda_photometric
+    lambda_geometric: float = 0.02
+    correlation: str = "signed"
+    pixels: int = 4000
+    """Largest number of sampled pixels; as many as the image has, or more, take all."""
+    patch_sizes: int = TrainingSettings.patch_sizes
+    """Number of patch sizes, the larger ones for regions where smaller patches are flat."""
+    max_rise: float = TrainingSettings.patch_rise
+    """Largest deviation of the surface from a patch's plane, in half sides of the patch."""
+    min_contrast: float = TrainingSettings.patch_contrast
+    """Least standard deviation of grey, in [0, 1], of a patch that is compared."""
+    weight: float = 1.0
+    """Factor on both terms: n if they are evaluated in every n-th iteration."""
+
+    def __post_init__(self) -> None:
+        if self.correlation not in CORRELATIONS:
+            raise UsageError(
+                f"There is no correlation {self.correlation!r}.",
+                f"Choose one of {', '.join(CORRELATIONS)}.",
+            )
+
+    @classmethod
+    def of_settings(cls, settings: TrainingSettings) -> MultiViewOptions:
+        """Return the options of a training's settings."""
+        return cls(
+            settings.lambda_photometric,
+            settings.lambda_geometric,
+            settings.correlation,
+            settings.multi_view_pixels,
+            patch_sizes=settings.patch_sizes,
+            max_rise=settings.patch_rise,
+            min_contrast=settings.patch_contrast,
+            weight=float(settings.multi_view_every),
+        )
+
+
+@dataclass(frozen=True)
+class MultiViewMetrics:
+    """Values of the terms and pixel counts."""
+
+    photometric: float
+    """Mean of ``w (1 - correlation)`` over the patches kept; 0 without any."""
+    geometric: float
+    """Mean of ``w noise`` over the valid pixels, pixels; 0 without any."""
+    chosen: int
+    """Number of sampled pixels."""
+    valid: int
+    """Pixels that reproject to within a pixel."""
+    kept: int
+    """Pixels whose patches are compared."""
+    dropped: int
+    """Pixels and Gaussians skipped because of non-finite values."""
+
+
+@dataclass(frozen=True)
+class MultiViewLoss:
+    """The weighted sum of both terms and its gradients."""
+
+    value: float
+    gradients: ImageGradients
+    """On ``depth`` and ``geometric_normal`` of the rendered view; none on the others."""
+    other: VisibleGradients | None
+    """On the Gaussians, through the other view's depth; ``None`` without such a contribution."""
+    figures: MultiViewMetrics
+
+
+def multi_view_losses(
+    image: ViewPass,
+    gaussians: RawArrays,
+    camera: Camera,
+    photo: np.ndarray,
+    mask: np.ndarray | None,
+    other_camera: Camera,
+    other_photo: np.ndarray,
+    other_mask: np.ndarray | None,
+    settings: MultiViewOptions,
+    random: np.random.Generator,
+    *,
+    threads: int = 0,
+    store: ArrayStore | None = None,
+) -> MultiViewLoss:
+    """Compare a rendered view with the photo and the depth of another view.
+
+    ``weight (lambda_photometric mean(w (1 - ncc)) + lambda_geometric mean(w noise))`` with
+    ``w = exp(-noise)`` treated as constant (docs/method.md, section 3.4). A pixel is valid where
+    both depths exist, both masks include it and the noise is below one pixel; its patch is kept
+    where the plane is not seen edge-on, all samples are inside both images and masks, neither patch
+    is flat, and ``1 - ncc < 0.9``.
+
+    Parameters
+    ----------
+    image : ViewPass
+        Rendered with depth; any object with the same images will do.
+    gaussians : RawArrays
+        Rendered Gaussians, scene frame.
+    camera, other_camera : Camera
+        Scene frame; sizes may differ.
+    photo, other_photo : (h, w, 3) uint8, or floats in [0, 1]
+    mask, other_mask : (h, w) bool or ``None``
+        False pixels are ignored.
+    settings : MultiViewOptions
+    random : numpy Generator
+        ``settings.pixels`` numbers are drawn, none where all pixels are taken.
+    threads : int
+        The result does not depend on it.
+    store : ArrayStore, optional
+        Memory for the gradients on images, which are then valid until the next call.
+
+    Returns
+    -------
+    MultiViewLoss
+
+    Raises
+    ------
+    UsageError
+        If the size of a photo or mask differs from its camera's.
+    """
+    threads = threads or default_threads()
+    store = ArrayStore() if store is None else store
+    _check_sizes(camera, image=image.depth, photo=photo, mask=mask)
+    _check_sizes(other_camera, photo=other_photo, mask=other_mask)
+    options = RenderOptions(sh_degree=0, threads=threads)
+    grey = grey_image(photo, "multi-view grey", threads=threads, store=store)
+    pixels = choose_pixels(
+        grey, image.depth, mask, settings.pixels, random, threads=threads, store=store
+    )
+    pair = _ViewPair(image, camera, other_camera, pixels, options.near_z, threads)
+    kept_there = NO_MASK if other_mask is None else np.ascontiguousarray(other_mask, np.bool_)
+    positions, position_slopes = pair.lift(kept_there)
+    by_depth = store.zeros("multi-view by depth", image.depth.shape, np.float32)
+    by_normal = store.zeros("multi-view by normal", image.geometric_normal.shape, np.float32)
+    on_images = ImageGradients(depth=by_depth, geometric_normal=by_normal)
+    given = np.isfinite(image.depth.reshape(-1)[pixels])  # (m,)
+    given &= np.isfinite(image.geometric_normal.reshape(-1, 3)[pixels]).all(1)
+    if not np.isfinite(positions[:, 0]).any():
+        nothing = MultiViewMetrics(0.0, 0.0, len(pixels), 0, 0, int((~given).sum()))
+        return MultiViewLoss(0.0, on_images, None, nothing)
+    view = query_view(gaussians, other_camera, options)
+    depths = solve_depths(view, positions)
+    noise, by_found, by_positions = pair.reproject(positions, depths.values)
+    valid = noise < np.inf  # (m,)
+    weights = np.where(valid, np.exp(-noise), 0.0)
+    lambda_photometric = settings.weight * settings.lambda_photometric
+    lambda_geometric = settings.weight * settings.lambda_geometric
+
+    states, errors, depth_slopes, normal_slopes = pair.compare(
+        noise,
+        grey,
+        grey_image(other_photo, "multi-view other grey", threads=threads, store=store),
+        NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_),
+        kept_there,
+        settings.correlation == "squared",
+        settings.patch_sizes,
+        settings.max_rise,
+        SAMPLES * settings.min_contrast**2,
+    )
+    kept = states == KEPT
+    photometric, geometric = _mean(weights * errors, kept), _mean(weights * _finite(noise), valid)
+    share = lambda_photometric * weights / max(1, int(kept.sum()))
+    pixel_depth = share * depth_slopes  # (m,)
+    pixel_normal = share[:, None] * normal_slopes  # (m, 3)
+    share = lambda_geometric * weights / max(1, int(valid.sum()))
+    other, broken = None, 0
+    if lambda_geometric != 0.0 and valid.any():
+        other, on_positions, broken = _other_gradients(gaussians, view, depths, share * by_found)
+        on_positions = share[:, None] * by_positions + on_positions
+        pixel_depth = pixel_depth + (on_positions * position_slopes).sum(1)
+    sound = given & np.isfinite(pixel_depth) & np.isfinite(pixel_normal).all(1)
+    rows = pixels[sound]
+    by_depth.reshape(-1)[rows] = pixel_depth[sound]
+    by_normal.reshape(-1, 3)[rows] = pixel_normal[sound]
+    figures = MultiViewMetrics(
+        photometric,
+        geometric,
+        len(pixels),
+        int(valid.sum()),
+        int(kept.sum()),
+        int((~sound | (states == BROKEN)).sum()) + broken,
+    )
+    value = lambda_photometric * photometric + lambda_geometric * geometric
+    return MultiViewLoss(value, on_images, other, figures)
+
+
+class _ViewPair:
+    """Two views and the sampled pixels of the first, packed for the kernels."""
+
+    def __init__(
+        self,
+        image: ViewPass,
+        camera: Camera,
+        other: Camera,
+        pixels: np.ndarray,
+        near_z: float,
+        threads: int,
+    ) -> None:
+        self.image, self.pixels, self.near_z, self.threads = image, pixels, near_z, threads
+        self.rotation = np.ascontiguousarray(camera.rotation)
+        self.camera, self.other = _pack(camera), _pack(other)
+        turn = other.rotation @ camera.rotation.T  # (3, 3) other camera from this one
+        shift = other.cam_from_world[:, 3] - turn @ camera.cam_from_world[:, 3]
+        self.pose = np.concatenate([turn, shift[:, None]], 1)  # (3, 4)
+        self.bounds = even_bounds(len(pixels), threads)
+
+    def lift(self, other_mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions in the other view (m, 2) float32, and their derivatives by depth."""
+        count = len(self.pixels)
+        positions, position_slopes = np.empty((count, 2), np.float32), np.empty((count, 2))
+
+        def run(begin: int, end: int) -> None:
+            lift_range(
+                begin, end, self.pixels, self.image.depth, self.camera, self.other, self.pose,
+                self.near_z, other_mask, positions, position_slopes,
+            )  # fmt: skip
+
+        run_chunks(run, self.bounds, self.threads)
+        return positions, position_slopes
+
+    def reproject(
+        self, positions: np.ndarray, found: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return noise (m,), its derivatives by the other view's depth (m,) and position (m, 2)."""
+        count = len(self.pixels)
+        noise, by_found, by_positions = np.empty(count), np.empty(count), np.empty((count, 2))
+        width = self.image.depth.shape[1]
+
+        def run(begin: int, end: int) -> None:
+            return_range(
+                begin, end, self.pixels, width, positions, found, self.camera, self.other,
+                self.pose, self.near_z, noise, by_found, by_positions,
+            )  # fmt: skip
+
+        run_chunks(run, self.bounds, self.threads)
+        return noise, by_found, by_positions
+
+    def compare(
+        self,
+        noise: np.ndarray,
+        grey: np.ndarray,
+        other_grey: np.ndarray,
+        mask: np.ndarray,
+        other_mask: np.ndarray,
+        squared: bool,
+        sizes: int,
+        max_rise: float,
+        min_spread: float,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return states (m,), errors (m,), their derivatives by depth (m,) and normal (m, 3)."""
+        count, image = len(self.pixels), self.image
+        states, errors = np.empty(count, np.uint8), np.empty(count)
+        by_depth, by_normals = np.empty(count), np.empty((count, 3))
+
+        def run(begin: int, end: int) -> None:
+            compare_range(
+                begin, end, self.pixels, noise, image.depth, image.geometric_normal, image.alpha,
+                self.rotation, self.camera, self.other, self.pose, self.near_z, grey, other_grey,
+                mask, other_mask, squared, sizes, max_rise, min_spread, states, errors, by_depth,
+                by_normals,
+            )  # fmt: skip
+
+        run_chunks(run, self.bounds, self.threads)
+        return states, errors, by_depth, by_normals
+
+
+def _other_gradients(
+    gaussians: RawArrays, view: QueryView, depths: QueryResult, by_found: np.ndarray
+) -> tuple[VisibleGradients, np.ndarray, int]:
+    """Return gradients on the Gaussians (m', ...) and positions (m, 2), and Gaussians dropped."""
+    grad_params = np.zeros_like(view.screen.params)
+    by_positions = add_query_gradients(view, depths, by_found, grad_params)
+    # All values are finite if the sum of their absolute values is.
+    with np.errstate(all="ignore"):
+        sizes = np.abs(grad_params[:, :_GEOMETRY_COLUMNS]).sum(1)  # (n,)
+    wild = ~np.isfinite(sizes)
+    grad_params[wild] = 0.0
+    ids = np.flatnonzero((sizes != 0.0) & ~wild).astype(np.int32)
+    found = project_backward_visible(
+        gaussians, view.camera, view.options, view.screen, grad_params, ids
+    )
+    return found, by_positions.astype(np.float64), int(wild.sum())
+
+
+def _mean(values: np.ndarray, where: np.ndarray) -> float:
+    return float(values[where].sum() / max(1, int(where.sum())))
+
+
+def _finite(noise: np.ndarray) -> np.ndarray:
+    return np.where(noise < np.inf, noise, 0.0)
+
+
+def _pack(camera: Camera) -> np.ndarray:
+    values = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    return np.array(values, np.float64)
+
+
+def _check_sizes(camera: Camera, **arrays: np.ndarray | None) -> None:
+    wanted = (camera.height, camera.width)
+    for name, array in arrays.items():
+        if array is not None and array.shape[:2] != wanted:
+            height, width = array.shape[:2]
+            raise UsageError(
+                f"The {name} is {width} x {height} px, the camera {camera.width} x "
+                f"{camera.height}.",
+                "Use the camera of the same level.",
+            )
