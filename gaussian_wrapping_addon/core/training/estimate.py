@@ -572,7 +572,7 @@ def estimate_training(
     Parameters
     ----------
     facts, settings, machine
-        As for :func:`~.training_estimate.estimate`.
+        As for :func:`estimate`.
     first : int
         Iterations already done by a checkpoint of a training in one piece.
 
