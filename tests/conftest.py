@@ -55,7 +55,7 @@ def compile_kernels_once() -> None:
             return
     for path in sorted(core.rglob("*.py")):
         state.update(path.read_bytes())
-    stamp = core / "kernels" / "__pycache__" / "compiled-for-tests"
+    stamp = core / "__pycache__" / "compiled-for-tests"
     if stamp.is_file() and stamp.read_text() == state.hexdigest():
         return
     processes = [
