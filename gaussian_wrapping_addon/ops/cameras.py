@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Photo cameras as Blender cameras."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 from typing import Any, Final, cast

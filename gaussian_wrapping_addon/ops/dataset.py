@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Photos chosen and checked."""
 
-from __future__ import annotations
-
 import json
 import logging
 from pathlib import Path
@@ -178,7 +176,7 @@ def start_check(
     panoramas = _panoramas(scene)
     uid, chosen = scene.session_uid, properties_of(scene).source
 
-    def keep(found: list[Finding]) -> None:
+    def keep(found: "list[Finding]") -> None:
         scene = addon.scene_of_uid(uid)
         if scene is not None and properties_of(scene).source == chosen:
             _keep(scene, found)
@@ -194,7 +192,7 @@ def start_check(
         text = f"{type(error).__name__}: {error}"
         keep([Finding("error", text, "See the system console.")])
 
-    def check() -> list[Finding]:
+    def check() -> "list[Finding]":
         return check_input(source, worker=worker_if_any(python), panoramas=panoramas)
 
     _checks.submit(check, keep, failed=keep_failure)
@@ -204,7 +202,7 @@ def _panoramas(scene: bpy.types.Scene) -> str:
     return str(properties_of(scene).training.equirectangular).lower()
 
 
-def _keep(scene: bpy.types.Scene, found: list[Finding]) -> None:
+def _keep(scene: bpy.types.Scene, found: "list[Finding]") -> None:
     properties = properties_of(scene)
     properties.findings.clear()
     properties.checked_source = properties.source

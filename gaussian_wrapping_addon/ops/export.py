@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Meshes written by Blender's exporters."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import shutil

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Jobs: started, cancelled, resumed, found."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 from dataclasses import replace

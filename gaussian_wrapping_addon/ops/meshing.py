@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Region list, mesh estimate."""
 
-from __future__ import annotations
-
 import json
 import os
 import tempfile
@@ -51,7 +49,7 @@ class EstimateInputs:
     """(4, 4) matrix of the region in its frame."""
     rest: tuple[object, ...]
 
-    def matches(self, other: EstimateInputs) -> bool:
+    def matches(self, other: "EstimateInputs") -> bool:
         """Return whether both give the same estimate."""
         scale = float(np.abs(self.relative[:3]).max())
         same = np.allclose(self.relative, other.relative, rtol=0.0, atol=_SAME * scale)

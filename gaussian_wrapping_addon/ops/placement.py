@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Scale, ground, up and origin of a result."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Regions: created, edited, imported, exported, watched."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass, field

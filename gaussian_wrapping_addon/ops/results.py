@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Results imported and their report shown."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Final
 
@@ -126,13 +124,6 @@ class GWRAP_OT_copy_report(_NeedsResult, bpy.types.Operator):
         return {"FINISHED"}
 
 
-REPORT_OPERATORS_CLASSES: Final = (
-    GWRAP_OT_read_report,
-    GWRAP_OT_show_pictures,
-    GWRAP_OT_copy_report,
-)
-
-
 # -- Operators that import results, open their folder and set their shading -----------------------
 
 
@@ -217,8 +208,11 @@ def materials_of(frame: bpy.types.Object | None) -> list[bpy.types.Material]:
     return list(dict.fromkeys(found))
 
 
-IMPORT_OPERATORS_CLASSES: Final = (
+CLASSES: Final = (
     GWRAP_OT_import_result,
     GWRAP_OT_open_report,
     GWRAP_OT_set_shading,
+    GWRAP_OT_read_report,
+    GWRAP_OT_show_pictures,
+    GWRAP_OT_copy_report,
 )

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The Python that jobs run in: preference, check, set-up."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os
@@ -151,9 +149,6 @@ class GWRAP_OT_copy_findings(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> OperatorResult:
         context.window_manager.clipboard = as_text()
         return {"FINISHED"}
-
-
-WORKER_CHECK_OPERATORS_CLASSES: Final = (GWRAP_OT_check_worker, GWRAP_OT_copy_findings)
 
 
 # -- State of the worker's environment: readiness, search for Pythons, set-up and removal ---------
@@ -576,11 +571,13 @@ class GWRAP_OT_open_preferences(bpy.types.Operator):
             return {"CANCELLED"}
 
 
-WORKER_SETUP_OPERATORS_CLASSES: Final = (
+CLASSES: Final = (
     GWRAP_OT_set_up_worker,
     GWRAP_OT_add_extra,
     GWRAP_OT_copy_setup_commands,
     GWRAP_OT_remove_worker,
     GWRAP_OT_cancel_setup,
     GWRAP_OT_open_preferences,
+    GWRAP_OT_check_worker,
+    GWRAP_OT_copy_findings,
 )

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Sub-panel Computers."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import bpy
@@ -26,7 +24,7 @@ from .panel_base import (
 # -- Where the jobs of a scene run: ``Scene.gwrap.computers``; no property has a callback ---------
 
 
-_COMPUTERS_PROPERTIES_KINDS: Final = (
+_KINDS: Final = (
     ("THIS", "Local", "Jobs run on this computer"),
     ("DASK", "Dask", "Parts of jobs run on the computers of a Dask cluster"),
 )
@@ -38,7 +36,7 @@ class GWRAP_PG_computers(bpy.types.PropertyGroup):
     kind: EnumProperty(  # type: ignore[valid-type]
         name="Computers",
         description="Computers that run the jobs of this scene",
-        items=_COMPUTERS_PROPERTIES_KINDS,
+        items=_KINDS,
     )
     dask_address: StringProperty(  # type: ignore[valid-type]
         name="Scheduler",
@@ -54,13 +52,13 @@ class GWRAP_PG_computers(bpy.types.PropertyGroup):
     )
 
 
-COMPUTERS_PROPERTIES_CLASSES: Final = (GWRAP_PG_computers,)
+PROPERTIES: Final = (GWRAP_PG_computers,)
 
 
 # -- The sub-panel "Computers": the choice, its address, the parts of the job by state ------------
 
 
-_COMPUTERS_PANEL_KINDS: Final = {"THIS": "Local", "DASK": "Dask"}
+_KIND_NAMES: Final = {"THIS": "Local", "DASK": "Dask"}
 _PARTS: Final = {
     "frames": "Frames", "cameras": "Cameras", "masks": "Masks", "coarse": "Coarse Training",
     "block": "Blocks", "train": "Train", "plan": "Plan", "points": "Points", "gather": "Gather",
@@ -86,7 +84,7 @@ class GWRAP_PT_computers(TabPanel, bpy.types.Panel):
             total = sum(look.board.totals)
             icon = "ERROR" if failed else "CHECKMARK" if done == total else "SORTTIME"
             return Readiness(tr("{done} of {total}", done=done, total=total), icon)
-        return Readiness(_COMPUTERS_PANEL_KINDS[properties_of(context.scene).computers.kind])
+        return Readiness(_KIND_NAMES[properties_of(context.scene).computers.kind])
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, properties = self.layout, properties_of(context.scene)
@@ -161,4 +159,4 @@ def _draw_failed(layout: Any, context: bpy.types.Context, look: Look) -> None:
             wrapped_label(box, part.error, characters - 4, icon="BLANK1")
 
 
-COMPUTERS_PANEL_CLASSES: Final = (GWRAP_PT_computers,)
+CLASSES: Final = (GWRAP_PT_computers,)

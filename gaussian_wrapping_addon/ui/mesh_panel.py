@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Sub-panels Mesh, Texture and Bake."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import bpy
@@ -82,7 +80,7 @@ class GWRAP_PG_bake(bpy.types.PropertyGroup):
     )
 
 
-BAKE_PROPERTIES_CLASSES: Final = (GWRAP_PG_bake,)
+PROPERTIES: Final = (GWRAP_PG_bake,)
 
 
 # -- The sub-panel "Mesh": resolution of the selected regions, and the meshing job ----------------
@@ -144,9 +142,6 @@ class GWRAP_PT_mesh_advanced(bpy.types.Panel):
         draw_settings(column, properties, settings_in("mesh_advanced"))
 
 
-MESH_PANEL_CLASSES: Final = (GWRAP_PT_mesh, GWRAP_PT_mesh_advanced)
-
-
 # -- The sub-panel "Texture": size, source of the colours, further maps, coarser meshes -----------
 
 
@@ -169,9 +164,6 @@ class GWRAP_PT_texture(TabPanel, bpy.types.Panel):
         draw_settings(column, properties, settings_in("texture"))
         text = "Applies to the next Wrap Scene, Mesh Region or Bake Photos."
         wrapped_label(layout, text, characters_of(context), icon="INFO")
-
-
-TEXTURE_PANEL_CLASSES: Final = (GWRAP_PT_texture,)
 
 
 # -- The sub-panel "Bake": photos onto the active mesh, whatever made it --------------------------
@@ -222,4 +214,9 @@ class GWRAP_PT_bake(TabPanel, bpy.types.Panel):
         wrapped_label(layout, text, characters, icon="INFO")
 
 
-BAKE_PANEL_CLASSES: Final = (GWRAP_PT_bake,)
+CLASSES: Final = (
+    GWRAP_PT_mesh,
+    GWRAP_PT_mesh_advanced,
+    GWRAP_PT_texture,
+    GWRAP_PT_bake,
+)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The add-on's preferences: the worker's Python and its options."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import bpy

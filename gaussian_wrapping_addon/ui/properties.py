@@ -7,8 +7,6 @@ Settings of a job come from their declarations (``panel_base.py``). Regions have
 callback: in Blender 4.2 one that ever had crashes the process at exit.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import bpy

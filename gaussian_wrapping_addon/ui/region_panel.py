@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Panel Region, region boxes in the 3D view."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any, Final, cast
 
@@ -60,7 +58,7 @@ class GWRAP_PG_region(bpy.types.PropertyGroup):
     )
 
 
-REGION_PROPERTIES_CLASSES: Final = (GWRAP_PG_region,)
+PROPERTIES: Final = (GWRAP_PG_region,)
 
 
 # -- The panel "Region": list of regions, settings of the active one, estimates -------------------
@@ -176,9 +174,6 @@ def _draw_estimate(layout: Any, context: bpy.types.Context, region: bpy.types.Ob
     layout.operator(
         "gwrap.estimate_regions", text="Estimate Again" if estimate else "Estimate", icon="TIME"
     )
-
-
-REGION_PANEL_CLASSES: Final = (GWRAP_PT_region,)
 
 
 # -- Regions in the 3D view: thick edges over what Blender draws, the active one in another colour
@@ -426,4 +421,7 @@ class GWRAP_GGT_region_box(bpy.types.GizmoGroup):
             bpy.app.timers.register(_end_later, first_interval=_POLL_S)
 
 
-REGION_GIZMO_CLASSES: Final = (GWRAP_GGT_region_box,)
+CLASSES: Final = (
+    GWRAP_PT_region,
+    GWRAP_GGT_region_box,
+)

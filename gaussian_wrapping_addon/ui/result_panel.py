@@ -77,9 +77,6 @@ class GWRAP_PT_report(bpy.types.Panel):
             box.label(text=tr("and {count} more in the report", count=more), translate=False)
 
 
-REPORT_PANEL_CLASSES: Final = (GWRAP_PT_report,)
-
-
 # -- The sub-panel "Result": shading, textures, export, the job's files ---------------------------
 
 
@@ -121,9 +118,6 @@ class GWRAP_PT_result(TabPanel, bpy.types.Panel):
         column.operator("gwrap.import_result", text="Import Result…", icon="IMPORT")
         if frame is not None:
             column.operator("gwrap.open_report", icon="FILE_FOLDER")
-
-
-RESULT_PANEL_CLASSES: Final = (GWRAP_PT_result,)
 
 
 # -- The panel "Scene Tools": photo cameras, true scale, ground and origin of a result ------------
@@ -210,4 +204,8 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
         row.operator("gwrap.reset_placement", text="Reset", icon="LOOP_BACK")
 
 
-SCENE_PANEL_CLASSES: Final = (GWRAP_PT_scene_tools,)
+CLASSES: Final = (
+    GWRAP_PT_result,
+    GWRAP_PT_report,
+    GWRAP_PT_scene_tools,
+)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Sub-panel Train and the menu of presets."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import bpy
@@ -53,9 +51,6 @@ class GWRAP_MT_presets(bpy.types.Menu):
         layout.operator("gwrap.save_preset", text="Save Preset…", icon="ADD")
 
 
-PRESET_MENU_CLASSES: Final = (GWRAP_MT_presets,)
-
-
 # -- Properties of the sub-panel "Train": ``Scene.gwrap.training``; no property has a callback ----
 
 
@@ -75,7 +70,7 @@ class GWRAP_PG_training(bpy.types.PropertyGroup):
     )
 
 
-TRAINING_PROPERTIES_CLASSES: Final = (GWRAP_PG_training,)
+PROPERTIES: Final = (GWRAP_PG_training,)
 
 
 # -- The sub-panel "Train": preset, time and memory before the start, the job, more training ------
@@ -165,9 +160,6 @@ def estimate_rows(lines: tuple[str, ...]) -> tuple[tuple[tuple[str, str], ...], 
     return rows, remarks
 
 
-TRAIN_PANEL_CLASSES: Final = (GWRAP_PT_train,)
-
-
 # -- The sub-panel "Advanced" of "Train": model selection, limits, start --------------------------
 
 
@@ -207,4 +199,8 @@ class GWRAP_PT_train_advanced(bpy.types.Panel):
         column.operator("gwrap.reset_training", icon="LOOP_BACK")
 
 
-TRAIN_ADVANCED_PANEL_CLASSES: Final = (GWRAP_PT_train_advanced,)
+CLASSES: Final = (
+    GWRAP_MT_presets,
+    GWRAP_PT_train,
+    GWRAP_PT_train_advanced,
+)

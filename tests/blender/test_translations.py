@@ -33,8 +33,8 @@ TEXTS: dict[str, list[str]] = ROWS["texts"]
 
 DRAWN = (
     *sorted(PACKAGE.glob("ui/**/*.py")),
-    PACKAGE / "ops/jobs/live_figures.py",
-    PACKAGE / "ops/results/report_data.py",
+    PACKAGE / "ops/job_timer.py",
+    PACKAGE / "ops/result_files.py",
 )
 """Modules whose texts are drawn in panels; those of other modules are reports and errors."""
 
