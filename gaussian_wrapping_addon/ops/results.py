@@ -12,7 +12,7 @@ from ..core.files import real_path
 from . import addon, scene_objects
 from .addon import NeedsObjectMode, NeedsResult, OperatorResult, ReportsErrors
 from .mesh_data import mesh_of
-from .result_files import report_of
+from .report_data import report_of
 from .scene_objects import import_result
 
 # -- Operators that open a job's report and show its pictures -------------------------------------

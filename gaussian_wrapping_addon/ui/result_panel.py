@@ -14,7 +14,7 @@ from ..ops import addon
 from ..ops.addon import tr
 from ..ops.cameras import cameras_under
 from ..ops.placement import point_empties
-from ..ops.result_files import report_of
+from ..ops.report_data import report_of
 from ..ops.results import materials_of
 from ..ops.scene_objects import cameras_of, images_of, shading_of
 from .panel_base import Readiness, TabPanel, characters_of, table, wrapped_label

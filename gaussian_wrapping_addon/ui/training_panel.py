@@ -11,7 +11,7 @@ from ..ops import addon, job_timer, training
 from ..ops.addon import addon_preferences, properties_of, tr
 from ..ops.panel_settings import Stage, preset_lines, primary_of, stage_of
 from ..ops.presets import preset_names, shown_name
-from ..ops.result_files import report_of
+from ..ops.report_data import report_of
 from .job_view import draw_job, job_readiness
 from .panel_base import (
     CATEGORY,

@@ -28,7 +28,7 @@ from gaussian_wrapping_addon.ops.panel_settings import (
     job_settings,
     output_of,
 )
-from gaussian_wrapping_addon.ops.result_files import ReportData, report_of
+from gaussian_wrapping_addon.ops.report_data import ReportData, report_of
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.job_play import write_fake_python
 from tests.blender.panel_states import (

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.ops import addon, results
-from gaussian_wrapping_addon.ops.result_files import MAX_WARNINGS, figures_of_report, report_of
+from gaussian_wrapping_addon.ops.report_data import MAX_WARNINGS, figures_of_report, report_of
 from gaussian_wrapping_addon.ops.scene_objects import import_result
 from gaussian_wrapping_addon.ui.result_panel import _MAX_WARNINGS, GWRAP_PT_report
 from tests.blender.fake_layout import FakeLayout, draw

@@ -30,9 +30,9 @@ from gaussian_wrapping_addon.core.settings import (
 )
 from gaussian_wrapping_addon.ops import addon, background, job_timer, panel_settings
 from gaussian_wrapping_addon.ops import training as training_estimate
-from gaussian_wrapping_addon.ops.job_timer import live_rows
 from gaussian_wrapping_addon.ops.scene_objects import import_result
 from gaussian_wrapping_addon.ui import training_panel
+from gaussian_wrapping_addon.ui.job_view import live_rows
 from tests.blender.fake_layout import draw
 from tests.blender.fake_worker import LIVE, picture
 from tests.blender.job_play import write_fake_python
