@@ -47,11 +47,11 @@ def installed(tmp_path: Path) -> Path:
     core = target / "core"
     (core / "some_constant.py").write_text("AMOUNT = 1.0\n")
     (core / "some_helper.py").write_text(
-        "from .kernels.compiled import inline\nfrom .some_constant import AMOUNT\n\n\n"
+        "from .compiled import inline\nfrom .some_constant import AMOUNT\n\n\n"
         "@inline\ndef added(x):\n    return x + AMOUNT\n"
     )
     (core / "some_kernel.py").write_text(
-        "from .kernels.compiled import kernel\nfrom .some_helper import added\n\n\n"
+        "from .compiled import kernel\nfrom .some_helper import added\n\n\n"
         "@kernel(fast=True)\ndef run(x):\n    return added(x)\n"
     )
     return root
@@ -130,15 +130,12 @@ def test_a_change_in_an_imported_file_is_compiled(installed: Path) -> None:
 
 def test_imports_are_followed_however_they_are_written() -> None:
     core = PACKAGE / "core"
-    found = compiled._imported(core / "render" / "projection" / "projection_activation.py")
-    assert core / "tolerances.py" in found  # from .. import tolerances
-    assert core / "kernels" / "compiled.py" in found  # from ..compiled import inline, kernel
-    assert core / "render" / "projection" / "harmonics_kernels.py" in found
-    found = compiled._imported(core / "render" / "raster" / "raster_forward.py")
-    assert (
-        core / "render" / "simd" / "raster_math.py" in found
-    )  # names in brackets, over many lines
-    found = compiled._imported(core / "jobs" / "training" / "training_stage.py")
+    found = compiled._imported(core / "render" / "projection_kernels.py")
+    assert core / "limits.py" in found  # from .. import limits
+    assert core / "compiled.py" in found  # from ..compiled import inline, kernel
+    found = compiled._imported(core / "render" / "raster.py")
+    assert core / "render" / "simd.py" in found  # names in brackets, over many lines
+    found = compiled._imported(core / "jobs" / "stages" / "training.py")
     assert core / "training" / "trainer.py" in found  # within a function
     assert all(path.is_file() for path in found)
 
