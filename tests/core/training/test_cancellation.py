@@ -16,8 +16,7 @@ from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import trainer
 from gaussian_wrapping_addon.core.training.adam import Adam
-from gaussian_wrapping_addon.core.training.density import contributions
-from gaussian_wrapping_addon.core.training.harmonics_selection import TrialView, select_harmonics
+from gaussian_wrapping_addon.core.training.density import needed_by_a_view
 from gaussian_wrapping_addon.core.training.state import CancellablePhotos, cancellable
 from gaussian_wrapping_addon.core.training.wrapping import (
     WrapView,
@@ -39,7 +38,7 @@ def look_at_normals(adam: Adam, views: object) -> None:
 
 
 def look_at_contributions(adam: Adam, views: object) -> None:
-    contributions(adam.gaussians().detached(), views, ViewRenderer(), threads=1)
+    needed_by_a_view(adam.gaussians().detached(), views, ViewRenderer(), 0.1, threads=1)
 
 
 @pytest.mark.parametrize("loop", [vote, look_at_normals, look_at_contributions])
@@ -66,21 +65,6 @@ def test_no_view_is_rendered_after_the_request(
 def test_without_a_request_every_item_comes_once() -> None:
     assert list(cancellable(range(VIEWS), Progress())) == list(range(VIEWS))
     assert list(cancellable(np.arange(0), Progress())) == []
-
-
-def test_a_trial_of_harmonics_ends_before_the_next_view() -> None:
-    _, photos = sphere_scene()
-    views = [TrialView(photos.camera(i), photos.photo(i)) for i in range(8)]
-    calls = [0]
-
-    def check() -> None:
-        calls[0] += 1
-        if calls[0] == 5:
-            raise Cancelled()
-
-    with pytest.raises(Cancelled):
-        select_harmonics(sphere_gaussians(40), views, views[:2], 1, threads=1, check=check)
-    assert calls[0] == 5
 
 
 @pytest.mark.parametrize("fetched", [1, 7, 20])

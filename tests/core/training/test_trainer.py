@@ -6,7 +6,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -332,7 +331,7 @@ def test_windows_that_a_mask_empties_say_nothing(tmp_path: Path) -> None:
         SETTINGS, iterations=30, pixels_per_iteration=450, holdout_every=0, exposure="off"
     )
     run = trainer._Trainer(scene, store, settings, tmp_path, 0, 1)
-    state = run._start(rounds.Rounds(run.stepper, [], None, Progress()), "key", Progress())
+    state = run._start(rounds.Rounds(run.stepper, None, Progress()), "key", Progress())
     for _ in range(30):
         run.stepper.step(state)
     numbers = {row[1] % iteration._MAX_WINDOWS for row in state.error_history._rows}
@@ -368,17 +367,15 @@ def test_a_round_that_is_cancelled_half_way_is_done_again(
 
 def test_every_decision_is_written_down_and_can_be_overridden(tmp_path: Path) -> None:
     scene, photos = sphere_scene(views=9, size_px=24)
-    names = {
-        "full_size", "exposure", "multi_view", "harmonics", "wrapping", "growth", "dense_start",
-        "refine_poses",
-    }  # fmt: skip
+    names = {"full_size", "exposure", "multi_view", "growth", "dense_start", "refine_poses"}
+    parts = {*names, "harmonics", "wrapping"}
     settings = dataclasses.replace(SETTINGS, densify_until=0.9)
     result = train(scene, photos, settings, tmp_path, Progress(), threads=1)
     assert {d.name for d in result.model_selection} == names
     assert all(d.evidence and d.setting == "auto" for d in result.model_selection)
     for word, degree in (("on", 1), ("off", 0)):
         (tmp_path / word).mkdir()
-        asked = dataclasses.replace(settings, **dict.fromkeys(names, word))
+        asked = dataclasses.replace(settings, **dict.fromkeys(parts, word))
         result = train(scene, photos, asked, tmp_path / word, Progress(), threads=1)
         assert {d.name for d in result.model_selection} == names
         assert all(d.setting == word for d in result.model_selection)
@@ -386,28 +383,6 @@ def test_every_decision_is_written_down_and_can_be_overridden(tmp_path: Path) ->
         assert result.exposure_fitted == (word == "on")
         lengths = np.linalg.norm(result.gaussians.normals().numpy(), axis=1)
         assert (lengths.max() > 0) == (word == "on")
-
-
-@pytest.mark.parametrize(("accepts", "wanted"), [(False, [1]), (True, [1, 2])])
-def test_a_refused_degree_is_not_tried_again(
-    accepts: bool, wanted: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene, photos = sphere_scene(views=9, size_px=24)
-    tried: list[int] = []
-    trial = rounds.select_harmonics
-
-    def counted(
-        gaussians: Any, views: Any, held_out: Any, degree: int, *renderer: Any, **more: Any
-    ) -> Any:
-        tried.append(degree)
-        found = trial(gaussians, views, held_out, degree, *renderer, **more)
-        sh = np.zeros((len(gaussians), (degree + 1) ** 2, 3), np.float32)
-        return dataclasses.replace(found, coefficients=sh if accepts else None)
-
-    monkeypatch.setattr(rounds, "select_harmonics", counted)
-    settings = dataclasses.replace(SETTINGS, sh_degree=2)
-    train(scene, photos, settings, tmp_path, Progress(), threads=1)
-    assert tried == wanted
 
 
 def test_masks_can_mean_that_nothing_is_there(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def known_coarse() -> CoarseTraining:
     """Return a coarse training that has found the spheres, a little off."""
     truth = row_gaussians()
     noise = torch.from_numpy(np.random.default_rng(1).normal(size=tuple(truth.sh.shape))).float()
-    decided = ModelSelection((Decision.by_settings("wrapping", "on"),))
+    decided = ModelSelection((Decision.by_settings("multi_view", "on"),))
     return CoarseTraining(truth.replaced(sh=truth.sh + 0.2 * noise), decided, None, None, "key")
 
 

@@ -136,7 +136,7 @@ def test_exposures_and_decisions_stay_those_of_the_coarse_training(
     gains = np.random.default_rng(0).normal(size=(24, 3), scale=0.1)
     exposure = Exposure(24, plan.views, gains)
     decided = plan.coarse.model_selection.with_decision(
-        Decision("harmonics", "auto", "degree 0", "Tried.", {"degree_tried": 1.0})
+        Decision("exposure", "auto", "on", "Measured.", {"spread": 1.0})
     ).with_decision(Decision("growth", "auto", "stopped", "It paid no more."))
     coarse = dataclasses.replace(plan.coarse, exposure=exposure, model_selection=decided)
     before = exposure.values.copy()
@@ -147,8 +147,8 @@ def test_exposures_and_decisions_stay_those_of_the_coarse_training(
     assert np.array_equal(state.exposure.values, before)
     assert np.array_equal(exposure.values, before)
     assert state.poses is None
-    assert result.model_selection.get("harmonics") == decided.get("harmonics")
-    assert result.model_selection.get("wrapping") == decided.get("wrapping")
+    for name in ("exposure", "multi_view"):
+        assert result.model_selection.get(name) == decided.get(name)
     assert result.gaussians.sh_degree == 0
     growth = result.model_selection.get("growth")
     assert growth is not None

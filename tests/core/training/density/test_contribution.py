@@ -14,7 +14,6 @@ from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.training.adam import Adam
 from gaussian_wrapping_addon.core.training.density import (
-    contributions,
     needed_by_a_view,
     prune_contributors,
 )
@@ -44,15 +43,6 @@ def view_weights(gaussians: OrientedGaussians, views: list[WrapView]) -> np.ndar
     options = RenderOptions(depth=False, sh_degree=0, threads=1, statistics=True)
     found = [render(gaussians, view.camera, options).statistics for view in views]
     return np.stack([statistics.weight_sum for statistics in found if statistics is not None])
-
-
-def test_shares_add_up_to_the_mean_alpha() -> None:
-    gaussians = random_gaussians(60, dtype=torch.float32)
-    views = [WrapView(camera(s), None) for s in (-0.4, 0.3)]
-    found = contributions(gaussians, views, ViewRenderer(), threads=1)
-    options = RenderOptions(depth=False, threads=1)
-    alpha = np.mean([render(gaussians, v.camera, options).alpha.numpy().mean() for v in views])
-    np.testing.assert_allclose(found.sum(), alpha, rtol=1e-4)
 
 
 def test_what_hides_behind_a_wall_is_not_needed() -> None:

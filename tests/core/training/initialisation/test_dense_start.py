@@ -191,7 +191,7 @@ def first_state(setting: str, folder: Path, events: list[ProgressEvent]) -> Trai
     settings = dataclasses.replace(SETTINGS, dense_start=setting)
     run = trainer._Trainer(few, own, settings, folder, 0, 1)
     progress = Progress("train", events.append)
-    return run._start(Rounds(run.stepper, run.held_out, run.inside, progress), "key", progress)
+    return run._start(Rounds(run.stepper, run.inside, progress), "key", progress)
 
 
 def test_the_training_starts_from_what_the_setting_says(tmp_path: Path) -> None:

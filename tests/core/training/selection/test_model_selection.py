@@ -11,13 +11,10 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.training.model_selection import (
-    TWO_SIDED_ERROR,
-    WRAPPING_SHARE,
     Decision,
     ModelSelection,
     decide,
     select_multi_view,
-    select_wrapping,
 )
 
 
@@ -90,27 +87,3 @@ def test_multi_view_is_on_where_any_photo_has_a_neighbour() -> None:
     for setting in ("auto", "on", "off"):
         assert select_multi_view([none, none], setting).chosen == "off"
     assert select_multi_view([]).chosen == "off"
-
-
-def test_wrapping_follows_the_share_of_what_is_seen_from_behind() -> None:
-    errors = np.full(1000, 0.1)
-    weights = np.ones(1000)
-    assert select_wrapping(errors, weights).chosen == "off"
-    few, many = round(0.9 * WRAPPING_SHARE * 1000), round(1.1 * WRAPPING_SHARE * 1000)
-    for count, chosen in ((few, "off"), (many, "on")):
-        two_sided = errors.copy()
-        two_sided[:count] = 2 * TWO_SIDED_ERROR
-        found = select_wrapping(two_sided, weights)
-        assert found.chosen == chosen
-        assert found.figures["share_two_sided"] == pytest.approx(count / 1000)
-    # What hardly shows decides nothing.
-    two_sided[:many], weights[:many] = 2.0, 1e-6
-    assert select_wrapping(two_sided, weights).chosen == "off"
-    assert select_wrapping(two_sided, weights, "on").chosen == "on"
-
-
-def test_wrapping_without_anything_seen_or_with_wrong_arrays() -> None:
-    assert select_wrapping(np.array([1.0]), np.array([0.0])).chosen == "off"
-    assert select_wrapping(np.array([math.nan, 1.0]), np.array([9.0, 1.0])).chosen == "on"
-    with pytest.raises(UsageError):
-        select_wrapping(np.zeros(3), np.zeros(2))
