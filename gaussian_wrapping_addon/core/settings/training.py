@@ -373,7 +373,7 @@ def _model_selection(
 
 
 def _part_of_paper(*, help: str, option: Option, label: str, tooltip: str, name: str) -> Any:
-    """Declare a part that is off unless asked for, as it gained nothing measured; Paper has it.
+    """Declare a part that is off unless asked for, as meshes hardly gain or lose by it; Paper has it.
 
     Version 0.1.0 decided on it from the photos: job files of then say ``"auto"``.
 
@@ -467,7 +467,7 @@ class TrainingSettings(MethodSettings):
         option=Option("--harmonics", help="colour that depends on the direction"),
         label="Reflections",
         tooltip="Learn colours that change with the viewing direction: for images of the "
-        "Gaussians, meshes gain nothing. The preset Paper always does",
+        "Gaussians, meshes hardly gain. The preset Paper always does",
         name="reflections",
     )
     exposure: str = _model_selection(
