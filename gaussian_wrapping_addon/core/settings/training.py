@@ -373,7 +373,7 @@ def _model_selection(
 
 
 def _part_of_paper(*, help: str, option: Option, label: str, tooltip: str, name: str) -> Any:
-    """Declare a part that is off unless asked for, as meshes hardly gain or lose by it; Paper has it.
+    """Declare a part that only Paper has unless asked for, as meshes hardly gain by it or lose.
 
     Version 0.1.0 decided on it from the photos: job files of then say ``"auto"``.
 
