@@ -33,6 +33,9 @@ from gaussian_wrapping_addon.core.settings.job import write_saved_settings
 
 BATCH = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon" / "batch.py"
 
+PARTS_OF_PAPER = ("harmonics", "wrapping")
+DECIDED = tuple(name for name in MODEL_SELECTION if name not in PARTS_OF_PAPER)
+
 
 def settings_of(*arguments: str) -> JobSettings:
     return training_settings(
@@ -55,7 +58,7 @@ def test_without_options_the_preset_stands(name: str) -> None:
         ("--holdout", "0", "holdout_every", 0),
         ("--preview-every", "2.5", "preview_every_s", 2.5),
         ("--mask-mode", "background", "mask_mode", "background"),
-        *((f"--{n.replace('_', '-')}", "off", n, "off") for n in MODEL_SELECTION),
+        *((f"--{n.replace('_', '-')}", "off", n, "off") for n in DECIDED),
         *((f"--{n.replace('_', '-')}", "on", n, "on") for n in MODEL_SELECTION),
     ],
 )
@@ -149,7 +152,8 @@ def test_map_options_become_texture_settings(command: str) -> None:
 @pytest.mark.parametrize(("word", "wanted"), [("auto", "auto"), ("all", "on"), ("none", "off")])
 def test_needs_sets_the_model_selection_and_a_single_option_wins(word: str, wanted: str) -> None:
     training = settings_of("--needs", word).training
-    assert {getattr(training, name) for name in MODEL_SELECTION} == {wanted}
+    names = DECIDED if word == "auto" else MODEL_SELECTION
+    assert {getattr(training, name) for name in names} == {wanted}
     other = "off" if wanted == "on" else "on"
     for arguments in (
         ("--needs", word, "--exposure", other),
@@ -157,7 +161,7 @@ def test_needs_sets_the_model_selection_and_a_single_option_wins(word: str, want
     ):
         training = settings_of(*arguments).training
         assert training.exposure == other
-        assert {getattr(training, n) for n in MODEL_SELECTION if n != "exposure"} == {wanted}
+        assert {getattr(training, n) for n in names if n != "exposure"} == {wanted}
 
 
 @pytest.mark.parametrize(
@@ -338,3 +342,14 @@ def test_export_asks_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         "formats": ["obj", "splat"], "placed": True, "regions": ["a", "b"], "levels": True,
         "shading": "unlit",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PARTS_OF_PAPER)
+def test_parts_that_gain_nothing_are_the_papers_and_off_elsewhere(name: str) -> None:
+    for word in PRESETS:
+        given = getattr(settings_of("--preset", word, "--needs", "auto").training, name)
+        assert given == ("on" if word == "paper" else "off")
+    asked = settings_of("--preset", "paper", f"--{name}", "off").training
+    assert getattr(asked, name) == "off"
+    with pytest.raises(UsageError, match="invalid choice: 'auto'"):
+        settings_of(f"--{name}", "auto")

@@ -51,7 +51,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "no_depth_loss": ("--lambda-depth-prior", "0"),
     "no_free_space": ("--free-views", "0"),
     "no_opacity_prior": ("--lambda-opacity", "0"),
-    "no_reflections": ("--harmonics", "off"),
+    "no_footprint": ("--overlap-price", "0"),
 }
 """Arguments that leave a part out, by the name of the run."""
 

@@ -28,10 +28,8 @@ MAX_ROWS = 100
 """Stages and regions stored at most."""
 
 _DECISIONS = {
-    "harmonics": "Reflections",
     "exposure": "Exposure",
     "multi_view": "Compare Photos",
-    "wrapping": "Wrap Thin Parts",
     "growth": "Add Gaussians",
     "full_size": "Photo Size",
     "dense_start": "Dense Start",

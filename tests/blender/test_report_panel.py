@@ -145,13 +145,13 @@ def test_edited_figures_are_survived(tmp_path: Path, text: str) -> None:
 def test_what_the_scene_needed_is_shown_with_who_decided(tmp_path: Path) -> None:
     report = full_report()
     report["training"]["decisions"] = [
-        {"name": "harmonics", "setting": "auto", "chosen": "degree 0", "evidence": "a"},
+        {"name": "full_size", "setting": "auto", "chosen": "480 px", "evidence": "a"},
         {"name": "exposure", "setting": "on", "chosen": "on", "evidence": "b"},
         {"name": "of a newer version", "setting": "auto", "chosen": "much", "evidence": "c"},
         "broken",
     ]
     found = rows(show(tmp_path / "job", report))
-    assert found["Reflections"] == "Degree 0"
+    assert found["Photo Size"] == "480 px"
     assert found["Exposure"] == "On (set by you)"
     assert found["of a newer version"] == "Much"
 

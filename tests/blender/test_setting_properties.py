@@ -42,10 +42,10 @@ STORED = {
     "lods": None,
     "max_atlases": None,
     "texture_source": ["PHOTOS", "GAUSSIANS"],
-    "training.harmonics": ["AUTO", "ON", "OFF"],
+    "training.reflections": None,
     "training.exposure": ["AUTO", "ON", "OFF"],
     "training.multi_view": ["AUTO", "ON", "OFF"],
-    "training.wrapping": ["AUTO", "ON", "OFF"],
+    "training.orientations": None,
     "training.growth": ["AUTO", "ON", "OFF"],
     "training.mask_mode": ["IGNORE", "BACKGROUND", "AUTO"],
     "training.turntable": ["AUTO", "ON", "OFF"],
@@ -133,7 +133,8 @@ def test_every_declared_property_is_there_and_drawn() -> None:
 def test_full_size_is_chosen_with_the_other_parts_of_the_model() -> None:
     names = [field.name for field in draw(training_panel.GWRAP_PT_train_advanced).fields]
     assert names[:8] == [
-        "harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size", "dense_start",
+        "reflections", "exposure", "multi_view", "orientations", "growth", "full_size",
+        "dense_start",
         "refine_poses",
     ]  # fmt: skip
     assert property_at("training.full_size").default == "AUTO"

@@ -78,7 +78,7 @@ def test_every_training_setting_is_a_plain_number_or_a_word() -> None:
     assert all(isinstance(getattr(training, f.name), (int, float, str)) for f in fields(training))
 
 
-@pytest.mark.parametrize("name", ["harmonics", "exposure", "multi_view", "wrapping", "growth"])
+@pytest.mark.parametrize("name", ["exposure", "multi_view", "growth", "harmonics", "wrapping"])
 def test_what_a_scene_may_need_is_auto_on_or_off(name: str) -> None:
     for word in ("auto", "on", "off"):
         settings = replace(preset("draft"), training=replace(TrainingSettings(), **{name: word}))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from ...core.settings import MODEL_SELECTION, JobSettings, preset, with_values
+from ...core.settings import MODEL_SELECTION, JobSettings, declarations, preset, with_values
 from .setting_options import add_options, given_settings, option_of
 from .user_preset import add_user_preset, saved_values
 
@@ -40,8 +40,11 @@ def training_settings(options: Namespace) -> JobSettings:
     values = given_settings(options, "training") | given_settings(options, "constants")
     saved = saved_values(options, values.get("preset"))
     if options.needs is not None:
+        word = _SELECTION_VALUES[options.needs]
         selected = {
-            f"training.{name}": _SELECTION_VALUES[options.needs] for name in MODEL_SELECTION
+            declared.path: word
+            for declared in declarations(JobSettings)
+            if declared.model_selection and word in declared.choices
         }
         values = {**selected, **values}
     values = {**saved, **values}

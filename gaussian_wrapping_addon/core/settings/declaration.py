@@ -66,13 +66,15 @@ class Choices:
     """One of a list of words or numbers."""
 
     values: tuple[Any, ...]
+    earlier: tuple[Any, ...] = ()
+    """Further words in files of earlier versions, which mean the setting's default."""
 
     @property
     def wanted(self) -> str:
         return f"one of {', '.join(map(str, self.values))}"
 
     def holds(self, value: Any) -> bool:
-        return value in self.values
+        return value in self.values or value in self.earlier
 
 
 @dataclass(frozen=True)

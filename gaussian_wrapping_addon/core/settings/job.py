@@ -706,6 +706,8 @@ def read_saved_settings(path: Path) -> SavedSettings:
             notes.append(f"{name[:_SHOWN_NAME]!r} is no setting of this version.")
         elif not _is_valid(declared, value):
             notes.append(f"{name} is out of range, and stays as it is.")
+        elif isinstance(declared.check, Choices) and value in declared.check.earlier:
+            values[name] = declared.default
         else:
             values[name] = float(value) if declared.kind is float else value
     if len(notes) > MAX_NOTES:

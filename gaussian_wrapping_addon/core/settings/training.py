@@ -372,6 +372,28 @@ def _model_selection(
     )
 
 
+def _part_of_paper(*, help: str, option: Option, label: str, tooltip: str, name: str) -> Any:
+    """Declare a part that only Paper has unless asked for, as meshes hardly gain by it or lose.
+
+    Version 0.1.0 decided on it from the photos: job files of then say ``"auto"``.
+
+    Parameters
+    ----------
+    label, tooltip, name : str
+        Of the property in the panel; `name` is not the setting's, which .blend files hold as an
+        enum.
+    """
+    return setting(
+        "off",
+        help=help,
+        check=Choices(SWITCH, earlier=("auto",)),
+        presets={"paper": "on"},
+        option=option,
+        panel=PanelProperty(label, tooltip, name=name),
+        model_selection=True,
+    )
+
+
 @dataclass(frozen=True)
 class TrainingSettings(MethodSettings):
     """How the Gaussians are trained. Milestones are fractions of ``iterations``."""
@@ -439,16 +461,14 @@ class TrainingSettings(MethodSettings):
         unit="photos",
         option=Option("--holdout", "N", "hold out each n-th photo for measuring; 0 holds out none"),
     )
-    harmonics: str = _model_selection(
-        help="View-dependent colour. auto: only degrees that lower the error of held-out photos; "
-        "on: all of them; off: degree 0.",
-        paper="on",
+    harmonics: str = _part_of_paper(
+        help="View-dependent colour. on: up to degree `sh_degree`; off: degree 0, but a splat that "
+        "training starts from keeps what it has.",
         option=Option("--harmonics", help="colour that depends on the direction"),
         label="Reflections",
-        tooltip="Colours that change with the viewing direction: gloss, metal, glass",
-        auto="Only as much as lowers the error of held-out photos",
-        on="As much as the preset allows, whether it helps or not",
-        off="One colour from all directions; fastest, right for matte surfaces",
+        tooltip="Learn colours that change with the viewing direction: for images of the "
+        "Gaussians, meshes hardly gain. The preset Paper always does",
+        name="reflections",
     )
     exposure: str = _model_selection(
         help="Gain and offset per photo.",
@@ -470,15 +490,13 @@ class TrainingSettings(MethodSettings):
         on="Always compare; slower, gives smoother and more accurate surfaces",
         off="Never compare; faster",
     )
-    wrapping: str = _model_selection(
+    wrapping: str = _part_of_paper(
         help="Orientation of the Gaussians, its loss, and clones of opposite orientation.",
-        paper="on",
         option=Option("--wrapping", help="orientation, and clones of opposite orientation"),
-        label="Wrap Thin Parts",
-        tooltip="Learn orientations, and give thin parts a front and a back",
-        auto="Where the normals still show errors, such as on thin parts",
-        on="Always; thin parts such as wires, spokes and leaves get a front and a back",
-        off="Never; faster, but thin parts may be lost",
+        label="Orientations",
+        tooltip="Learn which way Gaussians face, and clone those that face two ways; meshes of "
+        "short trainings lose a little. The preset Paper always does",
+        name="orientations",
     )
     growth: str = _model_selection(
         help="Densification. auto: it stops where more Gaussians gain little, and Gaussians that "
@@ -634,4 +652,4 @@ class TrainingSettings(MethodSettings):
 
 
 MODEL_SELECTION = tuple(d.name for d in declarations(TrainingSettings) if d.model_selection)
-"""Settings of the model selection; ``"auto"`` decides from the photos."""
+"""Parts of the model that can be switched on and off, or left to the photos (``"auto"``)."""

@@ -127,14 +127,11 @@ def block_settings(plan: BlockPlan, index: int, settings: TrainingSettings) -> T
 
 def decided(plan: BlockPlan, settings: TrainingSettings) -> TrainingSettings:
     """Return settings that leave the model as the coarse training decided it."""
-    wrapping = plan.coarse.model_selection.get("wrapping")
     return dataclasses.replace(
         settings,
-        # No degree is tried beyond the highest one.
         sh_degree=plan.coarse.gaussians.sh_degree,
-        harmonics="auto",
+        harmonics="off",  # the degree does not rise again
         full_size="on" if plan.full_size else "off",
-        wrapping=settings.wrapping if wrapping is None else wrapping.chosen,
         refine_poses="off",
     )
 

@@ -298,44 +298,6 @@ def _read(tensor: Tensor) -> np.ndarray:
 # -- Measure the contribution of each Gaussian to the views and prune the smallest ones -----------
 
 
-def contributions(
-    gaussians: OrientedGaussians,
-    views: Iterable[WrapView],
-    renderer: Renderer,
-    *,
-    threads: int = 0,
-) -> np.ndarray:
-    """Return the contribution of each Gaussian to the images of the views.
-
-    Masked pixels count like all others: Gaussians there are in front of, or behind, something that
-    other views train.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Scene frame.
-    views : iterable of WrapView
-    renderer : Renderer
-        Overwrites its last view.
-
-    Returns
-    -------
-    (n,) float64
-        Mean over the views of the share of the image that the Gaussian fills: sum of its blending
-        weights divided by the number of pixels.
-    """
-    raw = RawArrays.from_gaussians(gaussians)
-    options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
-    share = np.zeros(len(gaussians))
-    count = 0
-    for view in views:
-        statistics = renderer.render(raw, view.camera, options).statistics
-        assert statistics is not None
-        share += statistics.weight_sum / (view.camera.width * view.camera.height)
-        count += 1
-    return share / max(1, count)
-
-
 def largest_contributors(weights: np.ndarray, share: float) -> np.ndarray:
     """Return the Gaussians that a view needs: all but the least, which make up ``share`` of it.
 

@@ -219,9 +219,6 @@ GPU_GAUSSIAN_BYTES, GPU_PIXEL_BYTES, GPU_BASE_BYTES = 2400, 200, 300 * 2**20
 images and losses of a pixel; the rest. An iteration on 1,000,000 Gaussians and 1920 x 1080 px took
 1.79 GiB (docs/cuda.md), to which the snapshot of 0.66 GiB is added."""
 
-TRIAL_S = 6.0
-"""Of one trial of harmonics on the processor of that machine."""
-
 MATCHING_PIXEL_S = 6e-6
 """Per pixel of all photos at the size at which they are matched for a dense start: 7.6 us of one
 thread (35 photos of 320 x 240 px, benchmarks/scenes wheel) on two threads, and 2 us for planes
@@ -384,7 +381,7 @@ def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float
             continue
         if schedule.densifies(done):
             count = max(count, min(top, schedule.budget(done), count * ROUND_GROWTH))
-        if settings.wrapping != "off" and schedule.wraps(done):
+        if settings.wrapping == "on" and schedule.wraps(done):
             count = min(settings.max_gaussians, count * (1.0 + settings.wrap_share))
     return counts
 
@@ -479,10 +476,8 @@ def estimate(
     matching_s = MATCHING_PIXEL_S * matched if first == 0 else 0.0
     if machine.gpu_speed:
         iterating = [_gpu_seconds(scene_facts, settings, c, first) for c in (least, most)]
-        trials_s = TRIAL_S * (settings.harmonics == "auto")
         low_s = LOW * (iterating[0] / machine.gpu_speed + matching_s / machine.speed)
-        high_s = iterating[1] / machine.gpu_speed + (matching_s + 3 * trials_s) / machine.speed
-        high_s *= HIGH
+        high_s = HIGH * (iterating[1] / machine.gpu_speed + matching_s / machine.speed)
     else:
         low_s = LOW * (_seconds(scene_facts, cheap, least, first) + matching_s) / machine.speed
         high_s = HIGH * (_seconds(scene_facts, settings, most, first) + matching_s) / machine.speed

@@ -377,7 +377,7 @@ def _median_gain(gain: np.ndarray, total: np.ndarray) -> np.ndarray:
     return np.median(gain[known], axis=0).astype(gain.dtype)
 
 
-# -- The decisions on the model that need no training, and those made by settings -----------------
+# -- All decisions that need no training ----------------------------------------------------------
 
 
 def first_decisions(
@@ -387,10 +387,8 @@ def first_decisions(
     neighbours: Mapping[int, np.ndarray],
     settings: TrainingSettings,
     image_size: Decision,
-    *,
-    from_splat: bool,
 ) -> tuple[ModelSelection, Exposure | None]:
-    """Decide on exposure, multi-view terms, harmonics, wrapping and growth, as far as possible now.
+    """Decide on exposure and multi-view terms, and on growth where the settings do.
 
     Parameters
     ----------
@@ -400,8 +398,6 @@ def first_decisions(
         Views beside each of them.
     image_size : Decision
         Made before.
-    from_splat : bool
-        Whether the training starts from a splat, which has harmonics of its own.
     """
     found = select_exposure(scene, photos, views)
     selection = ModelSelection((image_size,)).with_decision(
@@ -412,17 +408,6 @@ def first_decisions(
         exposure = Exposure(len(scene.views), views, found.log_gains)
     pairs = [neighbours[view] for view in views]
     selection = selection.with_decision(select_multi_view(pairs, settings.multi_view))
-    if settings.harmonics != "auto" or settings.sh_degree == 0 or from_splat:
-        degree = settings.sh_degree if settings.harmonics != "off" else 0
-        why = "the splat has harmonics of its own." if from_splat else "decided by the settings."
-        selection = selection.with_decision(
-            Decision(
-                "harmonics", settings.harmonics, f"degree {degree}", f"Not tried: {why}",
-                measured=False,
-            )
-        )  # fmt: skip
-    if settings.wrapping != "auto":
-        selection = selection.with_decision(Decision.by_settings("wrapping", settings.wrapping))
     if settings.growth == "off":
         selection = selection.with_decision(Decision.by_settings("growth", "off"))
     return selection, exposure

@@ -32,20 +32,6 @@ _MAX_WINDOWS = 1 << 12
 """Upper bound of the windows per photo; combines view and window into one history index."""
 
 
-def is_oriented(schedule: Schedule, state: TrainingState) -> bool:
-    """Tell whether the orientation is trained now: from its start on, unless wrapping is off."""
-    wrapping = state.model_selection.get("wrapping")
-    off = wrapping is not None and wrapping.chosen == "off"
-    return not off and schedule.is_oriented(state.iteration)
-
-
-def may_wrap(schedule: Schedule, state: TrainingState) -> bool:
-    """Tell whether a wrapping round may clone now: oriented, and decided where photos decide."""
-    undecided = state.model_selection.get("wrapping") is None
-    waits = undecided and schedule.settings.wrapping == "auto"
-    return not waits and is_oriented(schedule, state)
-
-
 class NotFinite(Exception):  # noqa: N818 - asks for a restart, caught in trainer.py
     """A loss is not finite."""
 
@@ -111,7 +97,7 @@ class Stepper:
         iteration, schedule, adam = state.iteration, self.schedule, state.adam
         backend = self.backend
         sample = self._draw_sample(state)
-        oriented = is_oriented(schedule, state)
+        oriented = schedule.is_oriented(iteration)
         gathers, uses_depth = schedule.gathers_statistics(iteration), schedule.uses_depth(iteration)
         options = RenderOptions(
             depth=uses_depth, sh_degree=state.degree, threads=self.threads, screen_gradients=gathers

@@ -26,15 +26,6 @@ from .camera_poses import LEAST_VIEWS, CameraPoses
 
 ON, OFF = "on", "off"
 
-TWO_SIDED_ERROR = 0.5
-"""Mean normal error from which a Gaussian counts as two-sided: 60 degrees. A Gaussian seen equally
-from both sides has about 1, whatever its orientation."""
-
-WRAPPING_SHARE = 0.04
-"""Share of the visible surface with at least that error from which wrapping is selected. Contours
-and creases of a solid cause some that clones would not fix: 1.6 to 2.4 % on rendered solids, up to
-3.1 % on real photos, whereas spokes and a thin cup have 10 % (640 pixels)."""
-
 
 @dataclass(frozen=True)
 class Decision:
@@ -185,46 +176,6 @@ def select_multi_view(neighbours: Sequence[np.ndarray], setting: str = "auto") -
         f"position and direction, {figures['neighbours_per_photo']:.1f} on average."
     )
     return decide("multi_view", setting, True, evidence, figures)
-
-
-def select_wrapping(errors: np.ndarray, weights: np.ndarray, setting: str = "auto") -> Decision:
-    """Decide whether orientations are trained and clones of opposite orientation are made.
-
-    Gaussians of a thin part are seen from both sides, so their orientation disagrees with the
-    normals of the depth map in about half of their views; Gaussians of a solid hardly ever do.
-    Their share of the visible surface is the evidence (docs/method.md, section 4.2).
-
-    Parameters
-    ----------
-    errors : (n,) float
-        Mean normal error ``1 - N . n_depth`` of each Gaussian over the views, in [0, 2], after the
-        initial orientation.
-    weights : (n,) float
-        Visible weight of each: pixels, or sums of blending weights; at least 0.
-
-    Raises
-    ------
-    UsageError
-        The shapes differ, or are not one-dimensional.
-    """
-    if errors.shape != weights.shape or errors.ndim != 1:
-        raise UsageError(
-            f"Errors are {errors.shape}, weights {weights.shape}.", "Give one of each per Gaussian."
-        )
-    known = np.isfinite(errors) & (weights > 0)
-    total = float(weights[known].sum(dtype=np.float64))
-    if total <= 0.0:
-        evidence = "No Gaussian is visible, so thin parts cannot be detected."
-        return decide("wrapping", setting, False, evidence)
-    against = float(weights[known & (errors >= TWO_SIDED_ERROR)].sum(dtype=np.float64)) / total
-    mean = float(np.average(errors[known].astype(np.float64), weights=weights[known]))
-    figures = {"mean_normal_error": mean, "share_two_sided": against, "limit": WRAPPING_SHARE}
-    evidence = (
-        f"On {100.0 * against:.1f} % of the visible surface, orientations disagree with the depth "
-        "map's normals, as on thin parts that are seen from both sides (limit "
-        f"{100.0 * WRAPPING_SHARE:.0f} %)."
-    )
-    return decide("wrapping", setting, against >= WRAPPING_SHARE, evidence, figures)
 
 
 # -- Whether camera poses are refined (docs/method.md, section 1.8) -------------------------------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Updates between iterations: density control, wrapping, 3D filter, choice of the SH degree."""
+"""Updates between iterations: density control, wrapping, 3D filter."""
 
 from __future__ import annotations
 
@@ -15,16 +15,13 @@ from ..progress import Progress
 from ..scene.scene import PhotoSource
 from .density import (
     contradicted,
-    contributions,
     densify_and_prune,
     needed_by_a_view,
     prune_contributors,
     reset_opacity,
 )
-from .harmonics_selection import TrialView, select_harmonics
-from .iteration import Stepper, may_wrap
-from .live_view import divisor_for
-from .model_selection import select_poses, select_wrapping
+from .iteration import Stepper
+from .model_selection import select_poses
 from .schedule import Schedule
 from .state import TrainingState, cancellable
 from .wrapping import WrapView, normal_errors, start_orientation, wrap
@@ -34,9 +31,6 @@ _logger = logging.getLogger(__name__)
 PRUNE_DIVISOR = 2
 VOTE_DIVISOR = 4
 """Divisors of the image size at which views are rendered for pruning and for the vote."""
-
-TRIAL_SIDE_PX = 144
-"""Long side of the photos on which harmonics are tried: colours vary slowly on the surface."""
 
 Inside = Callable[[np.ndarray], np.ndarray]
 """Maps (n, 3) points to (n,) bool."""
@@ -48,8 +42,6 @@ class Rounds:
     Parameters
     ----------
     stepper : Stepper
-    held_out : sequence of int
-        Held-out views.
     inside : callable, optional
         Tells which points lie in the regions that density control favours.
     progress : Progress
@@ -61,12 +53,11 @@ class Rounds:
     def __init__(
         self,
         stepper: Stepper,
-        held_out: Sequence[int],
         inside: Inside | None,
         progress: Progress,
         filter_views: Sequence[int] | None = None,
     ) -> None:
-        self.stepper, self.held_out, self.inside = stepper, list(held_out), inside
+        self.stepper, self.inside = stepper, inside
         self.filter_views = stepper.views if filter_views is None else list(filter_views)
         self.photos: PhotoSource = stepper.photos
         self.schedule: Schedule = stepper.schedule
@@ -111,9 +102,7 @@ class Rounds:
             self._empty_free_space(state)
         if schedule.decides_poses(iteration):
             self._decide_poses(state)
-        if schedule.decides_wrapping(iteration):
-            self._decide_wrapping(state)
-        if schedule.wraps(iteration) and may_wrap(schedule, state):
+        if schedule.wraps(iteration) and schedule.is_oriented(iteration):
             changed |= self._wrap(state)
         if changed:
             state.clear_statistics()
@@ -122,9 +111,6 @@ class Rounds:
         if schedule.resets_opacity(iteration):
             reset_opacity(adam)
             state.error_history.clear()
-        tries = self.settings.harmonics == "auto" and not schedule.refines
-        if tries and schedule.tries_harmonics(iteration):
-            self._try_harmonics(state)
 
     def filter(self, state: TrainingState) -> None:
         """Compute the 3D filter for the image size of the coming iteration."""
@@ -205,67 +191,11 @@ class Rounds:
             state.adam.gaussians(), views, self.stepper.renderer, threads=self.threads
         )
 
-    def _decide_wrapping(self, state: TrainingState) -> None:
-        """Decide about wrapping from the photos; if off, undo what was begun to decide it."""
-        shown = contributions(
-            state.adam.gaussians().detached(), self._views(VOTE_DIVISOR), self.stepper.renderer,
-            threads=self.threads,
-        )  # fmt: skip
-        decision = select_wrapping(self._normal_errors(state), shown, self.settings.wrapping)
-        state.model_selection = state.model_selection.with_decision(decision)
-        if decision.chosen == "off" and not self.schedule.refines:
-            # As if it had been off from the start; a splat keeps the orientation it came with.
-            state.adam.array("orientation")[state.adam.frozen :] = 0.0
-            state.adam.reset_moments("orientation")
-
     def _wrap(self, state: TrainingState) -> bool:
         """Clone Gaussians with the opposite orientation; return whether there are new ones."""
         errors = self._normal_errors(state)
         limit = self.settings.max_gaussians
         return wrap(state.adam, errors, self.settings.wrap_share, limit) > 0
-
-    def _try_harmonics(self, state: TrainingState) -> None:
-        """Raise the degree of the harmonics if enough of the surface gains by it.
-
-        A rejected degree is not tried again: three trials cost a short training a seventh of its
-        time, and the later the trial, the more view dependence has been absorbed by shapes.
-        """
-        degree = state.degree + 1
-        known = state.model_selection.get("harmonics")
-        refused = known is not None and known.figures.get("degree_tried") == degree
-        if degree > self.settings.sh_degree or refused:
-            return
-        found = select_harmonics(
-            state.adam.gaussians().detached(),
-            [self._trial_view(state, view) for view in cancellable(self.views, self.progress)],
-            [self._trial_view(state, view) for view in cancellable(self.held_out, self.progress)],
-            degree,
-            self.stepper.renderer,
-            threads=self.threads,
-            check=self.progress.check,
-        )
-        if found.coefficients is not None:
-            state.degree = degree
-            coefficients = found.coefficients
-            frozen = state.adam.frozen
-            state.adam.array("sh")[frozen:, : coefficients.shape[1]] = coefficients[frozen:]
-            state.error_history.clear()
-        state.model_selection = state.model_selection.with_decision(
-            found.decision("auto", state.degree)
-        )
-
-    def _trial_view(self, state: TrainingState, view: int) -> TrialView:
-        divisor = divisor_for(self.photos, view, TRIAL_SIDE_PX)
-        correction = None
-        if state.exposure is not None and view in self.views:
-            gain, offset = state.exposure.factors(view)
-            correction = (gain, offset)
-        return TrialView(
-            self.photos.camera(view, divisor),
-            self.photos.photo(view, divisor),
-            self.photos.mask(view, divisor),
-            correction,
-        )
 
     def _region_weights(self, state: TrainingState) -> np.ndarray | None:
         """Return (n,) weights of the Gaussians, or ``None`` if all weigh the same."""

@@ -46,10 +46,6 @@ REFINING_FROM = 0.7
 SMALLEST_SIDE_PX = 96
 """Smallest long side of a pyramid level; a finer level is used below it."""
 
-TRY_HARMONICS_AT = (0.4, 0.5, 0.6)
-"""Fractions of the iterations at which the next degree is tried: after shapes and
-view-independent colours have converged, and early enough for the degree to be trained."""
-
 POSES_FROM = 0.05
 """Fraction of the iterations from which camera poses are refined: before, colours still change
 more than a pixel's shift would change them."""
@@ -128,7 +124,7 @@ class Schedule:
         return chosen
 
     def sh_degree(self, iteration: int) -> int:
-        """Return the degree of the harmonics if it is not selected from the photos."""
+        """Return the degree of the harmonics, where they are on."""
         share = 1.0 if self.refines else min(1.0, self._share(iteration))
         return min(self.settings.sh_degree, int(share / self.settings.degree_every + 1e-9))
 
@@ -162,27 +158,12 @@ class Schedule:
         return iteration == self._at(self.settings.depth_from)
 
     def is_oriented(self, iteration: int) -> bool:
-        """Tell whether the orientation is trained, unless the photos decided against wrapping."""
-        wanted = self.settings.wrapping != "off"
-        return wanted and iteration >= self._at(self.settings.orient_from)
+        """Tell whether the orientation is trained."""
+        return self.settings.wrapping == "on" and iteration >= self._at(self.settings.orient_from)
 
     def starts_orientation(self, iteration: int) -> bool:
         """Tell whether this is the first iteration that trains the orientation."""
-        wanted = self.settings.wrapping != "off"
-        return wanted and iteration == self._at(self.settings.orient_from)
-
-    def decides_wrapping(self, iteration: int) -> bool:
-        """Tell whether the photos decide about wrapping after this iteration, if they are to.
-
-        Not before the orientation was trained: without it every normal looks wrong.
-        """
-        settings = self.settings
-        first = max(1, self._at(settings.wrap_from), self._at(settings.orient_from) + 1)
-        return settings.wrapping == "auto" and iteration == first
-
-    def tries_harmonics(self, iteration: int) -> bool:
-        """Tell whether the next degree is tried after this iteration, if trials decide."""
-        return iteration in {self._at(share) for share in TRY_HARMONICS_AT}
+        return self.settings.wrapping == "on" and iteration == self._at(self.settings.orient_from)
 
     def gathers_statistics(self, iteration: int) -> bool:
         """Tell whether this iteration collects statistics for density control."""

@@ -425,7 +425,7 @@ class _Trainer:
         key = fingerprint(self.scene, self.settings, self.seed, self.start_splat, taken_over)
         progress.update(0.0, "preparing the Gaussians")
         rounds = Rounds(
-            self.stepper, self.held_out, self.inside, progress,
+            self.stepper, self.inside, progress,
             None if handover is None else handover.filter_views,
         )  # fmt: skip
         state = load_checkpoint(self.folder, key)
@@ -544,10 +544,10 @@ class _Trainer:
         state = TrainingState.start(gaussians, self.seed)
         state.warnings = warnings
         if self.start_splat is not None:
-            state.degree = self.settings.sh_degree if self.settings.harmonics != "off" else 0
+            state.degree = self.settings.sh_degree  # a splat keeps its own harmonics
         state.model_selection, state.exposure = first_decisions(
             self.scene, self.photos, self.views, self.neighbours, self.settings,
-            self.image_decision, from_splat=self.start_splat is not None,
+            self.image_decision,
         )  # fmt: skip
         if decision is not None:
             state.model_selection = state.model_selection.with_decision(decision)

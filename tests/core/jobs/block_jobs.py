@@ -21,7 +21,7 @@ from gaussian_wrapping_addon.core.jobs.store.job_folder import (
 from gaussian_wrapping_addon.core.scene.scene import save_scene
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings, TextureSettings
 from tests.core.jobs.finished_sphere import write_cube
-from tests.core.training.blocks.row_scene import SETTINGS, row_scene
+from tests.core.training.row_scene import SETTINGS, row_scene
 
 TRAINING = dataclasses.replace(SETTINGS, iterations=120, blocks=2, checkpoint_every_s=0.2)
 

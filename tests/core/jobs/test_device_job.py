@@ -35,7 +35,7 @@ from gaussian_wrapping_addon.core.training import device_backend, estimate
 from gaussian_wrapping_addon.core.training import start as point_start
 from gaussian_wrapping_addon.core.training.splat_start import transform_gaussians
 from tests.core.render.cuda.emulation import EmulatedKernels
-from tests.core.training.devices.device_training import emulated_backend, perturbed_sphere
+from tests.core.training.device_training import emulated_backend, perturbed_sphere
 from tests.core.training.small_scene import sphere_scene
 
 SIZE_PX, TRAINED_PX = 64, 32

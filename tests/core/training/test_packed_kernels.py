@@ -20,7 +20,7 @@ from gaussian_wrapping_addon.core.training.adam import Adam
 from gaussian_wrapping_addon.core.training.losses import color_loss, normal_losses
 from tests.core.render.scenes import look_at, random_gaussians
 from tests.core.render.test_vectorised import PACKED, SINGLE
-from tests.core.training.optimizer.test_adam import all_rates, random_gradients
+from tests.core.training.test_adam import all_rates, random_gradients
 
 
 @functools.cache

@@ -17,8 +17,7 @@ from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.stereo.depth_maps import DepthPrior
 from gaussian_wrapping_addon.core.training.cpu_backend import CpuBackend
-from gaussian_wrapping_addon.core.training.iteration import Stepper, is_oriented
-from gaussian_wrapping_addon.core.training.model_selection import Decision, ModelSelection
+from gaussian_wrapping_addon.core.training.iteration import Stepper
 from gaussian_wrapping_addon.core.training.rounds import Rounds
 from gaussian_wrapping_addon.core.training.schedule import Schedule
 from gaussian_wrapping_addon.core.training.state import TrainingState
@@ -60,7 +59,7 @@ def rounds_of(scene: Scene, photos: PhotosInMemory, settings: TrainingSettings) 
     views = list(range(len(scene.views)))
     neighbours = {view: np.zeros(0, np.int64) for view in views}
     stepper = Stepper(photos, Schedule(settings, SIZE_PX), views, neighbours, CpuBackend(1), 1)
-    return Rounds(stepper, [], None, Progress("train"))
+    return Rounds(stepper, None, Progress("train"))
 
 
 def run(
@@ -90,7 +89,7 @@ def test_pruning_keeps_what_only_one_of_many_views_shows(views: int) -> None:
 @pytest.mark.parametrize("views", [20, 61, 120])
 def test_every_view_votes_for_orientations(views: int) -> None:
     scene, photos, discs = street(views)
-    rounds = rounds_of(scene, photos, dataclasses.replace(SETTINGS, orient_from=0.0))
+    rounds = rounds_of(scene, photos, dataclasses.replace(SETTINGS, wrapping="on", orient_from=0.0))
     state = TrainingState.start(discs.replaced(orientation=torch.zeros(views, 4)), 0)
     rounds.before_step(state)
     normals = state.adam.gaussians().normals().numpy()
@@ -157,88 +156,41 @@ def test_growth_on_and_auto_change_the_number() -> None:
         assert len(state.adam) != len(sphere_gaussians()), growth
 
 
-def test_wrapping_that_the_photos_refuse_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The normal loss ends with the decision, and what it has trained is given up."""
-    from gaussian_wrapping_addon.core.training import rounds as module
-
-    refused = Decision("wrapping", "auto", "off", "Refused for the test.")
-    monkeypatch.setattr(module, "select_wrapping", lambda *_: refused)
-    at = round(SETTINGS.wrap_from * SETTINGS.iterations)
-    rounds, state = run(SETTINGS, at - 1)
-    assert is_oriented(rounds.schedule, state)
-    assert np.abs(state.adam.array("orientation")).max() > 0.0
-    weights: list[float] = []
-    real = rounds.stepper.backend.normal_losses
-
-    def watched(*arguments: object, lambda_normal: float, **others: object) -> object:
-        weights.append(lambda_normal)
-        return real(*arguments, lambda_normal=lambda_normal, **others)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(rounds.stepper.backend, "normal_losses", watched)
-    for _ in range(at - 1, SETTINGS.iterations):
-        rounds.before_step(state)
-        rounds.stepper.step(state)
-        rounds.after_step(state)
-    assert weights[0] == SETTINGS.lambda_normal  # before the decision
-    assert weights[1:] == [0] * (SETTINGS.iterations - at)
-    assert not state.adam.array("orientation").any()
-
-
-def test_wrapping_is_decided_without_rounds_too() -> None:
-    _, state = run(dataclasses.replace(SETTINGS, wrap_rounds=0))
-    decision = state.model_selection.get("wrapping")
-    assert decision is not None
-    assert decision.setting == "auto"
+@pytest.mark.parametrize("word", ["off", "auto", "on"])
+def test_orientations_and_clones_are_asked_for(word: str) -> None:
+    """Version 0.1.0 stored "auto"; it means off."""
+    settings = dataclasses.replace(SETTINGS, wrapping=word, growth="off")
+    sphere = sphere_gaussians()
+    start = sphere.replaced(orientation=torch.zeros_like(sphere.orientation))
+    rounds, state = run(settings, start=start)
+    assert rounds.schedule.is_oriented(settings.iterations - 1) == (word == "on")
+    assert bool(state.adam.array("orientation").any()) == (word == "on")
+    assert (len(state.adam) > len(sphere)) == (word == "on")
 
 
 @pytest.mark.parametrize(
     ("orient_from", "wrap_from", "wrap_until"),
     [(0.7, 0.7, 0.9), (0.8, 0.4, 0.9), (0.2, 0.9, 0.5), (0.0, 0.0, 0.5)],
 )
-def test_wrapping_is_decided_on_orientations_and_before_clones(
+def test_nothing_is_cloned_before_orientations(
     orient_from: float, wrap_from: float, wrap_until: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever the order of the milestones; undecided, every normal would look wrong."""
-    from gaussian_wrapping_addon.core.training import rounds as module
-
-    decide, wrap = Rounds._decide_wrapping, Rounds._wrap
+    """Whatever the order of the milestones."""
+    wrap = Rounds._wrap
     oriented: list[bool] = []
-    decided: list[bool] = []
 
-    def watched_decision(self: Rounds, state: TrainingState) -> None:
-        oriented.append(bool(state.adam.array("orientation").any()))
-        decide(self, state)
+    def watched(self: Rounds, state: TrainingState) -> bool:
+        before = bool(state.adam.array("orientation").any())
+        if cloned := wrap(self, state):
+            oriented.append(before)
+        return cloned
 
-    def watched_wrap(self: Rounds, state: TrainingState) -> bool:
-        decided.append(state.model_selection.get("wrapping") is not None)
-        return wrap(self, state)
-
-    accepted = Decision("wrapping", "auto", "on", "Accepted for the test.")
-    monkeypatch.setattr(module, "select_wrapping", lambda *_: accepted)
-    monkeypatch.setattr(Rounds, "_decide_wrapping", watched_decision)
-    monkeypatch.setattr(Rounds, "_wrap", watched_wrap)
+    monkeypatch.setattr(Rounds, "_wrap", watched)
     settings = dataclasses.replace(
-        SETTINGS, orient_from=orient_from, wrap_from=wrap_from, wrap_until=wrap_until
-    )
+        SETTINGS, wrapping="on", orient_from=orient_from, wrap_from=wrap_from,
+        wrap_until=wrap_until,
+    )  # fmt: skip
     sphere = sphere_gaussians()
     run(settings, start=sphere.replaced(orientation=torch.zeros_like(sphere.orientation)))
-    assert oriented == [True]
-    assert decided
-    assert all(decided)
-
-
-def test_wrapping_on_is_not_decided() -> None:
-    rounds, state = run(dataclasses.replace(SETTINGS, wrapping="on"))
-    assert state.model_selection.get("wrapping") is None or state.model_selection.chose("wrapping")
-    assert is_oriented(rounds.schedule, state)
-    assert state.adam.array("orientation").any()
-
-
-def test_a_decision_of_an_earlier_state_is_kept() -> None:
-    off = ModelSelection((Decision("wrapping", "auto", "off", "Refused before."),))
-    schedule = Schedule(SETTINGS, SIZE_PX)
-    state = TrainingState.start(sphere_gaussians(), 0)
-    state.iteration = SETTINGS.iterations - 1
-    assert is_oriented(schedule, state)
-    state.model_selection = off
-    assert not is_oriented(schedule, state)
+    assert oriented
+    assert all(oriented)

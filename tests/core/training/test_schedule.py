@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -21,7 +23,10 @@ from gaussian_wrapping_addon.core.training.schedule import (
 
 @pytest.mark.parametrize(
     "settings",
-    [*(preset(p).training for p in PRESETS), TrainingSettings(iterations=7, wrap_rounds=0)],
+    [
+        *(replace(preset(p).training, wrapping="on") for p in PRESETS),
+        TrainingSettings(iterations=7, wrap_rounds=0, wrapping="on"),
+    ],
     ids=[*PRESETS, "seven"],
 )
 def test_milestones_come_in_order_and_everything_ends_at_full_quality(
@@ -64,7 +69,7 @@ def test_growth_leaves_room_for_the_wrapping_rounds() -> None:
 
 
 def test_position_rate_falls_log_linearly_and_orientation_waits() -> None:
-    settings = TrainingSettings(iterations=REFERENCE_ITERATIONS, sh_degree=1)
+    settings = TrainingSettings(iterations=REFERENCE_ITERATIONS, sh_degree=1, wrapping="on")
     plan = Schedule(settings, 640)
     first, middle, last = (float(plan.rates(i)["means"][0]) for i in (0, 15_000, 30_000))
     assert first == pytest.approx(SCENE_RADIUS * POSITION_RATE[0], rel=1e-6)
@@ -113,10 +118,9 @@ def test_the_budget_grows_evenly_to_the_cap_and_never_falls() -> None:
     assert few.budget(0) == 400
 
 
-def test_pruning_and_trials_happen_at_their_shares() -> None:
+def test_pruning_and_comparisons_happen_at_their_shares() -> None:
     schedule = Schedule(TrainingSettings(iterations=1000), 640)
     assert [i for i in range(1001) if schedule.prunes(i)] == [200, 300, 400, 500, 600, 700]
-    assert [i for i in range(1001) if schedule.tries_harmonics(i)] == [400, 500, 600]
     none = Schedule(TrainingSettings(iterations=1000, prune_share=0.0), 640)
     assert not any(none.prunes(i) for i in range(1001))
     grown = Schedule(TrainingSettings(iterations=1000, growth="on"), 640)
@@ -127,9 +131,9 @@ def test_pruning_and_trials_happen_at_their_shares() -> None:
 
 
 def test_without_wrapping_nothing_is_oriented() -> None:
-    schedule = Schedule(TrainingSettings(iterations=300, wrapping="off"), 640)
+    schedule = Schedule(TrainingSettings(iterations=300), 640)
     assert not any(schedule.is_oriented(i) or schedule.starts_orientation(i) for i in range(301))
-    with_it = Schedule(TrainingSettings(iterations=300), 640)
+    with_it = Schedule(TrainingSettings(iterations=300, wrapping="on"), 640)
     assert [i for i in range(301) if with_it.starts_orientation(i)] == [200]
     assert with_it.is_oriented(200)
     assert [i for i in range(301) if with_it.starts_depth(i)] == [70]

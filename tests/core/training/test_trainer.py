@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Training runs on a tiny scene: quality, resuming, cancellation, masks, non-finite values."""
+"""Training runs on a tiny scene: quality, resuming, masks, non-finite values, backdrop."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,16 +13,22 @@ import torch
 
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, UsageError, WrapError
 from gaussian_wrapping_addon.core.gaussians.files import write_splat_ply
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians, gaussians_at
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.render.projection import RawArrays
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
+from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import cpu_backend, iteration, live_view, rounds, trainer
+from gaussian_wrapping_addon.core.training.start import LEAST_REACH
 from gaussian_wrapping_addon.core.training.state import TrainingResult
-from gaussian_wrapping_addon.core.training.trainer import train
+from gaussian_wrapping_addon.core.training.trainer import train, with_backdrop
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
+from tests.synthetic import look_at
+
+# -- Training runs on a tiny scene: quality, resuming, cancellation, masks, non-finite values -----
 
 SETTINGS = TrainingSettings(
     iterations=40, max_gaussians=400, max_image_px=32, sh_degree=1, densify_every=5,
@@ -332,7 +337,7 @@ def test_windows_that_a_mask_empties_say_nothing(tmp_path: Path) -> None:
         SETTINGS, iterations=30, pixels_per_iteration=450, holdout_every=0, exposure="off"
     )
     run = trainer._Trainer(scene, store, settings, tmp_path, 0, 1)
-    state = run._start(rounds.Rounds(run.stepper, [], None, Progress()), "key", Progress())
+    state = run._start(rounds.Rounds(run.stepper, None, Progress()), "key", Progress())
     for _ in range(30):
         run.stepper.step(state)
     numbers = {row[1] % iteration._MAX_WINDOWS for row in state.error_history._rows}
@@ -368,17 +373,15 @@ def test_a_round_that_is_cancelled_half_way_is_done_again(
 
 def test_every_decision_is_written_down_and_can_be_overridden(tmp_path: Path) -> None:
     scene, photos = sphere_scene(views=9, size_px=24)
-    names = {
-        "full_size", "exposure", "multi_view", "harmonics", "wrapping", "growth", "dense_start",
-        "refine_poses",
-    }  # fmt: skip
+    names = {"full_size", "exposure", "multi_view", "growth", "dense_start", "refine_poses"}
+    parts = {*names, "harmonics", "wrapping"}
     settings = dataclasses.replace(SETTINGS, densify_until=0.9)
     result = train(scene, photos, settings, tmp_path, Progress(), threads=1)
     assert {d.name for d in result.model_selection} == names
     assert all(d.evidence and d.setting == "auto" for d in result.model_selection)
     for word, degree in (("on", 1), ("off", 0)):
         (tmp_path / word).mkdir()
-        asked = dataclasses.replace(settings, **dict.fromkeys(names, word))
+        asked = dataclasses.replace(settings, **dict.fromkeys(parts, word))
         result = train(scene, photos, asked, tmp_path / word, Progress(), threads=1)
         assert {d.name for d in result.model_selection} == names
         assert all(d.setting == word for d in result.model_selection)
@@ -386,28 +389,6 @@ def test_every_decision_is_written_down_and_can_be_overridden(tmp_path: Path) ->
         assert result.exposure_fitted == (word == "on")
         lengths = np.linalg.norm(result.gaussians.normals().numpy(), axis=1)
         assert (lengths.max() > 0) == (word == "on")
-
-
-@pytest.mark.parametrize(("accepts", "wanted"), [(False, [1]), (True, [1, 2])])
-def test_a_refused_degree_is_not_tried_again(
-    accepts: bool, wanted: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene, photos = sphere_scene(views=9, size_px=24)
-    tried: list[int] = []
-    trial = rounds.select_harmonics
-
-    def counted(
-        gaussians: Any, views: Any, held_out: Any, degree: int, *renderer: Any, **more: Any
-    ) -> Any:
-        tried.append(degree)
-        found = trial(gaussians, views, held_out, degree, *renderer, **more)
-        sh = np.zeros((len(gaussians), (degree + 1) ** 2, 3), np.float32)
-        return dataclasses.replace(found, coefficients=sh if accepts else None)
-
-    monkeypatch.setattr(rounds, "select_harmonics", counted)
-    settings = dataclasses.replace(SETTINGS, sh_degree=2)
-    train(scene, photos, settings, tmp_path, Progress(), threads=1)
-    assert tried == wanted
 
 
 def test_masks_can_mean_that_nothing_is_there(tmp_path: Path) -> None:
@@ -426,3 +407,95 @@ def test_masks_can_mean_that_nothing_is_there(tmp_path: Path) -> None:
         clear[mode] = float(alpha[~mask].mean())
     assert clear["background"] < 0.5 * clear["ignore"]
     assert clear["background"] < 0.25
+
+
+# -- A sphere behind everything, in the photos' colours, where no photo sees through --------------
+
+WIDTH, HEIGHT = 72, 48
+WALL_X, HALF_SIDE = 6.0, 4.0
+COLOR = np.array([0.7, 0.5, 0.2])
+DEGREE = 1
+
+
+def camera(at: tuple[float, ...], to: tuple[float, ...], focal_px: float = 90.0) -> Camera:
+    return look_at(np.array(at), np.array(to), "view", WIDTH, HEIGHT, focal_px)
+
+
+AT_WALL = [camera((0, y, 0.3), (WALL_X, y, 0.0)) for y in (-1.0, 0.0, 1.0)]
+PAST_WALL = camera((0, 6.0, 0.0), (WALL_X, 6.0, 0.1))
+"""In a direction in which the others see the wall, from a place beyond its border."""
+INTO_NOTHING = camera((0, 0, 0), (-WALL_X, 0.0, 0.1))
+
+
+class Photos:
+    """The cameras of a photo source; the photos themselves are not needed."""
+
+    def __init__(self, cameras: list[Camera]) -> None:
+        self.cameras = cameras
+
+    def camera(self, index: int, divisor: int = 1) -> Camera:
+        assert divisor == 1  # small enough
+        return self.cameras[index]
+
+
+def wall() -> OrientedGaussians:
+    """Return two opaque layers of flat Gaussians of one colour."""
+    across = np.arange(-HALF_SIDE, HALF_SIDE, 0.2)
+    y, z, x = (axis.reshape(-1) for axis in np.meshgrid(across, across, [WALL_X, WALL_X + 0.1]))
+    points, count = np.stack([x, y, z], 1), len(x)
+    return gaussians_at(
+        points, np.tile(COLOR, (count, 1)), np.full(count, 0.16), DEGREE,
+        normals=np.tile([-1.0, 0, 0], (count, 1)), flatness=0.1, opacities=0.95,
+    )  # fmt: skip
+
+
+def backed(cameras: list[Camera]) -> OrientedGaussians:
+    return with_backdrop(wall(), Photos(cameras), range(len(cameras)), threads=1)
+
+
+def rendered(gaussians: OrientedGaussians, view: Camera) -> np.ndarray:
+    raw, options = RawArrays.from_gaussians(gaussians), RenderOptions(depth=False, threads=1)
+    return ViewRenderer().render(raw, view, options).color.copy()
+
+
+def test_beyond_the_border_lie_the_colours_of_the_wall() -> None:
+    middle = np.s_[16:32, 24:48]
+    assert np.abs(rendered(wall(), PAST_WALL)[middle]).max() < 0.01
+    found = rendered(backed(AT_WALL), PAST_WALL)[middle]
+    np.testing.assert_allclose(found, np.broadcast_to(COLOR, found.shape), atol=0.08)
+
+
+def test_training_views_stay_as_they_are() -> None:
+    before, after = wall(), backed(AT_WALL)
+    for view in AT_WALL:
+        change = np.abs(rendered(after, view) - rendered(before, view))
+        assert change.max() < 0.5 / 255
+
+
+def test_the_trained_gaussians_come_first_unchanged() -> None:
+    before, after = wall(), backed(AT_WALL)
+    assert len(after) > len(before)
+    assert after.sh_degree == DEGREE
+    for (name, old), (_, new) in zip(before.tensors(), after.tensors(), strict=True):
+        assert (new[: len(old)] == old).all(), name
+    assert (after.means[len(before) :].norm(dim=1) > 0.99 * LEAST_REACH).all()
+
+
+def test_where_a_photo_sees_through_it_stays_open() -> None:
+    after = backed([*AT_WALL, INTO_NOTHING])
+    assert rendered(after, INTO_NOTHING)[20:28, 32:40].max() < 0.02
+    # Without this photo, the same directions are unknown and filled.
+    assert rendered(backed(AT_WALL), INTO_NOTHING)[20:28, 32:40].min() > 0.1
+
+
+def test_photos_of_nothing_give_no_colours() -> None:
+    for cameras in ([], [INTO_NOTHING]):
+        assert len(backed(cameras)) == len(wall())
+
+
+def test_it_can_be_cancelled() -> None:
+    def check() -> None:
+        raise Cancelled()
+
+    with pytest.raises(Cancelled):
+        with_backdrop(wall(), Photos(AT_WALL), range(3), threads=1, check=check)

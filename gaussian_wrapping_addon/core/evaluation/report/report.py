@@ -36,10 +36,8 @@ from .region_section import Picture, closedness, note_lines, region_lines, regio
 
 
 _TITLES = {
-    "harmonics": "View-dependent colour (gloss)",
     "exposure": "Brightness and tint of each photo",
     "multi_view": "Comparison of neighbouring photos",
-    "wrapping": "Thin parts (two-sided surfaces)",
     "growth": "Number of Gaussians",
     "full_size": "Size of the training images",
     "dense_start": "Start on surfaces found by matching photos",
@@ -48,10 +46,8 @@ _TITLES = {
 """Title of each choice, in an artist's words."""
 
 _EFFECTS = {
-    "harmonics": ('"on" uses all degrees up to `sh_degree`; "off" gives each point one colour'),
     "exposure": '"on" corrects every photo; "off" uses them unchanged',
     "multi_view": '"on" or "off"',
-    "wrapping": '"on" or "off"',
     "full_size": '"on" trains at full size up to `max_image_px`; "off" at half of it',
     "refine_poses": '"on" refines them in any case; "off" takes them as given',
     "dense_start": '"on" starts on whatever is found; "off" starts from the sparse points',

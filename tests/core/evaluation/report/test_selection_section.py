@@ -14,10 +14,7 @@ from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training.model_selection import Decision, ModelSelection, decide
 from tests.core.evaluation.report.report_examples import full_summary
 
-NAMES = (
-    "harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size", "dense_start",
-    "refine_poses",
-)  # fmt: skip
+NAMES = ("exposure", "multi_view", "growth", "full_size", "dense_start", "refine_poses")
 
 
 def training() -> dict[str, Any]:
@@ -54,7 +51,7 @@ def test_what_a_person_decided_is_told_apart() -> None:
 
 def test_where_nothing_was_measured_the_photos_say_nothing() -> None:
     evidence = "The settings decide."
-    decision = Decision("wrapping", "off", "off", evidence, measured=False)
+    decision = Decision("growth", "off", "off", evidence, measured=False)
     stored = Decision.from_json(json.loads(json.dumps(decision.to_json())))
     assert stored == decision
     text = "\n".join(selection_lines({"decisions": [stored.to_json()]}))
