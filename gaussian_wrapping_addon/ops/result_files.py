@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from ..core import limits
+from ..core.array_file import read_arrays
 from ..core.errors import DatasetError, ParseError
-from ..core.files import read_arrays, read_json, real_path, reject_foreign_entries
+from ..core.files import read_json, real_path, reject_foreign_entries
 from ..core.regions.files import read_region_file
 from ..core.scene.camera import Camera, Similarity
 from ..core.scene.placement import FILE_NAME, read_placement

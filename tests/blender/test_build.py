@@ -117,18 +117,18 @@ preferences.threads = 3
 preferences.device = "CPU"
 preferences.worker_python = {python!r}
 assert "gaussian_wrapping_addon" not in sys.modules
-workers = sys.modules[name + ".ops.worker.preferred_worker"]
+workers = sys.modules[name + ".ops.worker_setup"]
 choice = workers.worker_choice(bpy.context)
 assert (choice.threads, choice.python, choice.device) == (3, {python!r}, "cpu"), choice
 import time
 scene = bpy.context.scene
 scene.gwrap.source = {photos!r}
 assert bpy.ops.gwrap.wrap_scene() == {{"FINISHED"}}
-timer = sys.modules[name + ".ops.jobs.job_timer"]
+timer = sys.modules[name + ".ops.job_timer"]
 end_s = time.monotonic() + 60
 while timer.poll_jobs() and time.monotonic() < end_s:
     time.sleep(0.1)
-watched = sys.modules[name + ".ops.jobs.watched_jobs"]
+watched = sys.modules[name + ".ops.job_timer"]
 status = watched.status_of(scene.gwrap.job_folder)
 print("STATUS", status.state, status.error)
 known = Path(bpy.utils.extension_path_user(name)) / "known_jobs.json"

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gaussian_wrapping_addon.core.array_file import is_whole, read_arrays
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.core.files import is_whole, read_arrays
 
 
 @pytest.fixture

@@ -46,7 +46,7 @@ def test_the_table_needs_the_standard_library_alone() -> None:
     code = (
         "import sys\n"
         f"sys.path.insert(0, {str(PACKAGE.parent)!r})\n"
-        "import gaussian_wrapping_addon.core.export_formats\n"
+        "import gaussian_wrapping_addon.core.names\n"
         "assert 'numpy' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-I", "-c", code], check=True)

@@ -40,10 +40,10 @@ def steps() -> Iterator[float]:
     press(bpy.ops.gwrap.wrap_scene)
     yield from until(lambda: state_of_job() == "RUNNING", "the job runs")
     yield from until(lambda: fraction_of_job() > 0.2, "the timer sees progress")
-    points = driving.module("ui.jobs.points_drawing")
+    points = driving.module("ui.job_view")
     yield from until(lambda: points._drawing.batch is not None, "the training's points are drawn")
     check(not points.VIEW.failed, "without an error")
-    bar = driving.module("ui.jobs.status_bar")
+    bar = driving.module("ui.job_view")
     check(len(bar.running_jobs()) == 1 and not bar._failed, "the status bar shows the job")
     driving.execute(bpy.ops.view3d.view_axis, type="FRONT")
     yield 1.0

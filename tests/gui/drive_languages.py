@@ -28,7 +28,7 @@ def steps() -> Iterator[float]:
     yield from driving.open_tab()
     view = bpy.context.preferences.view
     look_up = bpy.app.translations.pgettext
-    points = driving.module("ui.jobs.points_drawing")
+    points = driving.module("ui.job_view")
     for language in PAPER:
         view.language = language
         view.use_translate_interface = view.use_translate_tooltips = True
@@ -49,7 +49,7 @@ def steps() -> Iterator[float]:
         press(bpy.ops.wm.window_new)
         yield 1.0
         check(len(bpy.context.window_manager.windows) == 2, "a second window")
-        bar = driving.module("ui.jobs.status_bar")
+        bar = driving.module("ui.job_view")
         check(not bar._failed and not points.VIEW.failed, "both are drawn without an error")
         press(bpy.ops.gwrap.cancel_job)
         yield from until(lambda: state_of_job() == "CANCELLED", "the job is cancelled")

@@ -83,7 +83,7 @@ def steps() -> Iterator[float]:
     middle = on_screen(region, area.spaces.active.region_3d, box.matrix_world.translation)
     side = side_on_screen(box, 0)
     yield from drag(side, side + 0.8 * (side - middle))
-    gizmo = driving.module("ui.regions.region_gizmo")
+    gizmo = driving.module("ui.region_panel")
     yield from driving.until(lambda: gizmo._drag.before is None, "the drag has ended")
     box = bpy.data.objects["Front Door"]
     screenshot("9-dragged")

@@ -31,7 +31,7 @@ class Stalls:
     """Measures how long the add-on's timer keeps Blender waiting while a job runs."""
 
     def __init__(self) -> None:
-        self._timer = driving.module("ops.jobs.job_timer")
+        self._timer = driving.module("ops.job_timer")
         self._poll = self._timer.poll_jobs
         self._timer.poll_jobs = self._measured
         self.looks_s: list[float] = []
@@ -42,7 +42,7 @@ class Stalls:
         self._parts_s: dict[str, float] = {}
         for owner, name in (
             (driving.module("core.jobs.client").JobClient, "poll"),
-            (driving.module("ops.jobs.live_preview"), "refresh"),
+            (driving.module("ops.job_timer"), "refresh"),
             (self._timer, "_bring_in"),
             (self._timer, "redraw"),
         ):
@@ -146,9 +146,7 @@ def wrap() -> Iterator[float]:
             seen.append(status.fraction)
         if not stages or status.stage != stages[-1]:
             stages.append(status.stage)
-        pictures = driving.module("ops.jobs.live_preview").icons_of(
-            bpy.context.scene.gwrap.job_folder
-        )
+        pictures = driving.module("ops.job_timer").icons_of(bpy.context.scene.gwrap.job_folder)
         if status.stage == "train" and pictures and not photographed:
             yield 1.0
             screenshot("2-training")

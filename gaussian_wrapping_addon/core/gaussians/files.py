@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..array_file import read_arrays
 from ..errors import MeshingError, ParseError
-from ..files import read_arrays, write_bytes
+from ..files import write_bytes
 from ..limits import QUATERNION_MIN_NORM
 from ..ply import read_ply_header, read_vertices
 from ..progress import LEFT_OUT_HINT, ReportWarning

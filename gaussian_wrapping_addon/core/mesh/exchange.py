@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from .. import limits
+from ..array_file import read_arrays
 from ..errors import ParseError, WorkerError
-from ..files import read_arrays, read_json, write_bytes
+from ..files import read_json, write_bytes
 from ..names import EXPORT_FORMATS
 from ..photos.formats import forbid_ghostscript
 from ..scene.camera import Similarity

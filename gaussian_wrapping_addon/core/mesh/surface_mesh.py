@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from ..array_file import read_arrays
 from ..errors import ParseError
-from ..files import read_arrays, write_bytes
+from ..files import write_bytes
 
 # -- A triangle mesh in the scene frame -----------------------------------------------------------
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from ..array_file import read_arrays
 from ..errors import ParseError
-from ..files import read_arrays, write_bytes
+from ..files import write_bytes
 from .surface_mesh import SurfaceMesh
 
 # -- UDIM tiles: several textures side by side in one UV map. Needs numpy only --------------------

@@ -14,8 +14,9 @@ from typing import Any, Literal, Protocol, TypeVar
 import numpy as np
 
 from .. import limits
+from ..array_file import read_arrays
 from ..errors import DatasetError, ParseError
-from ..files import read_arrays, read_json, write_bytes, write_json
+from ..files import read_json, write_bytes, write_json
 from ..limits import POINT_REACH
 from ..names import SHARED_VARIABLE
 from ..progress import ReportWarning, read_warnings

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from .. import limits
+from ..array_file import read_arrays
 from ..errors import ParseError
-from ..files import read_arrays, write_bytes
+from ..files import write_bytes
 from ..parallel import default_threads, run_chunks
 from ..progress import Progress
 from ..scene.camera import Camera

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..array_file import read_arrays
 from ..errors import ParseError, UsageError
-from ..files import read_arrays, read_json, write_bytes, write_json
+from ..files import read_json, write_bytes, write_json
 from ..gaussians.model import OrientedGaussians
 from ..limits import MAX_BLOCKS
 from ..parallel import default_threads

@@ -17,8 +17,9 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from ..array_file import read_arrays
 from ..errors import ParseError, UsageError
-from ..files import open_regular, read_arrays, read_json, write_bytes, write_json
+from ..files import open_regular, read_json, write_bytes, write_json
 from ..gaussians.model import TRAINED, OrientedGaussians
 from ..progress import Progress, ReportWarning, read_warnings
 from ..scene.camera import Camera

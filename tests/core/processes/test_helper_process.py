@@ -175,7 +175,7 @@ def test_a_lower_limit_of_the_user_stays() -> None:
     code = (
         "import resource, sys\n"
         f"sys.path.insert(0, {str(Path(__file__).resolve().parents[3])!r})\n"
-        "from gaussian_wrapping_addon.core.processes.address_space import *\n"
+        "from gaussian_wrapping_addon.core.worker.helper_process import *\n"
         "G = 2**30\n"
         "resource.setrlimit(resource.RLIMIT_AS, (3 * G, 4 * G))\n"
         "assert is_limited_below(3 * G + 1) and not is_limited_below(3 * G)\n"

@@ -78,4 +78,4 @@ def test_pycolmap_is_imported_in_one_place() -> None:
         for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.Import) and any(name.name == "pycolmap" for name in node.names)
     }
-    assert places == {"core/dataset/pycolmap_import.py"}
+    assert places == {"core/readers/lenses.py"}

@@ -203,10 +203,10 @@ def test_a_broken_extra_says_why(tmp_path: Path, version: str, module: str, word
     (tmp_path / "gw_delta.py").write_text(module)
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        "from tests.core.setup.test_extras import PLAY, worker_extras\n"
-        "worker_extras.EXTRAS = (PLAY,)\n"
-        "try: print('loaded', worker_extras.load_extra('play', 'x').__name__)\n"
-        "except worker_extras.MissingExtraError as error: print(error)\n"
+        "from tests.core.setup.test_extras import PLAY, environment\n"
+        "environment.EXTRAS = (PLAY,)\n"
+        "try: print('loaded', environment.load_extra('play', 'x').__name__)\n"
+        "except environment.MissingExtraError as error: print(error)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False,

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...array_file import read_arrays
 from ...errors import DatasetError, ParseError, UsageError, WrapError
-from ...files import read_arrays, read_json, real_path, reject_foreign_entries, write_bytes
+from ...files import read_json, real_path, reject_foreign_entries, write_bytes
 from ...names import EXPORT_FORMATS, JOB_MARKER, SHADINGS, SPLAT_STEM, WORKER_FORMATS, file_stems
 from ...photos.formats import open_image, without_warnings
 from ...scene.camera import Similarity

@@ -310,8 +310,8 @@ class PartRunner:
         return self._region[2]
 
     def _run_tile(self, part: Part, progress: Progress) -> PartResult:
+        from ...array_file import is_whole
         from ...devices.checks import is_device_failure
-        from ...files import is_whole
 
         folder = self._stage_folder(f"plan-{part.region}") / TILES_FOLDER
         path = tile_file(folder, part.kind, part.tile)

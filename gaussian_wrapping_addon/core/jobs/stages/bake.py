@@ -9,8 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ...array_file import is_whole
 from ...errors import UsageError
-from ...files import is_whole, write_json
+from ...files import write_json
 from ...progress import Progress
 from ...settings import key_values
 from ..store.job_file import BakeRequest, JobFile, training_keys

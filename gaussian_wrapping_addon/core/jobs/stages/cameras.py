@@ -269,7 +269,7 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
     UsageError
         A splat is to get metres by photos, or a video by GPS, which they have none of.
     """
-    from ...files import is_whole
+    from ...array_file import is_whole
     from ...loading.load import load_scene
     from ...loading.real_world import UnitsRequest
     from ...photos.photo_file import AS_WRITTEN, MaskReading

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...array_file import is_whole
 from ...devices import DeviceChoice
 from ...errors import DatasetError, ParseError, UsageError, WrapError
-from ...files import is_whole, read_bounded, read_json, write_bytes, write_json
+from ...files import read_bounded, read_json, write_bytes, write_json
 from ...limits import MIN_IMAGES
 from ...machine import helper_memory_limit_bytes
 from ...masks.mask_folder import (

@@ -13,10 +13,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ...array_file import is_whole
 from ...devices import CPU, DeviceChoice, stage_device
 from ...devices.checks import is_device_failure
 from ...errors import DatasetError, MeshingError, WrapError
-from ...files import is_whole
 from ...meshing.tiles.plan import Field, TilePlan
 from ...meshing.tiles.store import (
     faces_path,

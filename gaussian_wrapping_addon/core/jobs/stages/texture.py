@@ -9,9 +9,10 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ...array_file import is_whole
 from ...errors import ParseError
 from ...evaluation.report.report import CURVE, write_report
-from ...files import finite_json, is_whole, read_json, resolve_inside, write_json
+from ...files import finite_json, read_json, resolve_inside, write_json
 from ...names import REPORT_FOLDER, RESULT_FORMATS
 from ...progress import Progress
 from ...scene.camera import Similarity

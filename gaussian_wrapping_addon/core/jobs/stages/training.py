@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from ...array_file import is_whole
 from ...devices import DeviceChoice
 from ...errors import ParseError, ResourceError, UsageError, WorkerError
-from ...files import is_whole, read_json, write_json
+from ...files import read_json, write_json
 from ...progress import Progress, ReportWarning, read_warnings
 from ...settings import MeshingSettings, TrainingSettings, to_json
 from ...worker.helper_process import own_peak_bytes

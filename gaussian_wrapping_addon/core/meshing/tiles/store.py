@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from ...array_file import read_arrays
 from ...errors import ParseError
-from ...files import read_arrays, read_json, write_bytes, write_json
+from ...files import read_json, write_bytes, write_json
 from ...progress import read_warnings
 from ...regions.shapes import Region, Tiling
 from ..surface_points import CandidateSurface, Caps, Spacing, SurfacePoints

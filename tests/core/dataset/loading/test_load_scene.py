@@ -424,9 +424,9 @@ def test_checking_needs_numpy_only(tmp_path: Path) -> None:
         "sys.meta_path.insert(0, Refuse())\n"
         "from pathlib import Path\n"
         "from gaussian_wrapping_addon.core.loading.check import check_input\n"
-        "import gaussian_wrapping_addon.core.dataset.loading.load\n"
-        "import gaussian_wrapping_addon.core.dataset.photos.photo_store\n"
-        "import gaussian_wrapping_addon.core.dataset.scene_file\n"
+        "import gaussian_wrapping_addon.core.loading.load\n"
+        "import gaussian_wrapping_addon.core.photos.store\n"
+        "import gaussian_wrapping_addon.core.scene.scene\n"
         "for finding in check_input(Path(sys.argv[1])):\n"
         "    sys.stdout.write(f'{finding.severity}: {finding.message}\\n')\n"
     )

@@ -162,7 +162,7 @@ def test_pillow_opens_files_in_one_place_only() -> None:
         and node.func.attr == "open"
         and getattr(node.func.value, "id", "") in ("Image", "PIL")
     }
-    assert places == {"core/dataset/photos/image_formats.py"}
+    assert places == {"core/photos/formats.py"}
 
 
 def test_threads_that_overlap_hear_no_warning_and_restore_the_filters() -> None:
