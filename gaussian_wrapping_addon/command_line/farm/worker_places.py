@@ -28,7 +28,7 @@ def in_worker(module: str, request: dict[str, Any]) -> int:
     from ...core.jobs.commands.run_in_worker import run_in_worker
 
     return run_in_worker(
-        request, python=worker_python(), module=f"jobs.commands.farm.{module}", what="command",
+        request, python=worker_python(), module=f"jobs.commands.farm_{module}", what="command",
         grace_s=_GRACE_S,
     )  # fmt: skip
 
