@@ -67,7 +67,7 @@ def checked_job(photos: Path, options: Namespace) -> JobFile:
     DatasetError, UsageError, DeviceError
         The photos, an option or the device cannot be used.
     """
-    from ..core.errors import DatasetError
+    from ..core.errors import DatasetError, UsageError
     from ..core.jobs.client import worker_if_any
     from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import make_job
@@ -76,6 +76,10 @@ def checked_job(photos: Path, options: Namespace) -> JobFile:
     settings = training_settings(options)
     # Presets of the program have no settings of textures; those of users have.
     job = make_job("wrap", photos, region_settings(settings, options, texture_stays=True))
+    if job.settings.training.blocks > 1 and not job.settings.computers:
+        raise UsageError(
+            "--blocks saves no time in one process.", "Give --computers as well, or omit --blocks."
+        )
     require_device(job.settings.device)
     _reject_frames_of_photos(job)
     panoramas = job.settings.equirectangular

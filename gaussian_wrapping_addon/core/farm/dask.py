@@ -106,11 +106,10 @@ class DaskTasks:
     def __init__(self, address: str, processes: int, certificates: str = "") -> None:
         self._address = address if address == LOCAL else str(scheduler_address(address))
         load_extra("farm", "Several processes or computers")
-        import cloudpickle
         import dask
         from distributed import Client, LocalCluster
 
-        cloudpickle.register_pickle_by_value(child)
+        _send_child_as_source(logging.ERROR)
         self._run = child.sendable()
         self._futures: dict[str, Future] = {}
         self._refusing: set[str] = set()
@@ -125,7 +124,6 @@ class DaskTasks:
                 "distributed.admin.log-length": 100,
             }
         )
-        logging.getLogger("distributed").setLevel(logging.ERROR)
         target: Any = self._address
         if self._address == LOCAL:
             self._cluster = target = LocalCluster(
@@ -287,6 +285,14 @@ class DaskTasks:
             _logger.warning("the Dask cluster did not close: %s", error)
 
 
+def _send_child_as_source(log_level: int) -> None:
+    """Have :mod:`.child` sent whole: workers need not have the add-on; quieten Dask's log."""
+    import cloudpickle
+
+    cloudpickle.register_pickle_by_value(child)
+    logging.getLogger("distributed").setLevel(log_level)
+
+
 async def check_scheduler(address: str, security: Any) -> None:
     """Ask a scheduler for its name: a client would wait for ever for one that accepts and hangs.
 
@@ -416,11 +422,9 @@ async def ask_workers(
     WorkerError
         No scheduler answers.
     """
-    import cloudpickle
     from distributed import Client
 
-    cloudpickle.register_pickle_by_value(child)
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    _send_child_as_source(logging.CRITICAL)
     security = security_of(str(address), certificates)
     await check_scheduler(str(address), security)
     try:

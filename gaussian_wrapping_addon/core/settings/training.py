@@ -607,27 +607,10 @@ class TrainingSettings(MethodSettings):
     blocks: int = setting(
         1,
         help="Parts of the scene that are trained each by itself, after a coarse training of the "
-        "whole, and then joined: side by side in several processes or computers, or one after "
-        "another in less memory. 1 trains the scene in one piece.",
+        "whole, and then joined; on several computers only. 1 trains the scene in one piece.",
         check=Range(1, MAX_BLOCKS),
         unit="blocks",
-        option=Option("--blocks", help="train the scene in this many parts, and join them"),
-        panel=PanelProperty(
-            "Blocks",
-            "Parts of the scene that are trained each by itself and then joined: for hundreds of "
-            "photos, on several processes or computers. 1: in one piece",
-            soft_high=16,
-        ),
-        since="0.2.0",
-    )
-    polish: float = setting(
-        0.1,
-        help="Share of the iterations that joined blocks are trained together on all photos; 0: "
-        "none, which needs the least memory. No effect without blocks.",
-        check=Range(0.0, 1.0),
-        option=Option(
-            "--polish", "SHARE", "share of the iterations that joined blocks are trained together"
-        ),
+        option=Option("--blocks", help="with --computers: train the scene in this many parts"),
         since="0.2.0",
     )
     checkpoint_every_s: float = setting(

@@ -98,7 +98,7 @@ class BlockSettings:
     @classmethod
     def of(cls, settings: TrainingSettings) -> BlockSettings:
         """Return how settings of a whole training divide it."""
-        return cls(settings.blocks, polish_iterations=settings.polish)
+        return cls(settings.blocks)
 
     @property
     def coarse_share(self) -> float:

@@ -545,15 +545,6 @@ PHOTOS_OVERLAP = 1.6
 """A block takes about so many times its share of the photos: those of its margin, and those that
 look into it from outside."""
 
-JOINED_COPIES = 3
-"""Of the values of joined Gaussians that are not trained together: a block's, all, as rendered."""
-
-MOST_ADVISED = 64
-"""Blocks that a warning names."""
-
-LEAST_PHOTOS = 20
-"""Photos of a block: fewer show too little of it from all sides."""
-
 MARGIN_GAUSSIANS = 1.4
 """Gaussians of a block with its margin, as a multiple of those in its cell: 0.2 of the cell's size
 along two axes, on one side each for the four blocks of a square."""
@@ -624,10 +615,6 @@ def block_estimates(
         facts, dataclasses.replace(settings, extra_iterations=further, dense_start="off"), machine,
         first=settings.iterations,
     )  # fmt: skip
-    if not further:  # they are rendered, without moments and snapshots
-        values = (GAUSSIAN_COPIES - JOINED_COPIES) * gaussian_bytes(settings)
-        less = round(joined.gaussians * values)
-        joined = dataclasses.replace(joined, memory_bytes=joined.memory_bytes - less)
     return (
         estimate(facts, blocks.coarse(settings), machine),
         estimate(photos, of_block, machine),
@@ -643,34 +630,3 @@ def coarse_gaussians(settings: TrainingSettings) -> int:
 def gaussians_of_block(settings: TrainingSettings) -> int:
     """Return about the largest number of Gaussians that one block trains."""
     return math.ceil(MARGIN_GAUSSIANS * settings.max_gaussians / settings.blocks)
-
-
-def memory_warnings(
-    facts: SceneFacts, settings: TrainingSettings, machine: Machine, expected: Estimate
-) -> list[ReportWarning]:
-    """Check disk space and memory; where memory is short, say which number of blocks fits.
-
-    Raises
-    ------
-    ResourceError
-        The disk has less free space than the training will write.
-    """
-    warnings = check_resources(expected, machine)
-    advice = blocks_advice(facts, settings, machine) if warnings else ""
-    return [dataclasses.replace(warning, hint=advice) for warning in warnings]
-
-
-def blocks_advice(facts: SceneFacts, settings: TrainingSettings, machine: Machine) -> str:
-    """Return which number of blocks fits into the free memory; empty if none does."""
-    if not machine.memory_bytes:
-        return ""
-    for polish in dict.fromkeys((settings.polish, 0.0)):
-        blocks = max(2, 2 * settings.blocks)
-        while blocks <= min(MOST_ADVISED, facts.photos // LEAST_PHOTOS):
-            divided = dataclasses.replace(settings, blocks=blocks, polish=polish)
-            needed = estimate_training(facts, divided, machine).memory_bytes
-            if needed <= MEMORY_SHARE_LEFT * machine.memory_bytes:
-                options = f"--blocks {blocks}" + ("" if polish else " --polish 0")
-                return f"In blocks it needs {needed / 2**30:.1f} GB: {options}."
-            blocks *= 2
-    return ""

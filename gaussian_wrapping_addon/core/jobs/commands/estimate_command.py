@@ -32,8 +32,8 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
     from ...training.estimate import (
         MESH_AND_TEXTURE_SHARE,
         block_estimates,
+        check_resources,
         estimate_training,
-        memory_warnings,
         renderer_is_compiled,
         speeds,
         this_machine,
@@ -74,7 +74,7 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
         lines.append("solving the cameras: minutes before")
     if not timed:
         lines.append("not timed here: the first job compiles the renderer, about a minute, once")
-    return [*lines, *memory_warnings(facts, training, machine, expected)]
+    return [*lines, *check_resources(expected, machine)]
 
 
 def input_facts(source: Path, settings: JobSettings | None = None) -> SceneFacts:

@@ -11,6 +11,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -235,9 +236,9 @@ GAUSSIANS_NAME = "gaussians.npz"
 """In the folder of a block: what it has trained."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class BlockStages:
-    """The stages of one training in blocks.
+    """The stages of one training in blocks; scene and plan are loaded once.
 
     Parameters
     ----------
@@ -253,6 +254,17 @@ class BlockStages:
     cameras: Stage
     threads: int
     device: DeviceChoice
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene with the poses that it came with."""
+        from ...scene.scene import load_saved_scene
+
+        return load_saved_scene(self.cameras.folder)
+
+    def fit_device(self, gaussians: int | None = None) -> None:
+        """Train on the processor where the GPU's memory does not suffice for so many Gaussians."""
+        self.device = fitting_device(self.scene, self.job, self.device, gaussians)
 
     def coarse(
         self,
@@ -297,7 +309,7 @@ class BlockStages:
         from ...training.state import remove_checkpoints
 
         settings, blocks = self._settings, self._blocks
-        coarse_settings, scene = blocks.coarse(settings), self._scene()
+        coarse_settings, scene = blocks.coarse(settings), self.scene
         backend = self._backend()
         coarse = train_coarse(
             scene, _photos(scene, coarse_settings), coarse_settings, folder,
@@ -345,7 +357,7 @@ class BlockStages:
         def whole(folder: Path) -> bool:
             done = read_done(folder) or {}
             # A coarse training that was done again, on another machine, may divide differently.
-            return done.get("plan") == self._plan().digest and is_whole(folder / GAUSSIANS_NAME)
+            return done.get("plan") == self._plan.digest and is_whole(folder / GAUSSIANS_NAME)
 
         key = f"{index:04d}"
 
@@ -362,7 +374,7 @@ class BlockStages:
         from ...training.blocks import train_block
         from ...training.state import remove_checkpoints
 
-        plan, settings = self._plan(), self._settings
+        plan, settings = self._plan, self._settings
         scene = self._refined(plan)
         result = train_block(
             plan, index, scene, _photos(scene, settings), settings, folder, progress,
@@ -440,7 +452,7 @@ class BlockStages:
         stages = self.finished()
         if len(stages) < self._settings.blocks + 1:
             raise WorkerError("Blocks of the training are missing.", "Resume the job.")
-        plan, settings = self._plan(), self._settings
+        plan, settings = self._plan, self._settings
         scene = self._refined(plan)
 
         def parts() -> Iterator[OrientedGaussians]:
@@ -482,6 +494,7 @@ class BlockStages:
 
         return BlockSettings.of(self._settings)
 
+    @cached_property
     def _plan(self) -> BlockPlan:
         from ...training.block_plan import PLAN_NAME, load_plan
 
@@ -489,15 +502,10 @@ class BlockStages:
             raise WorkerError("The training is not divided into blocks yet.", "Resume the job.")
         return load_plan(self.root)
 
-    def _scene(self) -> Scene:
-        from ...scene.scene import load_saved_scene
-
-        return load_saved_scene(self.cameras.folder)
-
     def _refined(self, plan: BlockPlan) -> Scene:
         from ...scene.scene import with_poses
 
-        scene, poses = self._scene(), plan.coarse.poses
+        scene, poses = self.scene, plan.coarse.poses
         return scene if poses is None else with_poses(scene, poses)
 
     def _priors(
@@ -578,7 +586,7 @@ def run_training(
         try:
             if job.settings.training.blocks > 1:
                 blocks = _blocks(folder, job, cameras, version, threads, device)
-                done = _join(stage_folder, blocks, progress, device)
+                done = _join(stage_folder, blocks, progress)
             else:
                 done = _train(stage_folder, job, cameras, progress, threads, device)
         except BaseException:
@@ -612,20 +620,18 @@ def run_coarse(
     ResourceError
         The disk is too full, or memory does not suffice.
     """
-    from ...scene.scene import load_saved_scene
     from ...training.estimate import coarse_gaussians
 
-    trained = _finished_training(folder, job, cameras, version)
-    if trained is not None:
-        return trained
-    scene = load_saved_scene(cameras.folder)
-    device = fitting_device(scene, job, device, coarse_gaussians(job.settings.training))
-    blocks = _blocks(folder, job, cameras, version, threads, device)
+    most = coarse_gaussians(job.settings.training)
+    blocks = _opened(folder, job, cameras, most, version, threads, device)
+    if isinstance(blocks, Stage):
+        return blocks
     blocks.root.mkdir(parents=True, exist_ok=True)
-    estimated, warnings = estimated_cost(scene, job, blocks.root, progress, threads, device)
-    return blocks.coarse(
-        progress, inside=_inside_regions(job, scene), estimated=estimated, warnings=warnings
+    estimated, warnings = estimated_cost(
+        blocks.scene, job, blocks.root, progress, threads, blocks.device
     )
+    inside = _inside_regions(job, blocks.scene)
+    return blocks.coarse(progress, inside=inside, estimated=estimated, warnings=warnings)
 
 
 def run_block(
@@ -648,29 +654,34 @@ def run_block(
     ResourceError
         Memory does not suffice.
     """
-    from ...scene.scene import load_saved_scene
     from ...training.estimate import gaussians_of_block
 
-    trained = _finished_training(folder, job, cameras, version)
-    if trained is not None:
-        return trained
-    scene = load_saved_scene(cameras.folder)
-    device = fitting_device(scene, job, device, gaussians_of_block(job.settings.training))
-    blocks = _blocks(folder, job, cameras, version, threads, device)
-    compile_if_needed(job, blocks.root, progress, threads, device)
-    return blocks.block(index, progress, inside=_inside_regions(job, scene))
+    most = gaussians_of_block(job.settings.training)
+    blocks = _opened(folder, job, cameras, most, version, threads, device)
+    if isinstance(blocks, Stage):
+        return blocks
+    compile_if_needed(job, blocks.root, progress, threads, blocks.device)
+    return blocks.block(index, progress, inside=_inside_regions(job, blocks.scene))
 
 
-def _finished_training(
-    folder: JobFolder, job: JobFile, cameras: Stage, version: int
-) -> Stage | None:
-    """Return the training that blocks are for, if it is finished: they may be gone then."""
+def _opened(
+    folder: JobFolder,
+    job: JobFile,
+    cameras: Stage,
+    gaussians: int,
+    version: int,
+    threads: int,
+    device: DeviceChoice,
+) -> BlockStages | Stage:
+    """Return the blocks, or the finished training that they are for: they may be gone then."""
     key, _ = training_keys(version, cameras.key, job)
     path = folder.stages / f"train-{key}"
     done = read_done(path)
-    if done is None or not _is_whole(path):
-        return None
-    return Stage("train", key, path, done, True)
+    if done is not None and _is_whole(path):
+        return Stage("train", key, path, done, True)
+    blocks = _blocks(folder, job, cameras, version, threads, device)
+    blocks.fit_device(gaussians)
+    return blocks
 
 
 def _is_whole(stage_folder: Path) -> bool:
@@ -733,17 +744,12 @@ def _train(
     return {**done, "warnings": [*earlier, *done["warnings"]], "estimate": estimated}
 
 
-def _join(
-    stage_folder: Path, blocks: BlockStages, progress: Progress, device: DeviceChoice
-) -> dict[str, Any]:
+def _join(stage_folder: Path, blocks: BlockStages, progress: Progress) -> dict[str, Any]:
     """Join the blocks of a training; return the content of ``done.json``."""
-    from ...scene.scene import load_saved_scene
-
-    device = fitting_device(load_saved_scene(blocks.cameras.folder), blocks.job, device)
-    blocks = replace(blocks, device=device)
-    compile_if_needed(blocks.job, stage_folder, progress, blocks.threads, device)
+    blocks.fit_device()
+    compile_if_needed(blocks.job, stage_folder, progress, blocks.threads, blocks.device)
     trained = Trained(blocks.join(stage_folder, progress), blocks.job.settings.training, ())
-    done = _written(stage_folder, blocks.cameras, trained, blocks.threads, device)
+    done = _written(stage_folder, blocks.cameras, trained, blocks.threads, blocks.device)
     return {**done, **blocks.figures(trained.result.seconds)}
 
 

@@ -67,8 +67,8 @@ def estimated_cost(
         The disk is too full.
     """
     from ...training.estimate import (
+        check_resources,
         estimate_training,
-        memory_warnings,
         scene_facts,
         speeds,
         this_machine,
@@ -85,9 +85,7 @@ def estimated_cost(
     done = [int(path.stem.rpartition("-")[2]) for path in checkpoints(stage_folder)]
     first = max(done, default=0)
     expected = estimate_training(scene_facts(scene), training, machine, first=first)
-    warnings = memory_warnings(
-        scene_facts(scene), training, machine, expected
-    )  # raises where the disk is too full
+    warnings = check_resources(expected, machine)  # raises where the disk is too full
     _logger.info("estimate: %s", expected.sentence())
     for warning in warnings:
         _logger.warning("%s", warning.text)

@@ -500,7 +500,6 @@ def blocks_key(version: int, cameras_key: str, job: JobFile) -> str:
     """Return the key of the blocks of a training: without what follows when they are joined."""
     described = key_values(job.settings.training)
     described.pop("extra_iterations")
-    described.pop("polish", None)  # a key has no setting of its default
     return stage_key("blocks", version, cameras_key, job.settings.seed, described)
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 from pathlib import Path
 
@@ -127,20 +126,14 @@ def test_finished_stages_are_used_again_and_blocks_may_go_once_they_are_joined(
     assert not blocks.exists()
 
 
-def test_more_and_another_joint_training_join_the_same_blocks(
+def test_more_training_joins_the_same_blocks(
     finished: tuple[JobFolder, JobFile, Stage], tmp_path: Path
 ) -> None:
     folder, job, stage = copied(finished, tmp_path), *finished[1:]
     blocks = {name: at for name, at in tokens(folder).items() if name.startswith("blocks")}
     longer = trained(folder, continue_training_job(folder, job, 10))
     assert longer.done["iterations"] == stage.done["iterations"] + 10
-    unpolished = dataclasses.replace(job.settings.training, polish=0.0)
-    other = trained(
-        folder,
-        dataclasses.replace(job, settings=dataclasses.replace(job.settings, training=unpolished)),
-    )
-    assert other.done["iterations"] == TRAINING.iterations
-    assert other.done["held_out_psnr"] < stage.done["held_out_psnr"] < longer.done["held_out_psnr"]
+    assert stage.done["held_out_psnr"] < longer.done["held_out_psnr"]
     assert {n: at for n, at in tokens(folder).items() if n.startswith("blocks")} == blocks
 
 
@@ -226,7 +219,7 @@ def test_all_priors_and_poses_of_the_coarse_training_reach_blocks_and_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A dense start leaves confirmed depths for each block; refined poses are the result's."""
-    folder, job = row_job(tmp_path, dense_start="on", refine_poses="on", polish=0.0)
+    folder, job = row_job(tmp_path, dense_start="on", refine_poses="on")
     given: list[int] = []
     original = block_module.train_block
 
