@@ -147,7 +147,7 @@ class VectorField:
     The sum is over all Gaussians with a value of at least :data:`TAIL` at the point, whatever their
     distance or size; each of the others would add less than ``TAIL / (1 - TAIL)`` times its
     ``|Sigma^-1 (x - mu)|``. A Gaussian with a normal shorter than
-    ``tolerances.ORIENTED_MIN_NORM`` is not oriented: it acts on both sides.
+    ``limits.ORIENTED_MIN_NORM`` is not oriented: it acts on both sides.
 
     Parameters
     ----------

@@ -271,7 +271,7 @@ def initial_gaussians(
 ) -> OrientedGaussians:
     """Return the Gaussians that training starts from (docs/method.md, section 1.3).
 
-    One per sparse point within ``tolerances.POINT_REACH``: round, as large as the mean distance to
+    One per sparse point within ``limits.POINT_REACH``: round, as large as the mean distance to
     its three nearest neighbours, opacity 0.1, orientation zero. Where there are fewer than
     :data:`MIN_START_POINTS`, random pixels are lifted to the depth of the nearest sparse points;
     where there are none, to a random depth, keeping the positions that most cameras see.

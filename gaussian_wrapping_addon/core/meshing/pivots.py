@@ -54,7 +54,7 @@ def directional_sigma(
 def two_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
     """Return centre and outer pivots of the Gaussians ``index``.
 
-    A Gaussian without orientation (normal shorter than ``tolerances.ORIENTED_MIN_NORM``) gets
+    A Gaussian without orientation (normal shorter than ``limits.ORIENTED_MIN_NORM``) gets
     outer pivots on both sides along its shortest axis.
 
     Returns

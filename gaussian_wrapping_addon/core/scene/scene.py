@@ -47,7 +47,7 @@ class PhotoSource(Protocol):
 def usable_points(points: np.ndarray) -> np.ndarray:
     """Tell which sparse points (n, 3), scene frame, are finite and within reach, (n,) bool.
 
-    The reach is ``tolerances.POINT_REACH``.
+    The reach is ``limits.POINT_REACH``.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         return np.linalg.norm(points, axis=1) <= POINT_REACH
@@ -75,7 +75,7 @@ class Scene:
     """Views and sparse points in the scene frame.
 
     The scene frame is Z-up (automatic up direction), has the mean of the camera centres at 0, and
-    is scaled so that 1.1 x the largest camera distance to 0 is ``tolerances.SCENE_RADIUS``.
+    is scaled so that 1.1 x the largest camera distance to 0 is ``limits.SCENE_RADIUS``.
     ``world_from_scene`` maps back to the frame of the input, in float64.
     """
 
