@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
+from typing import TypeGuard
 
 import pytest
 
@@ -242,3 +244,28 @@ def test_blender_side_of_core_loads_without_heavy_packages() -> None:
     )
     done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, check=False)
     assert done.returncode == 0, done.stderr.decode()
+
+
+def test_modules_that_children_run_exist() -> None:
+    """They are named in texts, which neither imports nor types check."""
+    named = []
+    for path in python_files(PACKAGE):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            texts: list[ast.expr] = []
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                if re.search(r"(MODULE|HELPER)$", node.targets[0].id):
+                    texts = [node.value]
+            elif isinstance(node, ast.Call):
+                called = getattr(node.func, "id", getattr(node.func, "attr", ""))
+                if called in ("child_command", "run_helper", "run_in_worker", "in_worker"):
+                    texts = [*node.args[:1], *(k.value for k in node.keywords if k.arg == "module")]
+                prefix = "jobs.commands.farm_" if called == "in_worker" else ""
+                texts = [ast.Constant(prefix + t.value) for t in texts if is_text(t)]
+            named += [(path.name, text.value) for text in texts if is_text(text)]
+    assert len(named) > 20
+    missing = [(n, m) for n, m in named if not (CORE / f"{m.replace('.', '/')}.py").is_file()]
+    assert missing == []
+
+
+def is_text(node: ast.expr) -> TypeGuard[ast.Constant]:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)

@@ -67,6 +67,18 @@ def test_options_of_videos_are_refused_for_photos(tmp_path: Path, option: str) -
     assert f"{option} has no effect: photos is no video. Omit it, or give the video." in text
 
 
+def test_blocks_without_other_computers_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        Image.new("RGB", (64, 48)).save(tmp_path / "photos" / name)
+    code, text = batch(
+        "wrap", tmp_path / "photos", "--out", tmp_path / "out", "--no-blend", "--blocks", "2"
+    )
+    assert code == EXIT_USAGE
+    assert "Give --computers as well, or omit --blocks." in text
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(("option", "value"), [("--frames", "2"), ("--fps", "0.01")])
 def test_numbers_out_of_range_are_refused(tmp_path: Path, option: str, value: str) -> None:
     path = write(tmp_path / "clip.mp4", pan(range(10)))

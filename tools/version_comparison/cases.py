@@ -46,7 +46,7 @@ def _step(text: str) -> Step:
 
 _COMMON = (
     "--preset draft --threads 2 --preview-every 0 --holdout 5 --texture-size 256"
-    " --harmonics off --wrapping off"  # their trials are gone: the earlier side leaves them out, too
+    " --harmonics off --wrapping off"  # the earlier side tried them out
 )
 
 CASES = (
