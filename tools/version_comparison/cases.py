@@ -45,16 +45,17 @@ def _step(text: str) -> Step:
 
 
 _COMMON = (
-    "--preset draft --threads 2 --preview-every 0 --holdout 5 --texture-size 256"
-    " --harmonics off --wrapping off"  # the earlier side tried them out
+    "--preset draft --threads 2 --preview-every 0 --holdout 5 --texture-size 256 --wrapping off"
 )
+_TRAINED = f"{_COMMON} --harmonics off"
+"""The earlier side tried harmonics and wrapping out; a splat keeps its harmonics on both."""
 
 CASES = (
     Case(
         "everything on, two regions",
         (
             _step(
-                f"wrap {{in}}/colmap --out {{out}}/first {_COMMON} --iterations 300"
+                f"wrap {{in}}/colmap --out {{out}}/first {_TRAINED} --iterations 300"
                 " --max-gaussians 2500 --needs all --region {in}/cut.json {in}/wedge.json"
                 " --points 2500 --faces 2000 --smooth 3 --normal-map on --ambient-occlusion"
                 " --lods 1 --export glb,obj,ply,usd"
@@ -66,7 +67,7 @@ CASES = (
         "evidence decides, pivots, open, occupied",
         (
             _step(
-                f"wrap {{in}}/transforms --out {{out}}/evidence {_COMMON} --iterations 500"
+                f"wrap {{in}}/transforms --out {{out}}/evidence {_TRAINED} --iterations 500"
                 " --max-gaussians 3000 --needs auto --mask-mode background --region-weight 2"
                 " --region {in}/cap.json --method pivots --pivots 9 --boundary open"
                 " --unseen occupied --texture-source gaussians --export ply"
@@ -90,7 +91,7 @@ CASES = (
             _step("more --out {out}/evidence --iterations 60"),
             Step(
                 _words(
-                    f"wrap {{in}}/colmap --out {{out}}/resumed {_COMMON} --iterations 400"
+                    f"wrap {{in}}/colmap --out {{out}}/resumed {_TRAINED} --iterations 400"
                     " --max-gaussians 2000 --needs none --harmonics on --sh-degree 3"
                     " --region {in}/cap.json --points 1000 --export obj --no-blend"
                 ),

@@ -56,8 +56,10 @@ LEFT_OUT_ENTRIES = (
     LeftOut(r"(^|\.)seconds\.\w+$", "time"),
     LeftOut(r"(^|\.)(bake_s|wall_seconds|heartbeat_s)$", "time"),
     LeftOut(r"(^|\.)(started|finished)_unix_s$", "date"),
-    LeftOut(r"(^|\.)peak_memory_bytes\.\w+$", "memory that was used"),
-    LeftOut(r"(^|\.)free_memory_bytes$", "memory that was free"),
+    LeftOut(r"(^|\.)peak_memory_bytes(\.\w+)?$", "memory that was used"),
+    LeftOut(r"^(begun_s|token|plan|code)$", "names and times of one run of a part", "*.json"),
+    LeftOut(r"(^|\.)(free_memory|photos\.budget)_bytes$", "memory that was free"),
+    LeftOut(r"(^|\.)settings(\.training)?\.polish$", "a setting that is gone"),
     LeftOut(r"(^|\.)pid(_started)?$", "process number"),
     LeftOut(r"^machine\.", "the machine"),
     LeftOut(r"^made_with\.code$", "fingerprint of the source code"),
@@ -75,6 +77,9 @@ LEFT_OUT_ENTRIES = (
     LeftOut(r"^(fraction|figures\.\w+)$", "what was seen at a moment of the clock", "status.json"),
 )
 """Regular expressions of entries of JSON files, such as ``training.held_out[0].psnr``."""
+
+GONE_DECISIONS = ("harmonics", "wrapping")
+"""Settled by their settings now, without a record."""
 
 
 @dataclass(frozen=True)
@@ -240,11 +245,17 @@ def _entries(value: Any, place: str) -> Iterator[tuple[str, str]]:
         for key in sorted(value):
             yield from _entries(value[key], f"{place}.{key}" if place else key)
     elif isinstance(value, list):
+        value = [one for one in value if not _is_gone(one)]
         yield f"{place}.length", str(len(value))
         for index, one in enumerate(value):
             yield from _entries(one, f"{place}[{index}]")
     else:
         yield place, json.dumps(value)  # floats as repr: as exact as they are
+
+
+def _is_gone(value: Any) -> bool:
+    """Return whether a value is the record of a decision that only the earlier version takes."""
+    return isinstance(value, dict) and value.get("name") in GONE_DECISIONS and "chosen" in value
 
 
 def _glb_items(data: bytes) -> Iterator[tuple[str, Item]]:
