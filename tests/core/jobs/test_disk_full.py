@@ -38,7 +38,7 @@ import sys
 sys.path[:0] = [{str(ROOT)!r}]
 from gaussian_wrapping_addon.core.jobs import runner, worker
 from gaussian_wrapping_addon.core.training.state import save_checkpoint
-from tests.core.training.test_checkpoint import filled
+from tests.core.training.test_state import filled
 def run_job(folder, job, event, cancelled):
     kept = folder.stages / "train-a"
     kept.mkdir()
