@@ -146,7 +146,6 @@ def _disable(blend: Path) -> None:
 def _reload(blend: Path) -> None:
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
     gaussian_wrapping_addon.unregister()
-    importlib.reload(job_timer)
     importlib.reload(registration)
     gaussian_wrapping_addon.register()
     jobs.attach_later()
