@@ -18,7 +18,7 @@ from typing import Any
 
 from gaussian_wrapping_addon.core.errors import ParseError
 from gaussian_wrapping_addon.core.files import finite_json, read_json, write_bytes, write_json
-from gaussian_wrapping_addon.core.jobs.store.job_folder import STAGE_VERSIONS
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS
 from gaussian_wrapping_addon.core.machine import processor_name
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -67,6 +67,17 @@ def test_a_python_without_numpy_is_told_what_to_use(entry: tuple[str, str]) -> N
     assert lacking.stdout.rstrip().endswith("Use another Python: that of Blender, or of the worker")
 
 
+def test_a_python_without_numpy_can_set_up_the_worker(
+    entry: tuple[str, str], tmp_path: Path
+) -> None:
+    """Only the worker needs packages: any Python makes it."""
+    command = ("set-up-worker", "--dry-run", "--to", str(tmp_path / "worker"))
+    shown = run_entry(entry, *command, prelude="sys.modules['numpy'] = None")
+    assert shown.returncode == 0, shown.stdout + shown.stderr
+    assert "-m pip install" in shown.stdout
+    assert not (tmp_path / "worker").exists()
+
+
 def test_the_wheel_is_complete(entry: tuple[str, str], tmp_path: Path) -> None:
     """Built without isolation, as there may be no network; unpacked, it finds its own files."""
     source = tmp_path / "source"

@@ -246,6 +246,26 @@ def test_blender_side_of_core_loads_without_heavy_packages() -> None:
     assert done.returncode == 0, done.stderr.decode()
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "meshing.delaunay_helper", "masks.model_helper", "photos.video", "photos.video_frames",
+        "texture.unwrap.pack_helper", "texture.unwrap.unwrap_helper", "units.markers",
+    ],
+)  # fmt: skip
+def test_helpers_load_no_more_than_they_need(name: str) -> None:
+    """They start often, and under a limit of memory, of which torch alone takes a share."""
+    code = (
+        "import sys, importlib\n"
+        f"sys.path.insert(0, {str(PACKAGE.parent)!r})\n"
+        f"importlib.import_module('gaussian_wrapping_addon.core.{name}')\n"
+        "loaded = {'torch', 'numba', 'igl'} & set(sys.modules)\n"
+        "assert not loaded, loaded\n"
+    )
+    done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+
+
 def test_modules_that_children_run_exist() -> None:
     """They are named in texts, which neither imports nor types check."""
     named = []

@@ -94,8 +94,9 @@ def _bake(options: Namespace) -> int:
     from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
     from ..core.jobs.store.job_file import BakeRequest, make_bake_job
-    from ..core.jobs.store.job_folder import JobFolder, read_done
+    from ..core.jobs.store.job_folder import JobFolder
     from ..core.jobs.store.rollback import finished_job, no_finished_training
+    from ..core.jobs.store.stage_folder import read_done
     from ..core.settings import JobSettings, TextureSettings
 
     texture = TextureSettings(**_texture(options))

@@ -35,8 +35,9 @@ def _mesh(options: Namespace) -> int:
     from ..core.jobs.client import JobClient, worker_python
     from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import make_job
-    from ..core.jobs.store.job_folder import JobFolder, read_done
+    from ..core.jobs.store.job_folder import JobFolder
     from ..core.jobs.store.rollback import finished_job, no_finished_training
+    from ..core.jobs.store.stage_folder import read_done
 
     folder = JobFolder(real_path(options.out))
     earlier = finished_job(folder)

@@ -12,8 +12,9 @@ import bpy
 from ..core.errors import UsageError, unwritable_error
 from ..core.jobs.client import JobClient, worker_python
 from ..core.jobs.store.job_file import BakeRequest, make_bake_job
-from ..core.jobs.store.job_folder import JobFolder, read_done
+from ..core.jobs.store.job_folder import JobFolder
 from ..core.jobs.store.rollback import finished_job, no_finished_training
+from ..core.jobs.store.stage_folder import read_done
 from ..core.mesh.exchange import FileMesh, write_handed_over
 from ..core.names import file_stem
 from ..core.settings import TextureSettings

@@ -162,7 +162,7 @@ EVERY_S = 3.0
 MAX_BYTES = 8 * 2**20
 """Larger files are not a preview; drawing them would be noticeable."""
 
-_LIVE_PREVIEW_NEVER_S = float("-inf")
+_NEVER_S = float("-inf")
 
 Stamp = tuple[str, int, int]
 """Path, time in ns and size in bytes of a file."""
@@ -170,7 +170,7 @@ Stamp = tuple[str, int, int]
 
 @dataclass
 class _ShownPreview:
-    searched_s: float = _LIVE_PREVIEW_NEVER_S
+    searched_s: float = _NEVER_S
     stamp: Stamp | None = None
     names: tuple[str, ...] = ()
     icons: tuple[int, ...] = ()
@@ -185,7 +185,7 @@ class _Read:
 
 
 _preview_readings = Lane()
-_live_preview_shown: dict[str, _ShownPreview] = {}
+_shown_previews: dict[str, _ShownPreview] = {}
 _pictures: Any = None  # ImagePreviewCollection, created with the first image
 _count = 0
 
@@ -195,7 +195,7 @@ def icons_of(folder: str) -> tuple[int, ...]:
 
     A photo beside its rendering gives two: an icon is drawn in a square.
     """
-    shown = _live_preview_shown.get(folder)
+    shown = _shown_previews.get(folder)
     return shown.icons if shown else ()
 
 
@@ -224,7 +224,7 @@ def refresh(folder: str, now_s: float) -> bool:
     It is read in a thread and shown by a later call. The old image stays until then: an incomplete
     or broken file changes nothing.
     """
-    shown = _live_preview_shown.setdefault(folder, _ShownPreview())
+    shown = _shown_previews.setdefault(folder, _ShownPreview())
     if shown.reading is None:
         if now_s - shown.searched_s >= EVERY_S:
             shown.searched_s = now_s
@@ -250,7 +250,7 @@ def refresh(folder: str, now_s: float) -> bool:
 
 def forget(folder: str) -> None:
     """Remove the image of a job that has ended."""
-    shown = _live_preview_shown.pop(folder, None)
+    shown = _shown_previews.pop(folder, None)
     if shown is not None:
         _drop(shown.names)
 
@@ -263,7 +263,7 @@ def start() -> None:
 def stop() -> None:
     """Remove everything; Blender warns about collections left behind."""
     global _pictures
-    _live_preview_shown.clear()
+    _shown_previews.clear()
     _preview_readings.stop()
     if _pictures is not None:
         bpy.utils.previews.remove(_pictures)
@@ -326,9 +326,6 @@ def _drop(names: tuple[str, ...]) -> None:
 # behind.
 
 
-_LIVE_POINTS_NEVER_S = float("-inf")
-
-
 @dataclass(frozen=True)
 class LivePoints:
     """Points of a running training."""
@@ -342,13 +339,13 @@ class LivePoints:
 
 @dataclass
 class _ShownPoints:
-    searched_s: float = _LIVE_POINTS_NEVER_S
+    searched_s: float = _NEVER_S
     points: LivePoints | None = None
     reading: Task[LivePoints | None] | None = None
 
 
 _point_readings = Lane()
-_live_points_shown: dict[str, _ShownPoints] = {}
+_shown_points: dict[str, _ShownPoints] = {}
 
 
 def points_of(scene: bpy.types.Scene) -> LivePoints | None:
@@ -357,7 +354,7 @@ def points_of(scene: bpy.types.Scene) -> LivePoints | None:
     status = status_of(properties.job_folder)
     if not properties.show_points or status is None or not status.active or status.stage != "train":
         return None
-    shown = _live_points_shown.get(key_of(properties.job_folder))
+    shown = _shown_points.get(key_of(properties.job_folder))
     return shown.points if shown else None
 
 
@@ -372,7 +369,7 @@ def frame_of_job(scene: bpy.types.Scene) -> bpy.types.Object | None:
 
 def refresh_points(folder: str, now_s: float) -> bool:
     """Search for new points, at most every few seconds; return whether there are new ones."""
-    shown = _live_points_shown.setdefault(folder, _ShownPoints())
+    shown = _shown_points.setdefault(folder, _ShownPoints())
     if shown.reading is None:
         if now_s - shown.searched_s >= EVERY_S:
             shown.searched_s = now_s
@@ -394,7 +391,7 @@ def refresh_points(folder: str, now_s: float) -> bool:
 
 def forget_points(folder: str) -> None:
     """Remove the points of a job that has ended."""
-    _live_points_shown.pop(folder, None)
+    _shown_points.pop(folder, None)
 
 
 def start_points() -> None:
@@ -404,7 +401,7 @@ def start_points() -> None:
 
 def stop_points() -> None:
     """Remove everything."""
-    _live_points_shown.clear()
+    _shown_points.clear()
     _point_readings.stop()
 
 

@@ -15,8 +15,9 @@ from ..core.errors import DatasetError, UsageError, WrapError
 from ..core.files import real_path
 from ..core.jobs.client import JobClient, worker_python
 from ..core.jobs.store.job_file import make_job
-from ..core.jobs.store.job_folder import JobFolder, JobStatus, read_done
+from ..core.jobs.store.job_folder import JobFolder, JobStatus
 from ..core.jobs.store.rollback import continue_training_job, finished_job
+from ..core.jobs.store.stage_folder import read_done
 from ..core.names import AUTOMATIC_REGIONS, region_name, region_names
 from ..core.regions.files import read_region_file
 from ..core.settings import JobSettings, with_values

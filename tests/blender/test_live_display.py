@@ -55,11 +55,11 @@ def write_points(folder: Path, count: int = 5, data: bytes | None = None) -> Pat
 
 def look(folder: Path) -> None:
     """Let the timer search, wait for the reading, and let it take what was read."""
-    job_timer._live_points_shown.setdefault(
-        str(folder), job_timer._ShownPoints()
-    ).searched_s = float("-inf")
+    job_timer._shown_points.setdefault(str(folder), job_timer._ShownPoints()).searched_s = float(
+        "-inf"
+    )
     job_timer.poll_jobs()
-    reading = job_timer._live_points_shown[str(folder)].reading
+    reading = job_timer._shown_points[str(folder)].reading
     assert reading is not None
     assert reading.finished(20.0)
     job_timer.poll_jobs()
@@ -97,7 +97,7 @@ def test_points_follow_the_file_the_job_and_the_checkbox(tmp_path: Path) -> None
     assert count() is None, "the training is over"
     client.status = replace(RUNNING, state="CANCELLED")
     job_timer.poll_jobs()
-    assert job_timer._live_points_shown == {}
+    assert job_timer._shown_points == {}
     assert path.exists()
 
 

@@ -9,7 +9,7 @@ import bpy
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.meshing import surface_points
+from gaussian_wrapping_addon.core.meshing import spacing
 from gaussian_wrapping_addon.ops import region_operators
 from gaussian_wrapping_addon.ops.region_operators import checked_edge_length, own_lengths
 from gaussian_wrapping_addon.ops.scene_objects import import_result
@@ -57,4 +57,4 @@ def test_impossible_lengths_are_refused(
 
 
 def test_the_limit_is_the_workers() -> None:
-    assert region_operators.FINEST_SHARE == surface_points.FINEST_SHARE
+    assert region_operators.FINEST_SHARE == spacing.FINEST_SHARE

@@ -224,7 +224,7 @@ def write_picture(folder: Path, name: str = "train-now", data: bytes | None = No
 def refreshed(key: str, now_s: float) -> bool:
     """Look for a picture, wait until it is read, and show it."""
     assert not job_timer.refresh(key, now_s), "it is read in a thread"
-    reading = job_timer._live_preview_shown[key].reading
+    reading = job_timer._shown_previews[key].reading
     if reading is not None:
         assert reading.finished(20.0)
     return job_timer.refresh(key, now_s)
@@ -236,11 +236,11 @@ def test_the_picture_follows_the_file_and_survives_bad_ones(tmp_path: Path) -> N
     path = write_picture(tmp_path)
     assert not refreshed(key, job_timer.EVERY_S - 0.1), "not yet time"
     assert refreshed(key, 10.0)
-    stamp = job_timer._live_preview_shown[key].stamp
+    stamp = job_timer._shown_previews[key].stamp
     assert stamp is not None
     assert stamp[0] == str(path)
     assert len(job_timer.icons_of(key)) == 2, "photo and rendering"
-    names = job_timer._live_preview_shown[key].names
+    names = job_timer._shown_previews[key].names
     left, right = (job_timer._pictures[name] for name in names)
     assert left.image_size[:] == right.image_size[:]
     colours = [np.array(p.image_pixels_float[:]).reshape(-1, 4).mean(0) for p in (left, right)]
@@ -254,7 +254,7 @@ def test_the_picture_follows_the_file_and_survives_bad_ones(tmp_path: Path) -> N
     bad_ones = (b"", b"no picture", b"PK\x03\x04 no zip", several.getvalue(), huge, flat)
     for bad in (*bad_ones, npy_bytes(picture())[:200], npy_bytes(np.zeros(0))):
         write_picture(tmp_path, data=bad)
-        assert not refreshed(key, job_timer._live_preview_shown[key].searched_s + 10.0)
+        assert not refreshed(key, job_timer._shown_previews[key].searched_s + 10.0)
         assert job_timer.icons_of(key)
     (path.parent / "done.json").write_text("{}")
     assert job_timer.newest_picture(tmp_path) is None, "a finished training is not under way"
@@ -271,7 +271,7 @@ def test_a_running_training_is_drawn_and_let_go(tmp_path: Path) -> None:
     client = Client(running)
     job_timer.watch(bpy.context.scene, tmp_path, client, imports=False)  # type: ignore[arg-type]
     job_timer.poll_jobs()
-    assert job_timer._live_preview_shown[str(tmp_path)].reading.finished(20.0)
+    assert job_timer._shown_previews[str(tmp_path)].reading.finished(20.0)
     job_timer.poll_jobs()
     layout = draw(training_panel.GWRAP_PT_train)
     assert "750 of 3,000" in layout.texts

@@ -16,19 +16,16 @@ from ..loading.source_kind import read_poses, source_kind
 from ..progress import Progress
 from ..scene.camera import Camera, Similarity
 from .alignment import IcpResult, icp, pose_errors
+from .dtu import align_to_scan, is_dtu_folder, read_dtu, score_dtu
 from .dtu_chamfer import DENSITY_MM, MAX_DISTANCE_MM, PATCH_MM
 from .layouts import SAMPLES as TANKS_SAMPLES
 from .layouts import (
     align_to_log,
-    align_to_scan,
     is_cloud,
-    is_dtu_folder,
     is_tanks_folder,
     read_cloud,
-    read_dtu,
     read_mesh,
     read_tanks,
-    score_dtu,
     score_tanks,
 )
 from .surface_scores import (

@@ -232,7 +232,7 @@ def _pack(camera: Camera) -> list[float]:
 
 # -- Initial Gaussians: from sparse points, and along camera rays if these are few ----------------
 #
-# The start from an existing splat is in ``core/training/initialisation/``.
+# The start from an existing splat is in ``core/training/splat_start.py``.
 
 
 _logger = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from pathlib import Path
 from ..files import read_json, write_bytes
 from ..photos.photo_file import read_photo
 from ..worker.helper_process import emit
-from .making import SegmentationModel, cleaned, encoded
+from .segmentation import SegmentationModel, cleaned, encoded
 
 
 def main(folder: Path) -> None:

@@ -17,20 +17,22 @@ from ..gaussians.model import GaussianArrays
 from ..mesh.sampling import EDGE_PER_RADIUS, POINTS_PER_SQUARE, sample_triangles
 from ..regions.shapes import Region
 from .pivots import pivot_rule
-from .surface_points import (
+from .spacing import (
     AUTOMATIC_POINTS,
-    INNER_RADII,
     LONGEST_SHARE,
-    MAX_CANDIDATES,
     MIN_VERTICES,
-    OVERSAMPLING,
     VERTICES_PER_UNIFORM,
     ResolutionRequest,
     dense_points,
     kept_from_dense,
+    times_longer,
+)
+from .surface_points import (
+    INNER_RADII,
+    MAX_CANDIDATES,
+    OVERSAMPLING,
     pivots_alone,
     pivots_and_probes,
-    times_longer,
 )
 from .tiles.plan import TILE_POINTS, WHOLE_POINTS
 
@@ -249,7 +251,7 @@ def estimate_mesh(
         From :func:`evaluation_seconds`.
     resolved : (n,) float64, optional
         Shortest edge that the photos resolve at samples of the surface, which limits adaptive
-        spacing; from :func:`.surface_points.resolved_edges`.
+        spacing; from :func:`.spacing.resolved_edges`.
     """
     by_edge = request.edge_length > 0
     if by_edge:

@@ -28,7 +28,8 @@ from .delaunay import bounding_points, delaunay
 from .marching_tetrahedra import bisect, cut_to_region, marching_closed
 from .pivots import pivot_rule
 from .repair import remove_degenerate
-from .surface_points import footprints, no_surface_error, pivot_cloud, pivots_alone
+from .spacing import footprints
+from .surface_points import no_surface_error, pivot_cloud, pivots_alone
 
 _logger = logging.getLogger(__name__)
 

@@ -27,17 +27,14 @@ from .classification import boundary_faces, classify, on_one_sheet, tetrahedron_
 from .clean_up import without_small_handles
 from .delaunay import bounding_points, delaunay
 from .repair import remove_degenerate, split_nonmanifold
+from .spacing import DenseRequest, checked_request, dense_request, nominal_edge
 from .surface_points import (
     KIND_CAP,
     KIND_JUMP,
     KIND_SURFACE,
-    DenseRequest,
     SurfacePoints,
     SurfaceSampler,
     candidate_surface,
-    checked_request,
-    dense_request,
-    nominal_edge,
 )
 
 _logger = logging.getLogger(__name__)

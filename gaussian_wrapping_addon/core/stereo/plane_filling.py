@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from ..progress import Progress
 from .depth_maps import DepthMap
-from .matching import WORST_COST
+from .matching_cost import WORST_COST
 from .plane_evidence import AGREEING, ALIKE, NEARER, THROUGH, Aligner, PackedPhotos, Part, packed
 from .plane_fitting import (
     BORDER_PX,

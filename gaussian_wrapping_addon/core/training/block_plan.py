@@ -270,17 +270,6 @@ class BlockPlan:
         owner = self.tiling.owner(self.coarse.gaussians.means.double().numpy())
         return np.setdiff1d(np.flatnonzero(owner == index), self.blocks[index].trained)
 
-    def near_border(self, points: np.ndarray, reach: float) -> np.ndarray:
-        """Tell which of (n, 3) points lie at most so far from another cell than theirs, (n,) bool.
-
-        ``reach`` is in scene units, along each axis.
-        """
-        cells = sum(
-            self.tiling.within(index, points, reach).astype(np.int64)
-            for index in range(len(self.blocks))
-        )
-        return np.asarray(cells > 1)
-
     @functools.cached_property
     def digest(self) -> str:
         """Hash of all of it."""

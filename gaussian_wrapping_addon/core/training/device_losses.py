@@ -27,7 +27,8 @@ from ..render.projection import pack_camera
 from ..render.types import ImageGradients, RenderOptions
 from ..resampling import LUMA
 from ..scene.camera import Camera
-from .multi_view import BLOCK_PX, BORDER_PX, KEPT, SAMPLES, MultiViewOptions
+from .multi_view import BLOCK_PX, BORDER_PX, MultiViewOptions
+from .multi_view_kernels import KEPT, SAMPLES
 
 # -- Losses on images of a device: those of :mod:`.losses` and :mod:`.losses` as kernels
 #

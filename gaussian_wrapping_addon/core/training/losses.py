@@ -126,7 +126,7 @@ TOLERANCE_SHARE = 0.01
 OUTLIER_SHARE = 0.03
 """Relative difference from which the photos are believed: stereo misses what is thin."""
 
-_DEPTH_PRIOR_LOSS_NO_MASK = np.zeros((0, 0), np.bool_)
+_NO_MASK = np.zeros((0, 0), np.bool_)
 
 
 @kernel(fast=False, fused=True)
@@ -205,7 +205,7 @@ def depth_prior_loss(
         if store is None
         else store.take("by depth of the prior", depth.shape, depth.dtype)
     )
-    flat_mask = _DEPTH_PRIOR_LOSS_NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
+    flat_mask = _NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
     pixels = max(1, depth.size if mask is None else int(np.count_nonzero(flat_mask)))
     sums = np.zeros(len(depth))
     lens, prior_lens = _lens(camera), _lens(prior.camera)
@@ -531,9 +531,6 @@ def agreement_rows(  # type: ignore[no-untyped-def]
 # See docs/method.md, section 3.
 
 
-_LOSSES_NO_MASK = np.zeros((0, 0), np.bool_)
-
-
 @dataclass
 class ColorMetrics:
     """Image metrics from the colour loss, over unmasked values."""
@@ -691,7 +688,7 @@ def normal_losses(
     z, cover = np.ascontiguousarray(depth), np.ascontiguousarray(alpha)
     geometric = np.ascontiguousarray(geometric_normal).reshape(height, -1)  # (h, 3 w)
     learned = np.ascontiguousarray(normal).reshape(height, -1)
-    flat_mask = _LOSSES_NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
+    flat_mask = _NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
     pixels = max(1, height * width if mask is None else int(np.count_nonzero(flat_mask)))
     sums = np.empty((height, 3))
     by_geometric, by_learned = (

@@ -46,7 +46,7 @@ PACKAGES_OPTION = "gwrap_packages"
 
 _POINTER = "worker-location.json"
 _ADDON = "gaussian_wrapping_addon"
-_WORKER_ENVIRONMENT_PACKAGE_ROOT = Path(__file__).resolve().parents[2]
+_PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
@@ -153,14 +153,11 @@ def installed_root() -> Path | None:
     It is the folder returned by ``bpy.utils.extension_path_user``, so that the command line of an
     installed extension finds it without Blender.
     """
-    repository = _WORKER_ENVIRONMENT_PACKAGE_ROOT.parent
+    repository = _PACKAGE_ROOT.parent
     user = repository.parent / ".user"
-    if (
-        not (_WORKER_ENVIRONMENT_PACKAGE_ROOT / "blender_manifest.toml").is_file()
-        or not user.is_dir()
-    ):
+    if not (_PACKAGE_ROOT / "blender_manifest.toml").is_file() or not user.is_dir():
         return None
-    return user / repository.name / _WORKER_ENVIRONMENT_PACKAGE_ROOT.name / "worker"
+    return user / repository.name / _PACKAGE_ROOT.name / "worker"
 
 
 def default_root() -> Path:
@@ -218,7 +215,6 @@ NO_ROOM = (
 )
 """What the loaders of Linux, macOS and Windows say where a library finds no room in memory."""
 _LLVM = "llvmlite.binding"
-_WORKER_REQUIREMENTS_PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
@@ -249,7 +245,7 @@ def requirements_file() -> Path:
     UsageError
         The file is missing.
     """
-    for folder in (_WORKER_REQUIREMENTS_PACKAGE_ROOT, _WORKER_REQUIREMENTS_PACKAGE_ROOT.parent):
+    for folder in (_PACKAGE_ROOT, _PACKAGE_ROOT.parent):
         if (folder / FILE_NAME).is_file():
             return folder / FILE_NAME
     raise UsageError(f"{FILE_NAME} is missing.", "Install the add-on's zip again.")

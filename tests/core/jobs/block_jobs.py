@@ -10,9 +10,9 @@ from PIL import Image
 
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, write_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
     STAGE_VERSIONS,
-    JobFolder,
     Stage,
     read_done,
     source_fingerprint,

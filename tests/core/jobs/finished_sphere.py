@@ -11,10 +11,9 @@ from PIL import Image
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.gaussians.files import save_gaussians
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, training_keys, write_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
     STAGE_VERSIONS,
-    JobFolder,
-    JobStatus,
     source_fingerprint,
     stage_key,
 )

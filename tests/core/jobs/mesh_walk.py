@@ -9,7 +9,8 @@ from gaussian_wrapping_addon.core.devices import DeviceChoice
 from gaussian_wrapping_addon.core.jobs.parts.graph import Part, read_state
 from gaussian_wrapping_addon.core.jobs.parts.runner import InProcess, PartResult, PartRunner, Walk
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, Stage, read_done
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage, read_done
 from gaussian_wrapping_addon.core.progress import Progress
 
 

@@ -15,9 +15,9 @@ from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.stages.cameras import run_cameras
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, training_keys
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
     STAGE_VERSIONS,
-    JobFolder,
     Stage,
     source_fingerprint,
     stage_key,

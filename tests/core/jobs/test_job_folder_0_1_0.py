@@ -19,7 +19,8 @@ import pytest
 
 from gaussian_wrapping_addon.core.jobs.commands.export_files import result_of
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, read_done
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import read_done
 
 ROOT = Path(__file__).resolve().parents[3]
 STORED = ROOT / "tests" / "data" / "job-0.1.0"

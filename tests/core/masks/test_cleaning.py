@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from gaussian_wrapping_addon.core.masks.making import GROWN_SHARE, cleaned, encoded
+from gaussian_wrapping_addon.core.masks.segmentation import GROWN_SHARE, cleaned, encoded
 
 
 def disc(size: int, radius: float, at: tuple[float, float] | None = None) -> np.ndarray:

@@ -14,7 +14,7 @@ from PIL import Image
 from gaussian_wrapping_addon.core.errors import DatasetError, ResourceError, WorkerError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.limits import MAX_MODEL_BYTES
-from gaussian_wrapping_addon.core.masks.making import (
+from gaussian_wrapping_addon.core.masks.segmentation import (
     RANGES,
     USUAL_SIDE_PX,
     SegmentationModel,

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.masks.making import THRESHOLD, cleaned, silhouettes
+from gaussian_wrapping_addon.core.masks.making import silhouettes
+from gaussian_wrapping_addon.core.masks.segmentation import THRESHOLD, cleaned
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.render.scenes import look_at

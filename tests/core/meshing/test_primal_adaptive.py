@@ -15,7 +15,7 @@ from gaussian_wrapping_addon.core.mesh.sampling import sample_triangles
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing import surface_points
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
-from gaussian_wrapping_addon.core.meshing.surface_points import MIN_VERTICES
+from gaussian_wrapping_addon.core.meshing.spacing import MIN_VERTICES
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.field.field_scenes import camera_at

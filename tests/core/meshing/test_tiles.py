@@ -13,9 +13,9 @@ from gaussian_wrapping_addon.core.field.vacancy import VacancyResult
 from gaussian_wrapping_addon.core.mesh.sampling import sample_triangles
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
+from gaussian_wrapping_addon.core.meshing.spacing import Spacing
 from gaussian_wrapping_addon.core.meshing.surface_points import (
     CandidateSurface,
-    Spacing,
     SurfacePoints,
     no_caps,
 )

@@ -40,7 +40,8 @@ from gaussian_wrapping_addon.core.stereo.depth_maps import (
     shown_open,
     triangle_planes,
 )
-from gaussian_wrapping_addon.core.stereo.matching import WORST_COST, in_image
+from gaussian_wrapping_addon.core.stereo.matching import in_image
+from gaussian_wrapping_addon.core.stereo.matching_cost import WORST_COST
 from tests.core.stereo.ball_scene import (
     SIDE_PX,
     arc_cameras,

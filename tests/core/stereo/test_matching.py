@@ -8,13 +8,19 @@ import pytest
 
 from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.stereo.matching import (
+    GOOD_COST,
+    MOST_SOURCES,
+    MatchingLevel,
+    grey_levels,
+    in_image,
+    source_views,
+)
+from gaussian_wrapping_addon.core.stereo.matching_cost import (
     AT_X,
     AT_Y,
     GAIN,
-    GOOD_COST,
     LEAST_TOLERANCE_LEVELS,
     MAX_BACK_ERROR_PX,
-    MOST_SOURCES,
     NO_BRIGHTNESS,
     RATE,
     SAMPLES,
@@ -23,15 +29,11 @@ from gaussian_wrapping_addon.core.stereo.matching import (
     WEIGHTED_GREY,
     WINDOW,
     WORST_COST,
-    MatchingLevel,
     back_error_px,
     fill_window,
-    grey_levels,
-    in_image,
     normal_of,
     random_share,
     slopes_of,
-    source_views,
     view_cost,
 )
 from tests.core.stereo.textured_plane import (

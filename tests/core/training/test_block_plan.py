@@ -154,13 +154,6 @@ def test_what_the_photos_of_a_block_hardly_show_stands_still() -> None:
     assert kept > 0
 
 
-def test_points_near_a_border_are_those_close_to_its_plane() -> None:
-    plan = two_blocks()
-    (_, axis, at), = plan.tiling.splits  # fmt: skip
-    points = np.random.default_rng(2).uniform(-5, 5, (500, 3))
-    assert (plan.near_border(points, 0.7) == (np.abs(points[:, axis] - at) <= 0.7)).all()
-
-
 def test_limits_of_blocks_add_up_to_that_of_the_whole() -> None:
     plan = two_blocks(4)
     owner = plan.tiling.owner(plan.coarse.gaussians.means.double().numpy())

@@ -41,14 +41,13 @@ from gaussian_wrapping_addon.core.training.losses import (
     normal_losses,
 )
 from gaussian_wrapping_addon.core.training.multi_view import (
-    KEPT,
-    SAMPLES,
     MultiViewLoss,
     MultiViewOptions,
     choose_pixels,
     grey_image,
     multi_view_losses,
 )
+from gaussian_wrapping_addon.core.training.multi_view_kernels import KEPT, SAMPLES
 from tests.core.device_kernels import DEVICES, kernels_of
 from tests.core.render.comparisons import relative_l2
 from tests.core.render.cuda.emulation import EmulatedKernels

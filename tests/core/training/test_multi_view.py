@@ -21,10 +21,7 @@ from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.settings import TrainingSettings, preset
 from gaussian_wrapping_addon.core.training.adam import merge_gradients
 from gaussian_wrapping_addon.core.training.multi_view import (
-    KEPT,
     NO_MASK,
-    SAMPLES,
-    SKIPPED,
     MultiViewLoss,
     MultiViewOptions,
     NeighbourLimits,
@@ -33,6 +30,7 @@ from gaussian_wrapping_addon.core.training.multi_view import (
     grey_image,
     multi_view_losses,
 )
+from gaussian_wrapping_addon.core.training.multi_view_kernels import KEPT, SAMPLES, SKIPPED
 from tests.core.render.query_autograd import query_depth
 from tests.core.render.scenes import look_at
 from tests.core.training.plane_scene import (

@@ -19,8 +19,9 @@ from ...settings import MeshingSettings, from_json
 from ..stages.cameras import scene_stage_name
 from ..stages.meshing import estimate_region_mesh, estimate_region_pivots, field_views, free_bytes
 from ..store.job_file import read_job
-from ..store.job_folder import JobFolder, read_done
+from ..store.job_folder import JobFolder
 from ..store.rollback import finished_job, no_finished_training
+from ..store.stage_folder import read_done
 from .run_in_worker import run_command
 
 MAX_VIEWS = 24
@@ -46,7 +47,7 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     from ...field.samples import sample_depth_maps
     from ...field.vacancy import VacancyField
     from ...gaussians.files import load_gaussians
-    from ...meshing.surface_points import checked_request
+    from ...meshing.spacing import checked_request
     from ...photos.store import PhotoStore
     from ...regions.scene_regions import (
         automatic_region,

@@ -32,7 +32,8 @@ from ...names import FACES, GATHER, POINTS, region_names
 from ...settings import key_values
 from ...worker.spawn import host_and_pid_namespace, process_start_ticks
 from ..store.job_file import JobFile, read_job
-from ..store.job_folder import STAGE_VERSIONS, JobFolder, stage_key
+from ..store.job_folder import JobFolder
+from ..store.stage_folder import STAGE_VERSIONS, stage_key
 
 # -- Exit codes of ``run-part``: what an engine may do with a part that is not done ---------------
 

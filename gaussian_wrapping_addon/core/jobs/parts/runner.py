@@ -36,7 +36,8 @@ from ..stages.meshing import (
 from ..stages.texture import run_texture
 from ..stages.training import plan_files, run_block, run_coarse, run_training
 from ..store.job_file import JobFile
-from ..store.job_folder import STAGE_VERSIONS, JobFolder, Stage, read_done
+from ..store.job_folder import JobFolder
+from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done
 from .graph import (
     MAY_WORK_ELSEWHERE,
     OTHER_CODE,

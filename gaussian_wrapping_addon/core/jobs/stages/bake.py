@@ -15,8 +15,9 @@ from ...files import write_json
 from ...progress import Progress
 from ...settings import key_values
 from ..store.job_file import BakeRequest, JobFile, training_keys
-from ..store.job_folder import STAGE_VERSIONS, JobFolder, Stage, read_done, run_stage, stage_key
+from ..store.job_folder import JobFolder
 from ..store.rollback import new_result, no_finished_training
+from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done, run_stage, stage_key
 
 if TYPE_CHECKING:
     from ...mesh.exchange import FileMesh

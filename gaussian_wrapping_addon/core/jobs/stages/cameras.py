@@ -27,16 +27,16 @@ from ...progress import Progress, ReportWarning, read_warnings
 from ...readers.point_files import is_splat_path
 from ...scene.scene import Scene, View
 from ..store.job_file import JobFile, training_keys
-from ..store.job_folder import (
+from ..store.job_folder import JobFolder
+from ..store.rollback import shorter_training
+from ..store.stage_folder import (
     STAGE_VERSIONS,
-    JobFolder,
     Stage,
     read_done,
     run_stage,
     source_fingerprint,
     stage_key,
 )
-from ..store.rollback import shorter_training
 
 if TYPE_CHECKING:
     from ...loading.real_world import UnitsRequest

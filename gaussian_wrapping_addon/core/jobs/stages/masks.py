@@ -34,7 +34,8 @@ from ...regions.scene_regions import parse_region, region_in_scene
 from ...regions.shapes import Region
 from ...settings import TrainingSettings
 from ..store.job_file import JobFile, training_keys
-from ..store.job_folder import STAGE_VERSIONS, JobFolder, Stage, read_done, run_stage, stage_key
+from ..store.job_folder import JobFolder
+from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done, run_stage, stage_key
 from .cameras import MASKED, scene_of_finished_training
 
 if TYPE_CHECKING:
@@ -89,7 +90,8 @@ def make_region_masks(
     import torch
 
     from ...devices.checks import with_renderer
-    from ...masks.making import GROWN_SHARE, cleaned, encoded, silhouettes
+    from ...masks.making import silhouettes
+    from ...masks.segmentation import GROWN_SHARE, cleaned, encoded
 
     gaussians = _coarse_training(
         scene, job, folder / "coarse", progress.span(0.0, _TRAINED), threads, device
@@ -384,7 +386,7 @@ def _write_masked_scene(
 ) -> dict[str, Any]:
     """Copy masks and scene, without the photos that are left out."""
 
-    from ...masks.making import encoded
+    from ...masks.segmentation import encoded
     from ...photos.photo_file import MASK_THRESHOLD, read_mask
     from ...scene.scene import MASKS_MADE, load_saved_scene, save_scene
 

@@ -34,9 +34,9 @@ from ...names import AUTOMATIC_REGIONS, GATHER, POINTS, TILE_KINDS
 from ...progress import Progress, ReportWarning
 from ...settings import MeshingSettings, key_values
 from ..store.job_file import JobFile
-from ..store.job_folder import (
+from ..store.job_folder import JobFolder
+from ..store.stage_folder import (
     STAGE_VERSIONS,
-    JobFolder,
     Stage,
     record_interrupted_time,
     run_stage,
@@ -175,7 +175,7 @@ def reject_short_edges(job: JobFile, cameras: Path) -> None:
     ResourceError
         Names the region.
     """
-    from ...meshing.surface_points import checked_request
+    from ...meshing.spacing import checked_request
     from ...scene.scene import load_saved_scene
 
     lengths = {
@@ -501,7 +501,7 @@ def estimate_region_mesh(
         evaluation_seconds,
         occupied_boundary_area,
     )
-    from ...meshing.surface_points import checked_request, resolved_edges
+    from ...meshing.spacing import checked_request, resolved_edges
 
     adaptive = meshing.spacing == "adaptive"
     subset = depth_samples.points[:: max(1, len(depth_samples) // MAX_SPACING_SAMPLES)]

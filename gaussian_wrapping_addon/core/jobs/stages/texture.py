@@ -21,8 +21,9 @@ from ...scene.placement import read_placement, write_placement
 from ...settings import to_json
 from ...units.georeference import blender_start
 from ..store.job_file import JobFile
-from ..store.job_folder import STAGE_VERSIONS, JobFolder, Stage, run_stage, stage_key
+from ..store.job_folder import JobFolder
 from ..store.rollback import new_result
+from ..store.stage_folder import STAGE_VERSIONS, Stage, run_stage, stage_key
 from .cameras import write_scene_summary
 from .meshing import DENSE_MESH
 

@@ -23,7 +23,7 @@ from ...progress import Progress, ReportWarning, read_warnings
 from ...settings import MeshingSettings, TrainingSettings, to_json
 from ...worker.helper_process import own_peak_bytes
 from ..store.job_file import JobFile, blocks_key, training_keys
-from ..store.job_folder import JobFolder, Stage, read_done, record_interrupted_time, run_stage
+from ..store.job_folder import JobFolder
 from ..store.rollback import (
     checkpoints,
     lineage,
@@ -31,6 +31,7 @@ from ..store.rollback import (
     nothing_to_continue,
     shorter_training,
 )
+from ..store.stage_folder import Stage, read_done, record_interrupted_time, run_stage
 from .training_cost import compile_if_needed, estimated_cost, fitting_device
 
 if TYPE_CHECKING:

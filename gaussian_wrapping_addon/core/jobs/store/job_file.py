@@ -39,7 +39,7 @@ from ...settings import (
     to_json,
 )
 from ...units.georeference import metric_from_world
-from .job_folder import stage_key
+from .stage_folder import stage_key
 
 # -- What a job bakes the photos onto: the entry ``bake`` of the job file -------------------------
 #

@@ -17,7 +17,8 @@ from typing import Any
 from ...errors import DatasetError, ParseError, UsageError
 from ...files import is_real_folder, read_json, write_json
 from .job_file import JobFile, read_job, write_job
-from .job_folder import JobFolder, JobStatus, read_done
+from .job_folder import JobFolder, JobStatus
+from .stage_folder import read_done
 
 # -- Replace a job's result all at once, or not at all --------------------------------------------
 #

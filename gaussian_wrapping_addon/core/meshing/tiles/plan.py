@@ -15,17 +15,8 @@ from ...mesh.sampling import POINTS_PER_SQUARE
 from ...progress import Progress, ReportWarning
 from ...regions.shapes import Region, Tiling, split_evenly
 from ...scene.camera import Camera
-from ..surface_points import (
-    CandidateSurface,
-    Caps,
-    DenseRequest,
-    ResolutionRequest,
-    Spacing,
-    SurfaceSampler,
-    cap_points,
-    dense_request,
-    nominal_edge,
-)
+from ..spacing import DenseRequest, ResolutionRequest, Spacing, dense_request, nominal_edge
+from ..surface_points import CandidateSurface, Caps, SurfaceSampler, cap_points
 
 # -- Steiner points on a jittered lattice, which bound empty balls and so make Delaunay cells
 #    local

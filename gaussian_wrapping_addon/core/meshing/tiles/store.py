@@ -17,7 +17,8 @@ from ...errors import ParseError
 from ...files import read_json, write_bytes, write_json
 from ...progress import read_warnings
 from ...regions.shapes import Region, Tiling
-from ..surface_points import CandidateSurface, Caps, Spacing, SurfacePoints
+from ..spacing import Spacing
+from ..surface_points import CandidateSurface, Caps, SurfacePoints
 from .plan import TilePlan
 from .tile import GatheredPoints, TileSurface
 

@@ -18,14 +18,8 @@ from ..classification import OUTWARD_FACES, classify, on_one_sheet, tetrahedron_
 from ..delaunay import bounding_points, delaunay
 from ..primal_adaptive import DEGENERATE_SHARE, KIND_SPLIT, LONGEST_EDGE_SHARE
 from ..repair import remove_degenerate, split_nonmanifold
-from ..surface_points import (
-    KIND_CAP,
-    KIND_JUMP,
-    PRIORITY_SURFACE,
-    ResolutionRequest,
-    SurfacePoints,
-    SurfaceSampler,
-)
+from ..spacing import ResolutionRequest
+from ..surface_points import KIND_CAP, KIND_JUMP, PRIORITY_SURFACE, SurfacePoints, SurfaceSampler
 from .plan import (
     CLEARANCE_CAP_RADII,
     CLEARANCE_RADII,

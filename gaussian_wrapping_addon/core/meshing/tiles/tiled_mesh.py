@@ -21,7 +21,8 @@ from ...scene.camera import Camera
 from ...settings import MeshingSettings
 from ..primal_adaptive import residuals_on_surface, small_handles_closed, vertex_counts
 from ..repair import remove_degenerate
-from ..surface_points import candidate_surface, checked_request
+from ..spacing import checked_request
+from ..surface_points import candidate_surface
 from .join import Joined, LoadTile, flip_by_tiles, joined, overview
 from .plan import Field, TilePlan, make_plan
 from .tile import KIND_STEINER, cost_units, longest_edge

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...errors import DatasetError
 from ...worker.helper_process import emit
-from .charts import chart_extents, packing_scale, packing_square
+from .packing_scale import chart_extents, packing_scale, packing_square
 
 GROWTH = 1.1
 MAX_GROWTHS = 8

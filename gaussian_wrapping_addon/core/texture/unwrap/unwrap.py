@@ -26,8 +26,9 @@ from ...mesh.surface_mesh import SurfaceMesh, edge_lengths
 from ...mesh.textured_mesh import FIRST_UDIM, TILE_COLUMNS, TILE_ROWS
 from ...progress import Progress, ReportWarning
 from ..atlas import AtlasRaster, raster_atlas
-from .charts import find_charts, pack_charts, split_wide_charts
+from .charts import find_charts, pack_charts
 from .overlaps import split_overlaps
+from .packing_scale import split_wide_charts
 
 # -- Fallback unwrap: box projection along the axes, charts packed in shelves ---------------------
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gaussian_wrapping_addon.core.errors import MissingExtraError
-from gaussian_wrapping_addon.core.jobs.store.job_folder import source_fingerprint
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
 from gaussian_wrapping_addon.core.loading import load as load_module
 from gaussian_wrapping_addon.core.loading.check import check_input
 from gaussian_wrapping_addon.core.loading.load import load_scene

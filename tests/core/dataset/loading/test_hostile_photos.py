@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from gaussian_wrapping_addon.core.files import resolve_inside
-from gaussian_wrapping_addon.core.jobs.store.job_folder import source_fingerprint
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
 from gaussian_wrapping_addon.core.loading.check import Finding, check_input
 from gaussian_wrapping_addon.core.loading.load import load_scene
 from gaussian_wrapping_addon.core.photos.finder import find_mask

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import DatasetError
-from gaussian_wrapping_addon.core.jobs.store.job_folder import source_fingerprint
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
 from gaussian_wrapping_addon.core.limits import SCENE_RADIUS
 from gaussian_wrapping_addon.core.loading.check import check_input
 from gaussian_wrapping_addon.core.loading.load import load_scene

@@ -15,7 +15,7 @@ from scipy.io import savemat
 from gaussian_wrapping_addon import batch
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.evaluation.command import EvaluationRequest, evaluate_mesh
-from gaussian_wrapping_addon.core.evaluation.layouts import (
+from gaussian_wrapping_addon.core.evaluation.dtu import (
     align_to_scan,
     read_dtu,
     read_observation_mask,

@@ -24,9 +24,10 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import (
     read_job,
     training_keys,
 )
-from gaussian_wrapping_addon.core.jobs.store.job_folder import STAGE_VERSIONS, JobFolder, Stage
-from gaussian_wrapping_addon.core.masks.making import encoded
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage
 from gaussian_wrapping_addon.core.masks.mask_folder import read_list, write_list
+from gaussian_wrapping_addon.core.masks.segmentation import encoded
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.scene.scene import Scene, load_saved_scene, save_scene
 from gaussian_wrapping_addon.core.settings import JobSettings

@@ -21,10 +21,10 @@ from gaussian_wrapping_addon.core.jobs.stages.meshing import DENSE_MESH, run_mes
 from gaussian_wrapping_addon.core.jobs.stages.texture import run_texture
 from gaussian_wrapping_addon.core.jobs.stages.training import run_training
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
     DONE_NAME,
     STAGE_VERSIONS,
-    JobFolder,
     Stage,
     read_done,
 )

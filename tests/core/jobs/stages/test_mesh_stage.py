@@ -18,7 +18,8 @@ from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
 from gaussian_wrapping_addon.core.jobs.stages import meshing
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, Stage
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage
 from gaussian_wrapping_addon.core.mesh.surface_mesh import load_mesh
 from gaussian_wrapping_addon.core.meshing.delaunay import bounding_points, delaunay
 from gaussian_wrapping_addon.core.meshing.marching_tetrahedra import bisect, marching_tetrahedra

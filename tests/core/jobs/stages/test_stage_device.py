@@ -15,12 +15,8 @@ from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
 from gaussian_wrapping_addon.core.jobs.stages import training, training_cost
 from gaussian_wrapping_addon.core.jobs.stages.training import GAUSSIANS_NAME, run_training
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
-    STAGE_VERSIONS,
-    JobFolder,
-    Stage,
-    read_done,
-)
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage, read_done
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.training import device_backend, trainer
 from gaussian_wrapping_addon.core.training.state import TrainingResult

@@ -12,7 +12,7 @@ import pytest
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, start_fingerprint
-from gaussian_wrapping_addon.core.jobs.store.job_folder import source_fingerprint
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
 from gaussian_wrapping_addon.core.ply import read_ply_header
 from gaussian_wrapping_addon.core.regions.files import parse_region_file, region_to_json
 from gaussian_wrapping_addon.core.regions.scene_regions import parse_region

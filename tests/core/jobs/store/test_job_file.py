@@ -23,7 +23,8 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import (
     training_keys,
     write_job,
 )
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, stage_key
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import stage_key
 from gaussian_wrapping_addon.core.loading.real_world import UnitsRequest
 from gaussian_wrapping_addon.core.names import JOB_MARKER, region_name, region_names
 from gaussian_wrapping_addon.core.progress import Progress

@@ -19,8 +19,9 @@ from gaussian_wrapping_addon.core.jobs.stages import texture
 from gaussian_wrapping_addon.core.jobs.stages.texture import export_results
 from gaussian_wrapping_addon.core.jobs.store import rollback
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, Stage
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.rollback import new_result, recover
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.scene.camera import Similarity
 from gaussian_wrapping_addon.core.settings import JobSettings

@@ -23,7 +23,7 @@ import sys
 sys.path[:0] = {path!r}
 from gaussian_wrapping_addon.core.errors import {error}
 from gaussian_wrapping_addon.core.jobs import runner, worker
-from gaussian_wrapping_addon.core.jobs.store.job_folder import run_stage
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import run_stage
 from gaussian_wrapping_addon.core.progress import Progress
 def work(folder, progress):
     (folder / "tiles").mkdir(exist_ok=True)

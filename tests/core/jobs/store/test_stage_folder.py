@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.core.jobs.store.job_folder import (
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
     record_interrupted_time,
     run_stage,
     source_fingerprint,

@@ -26,8 +26,9 @@ from gaussian_wrapping_addon.core.jobs.stages.training import (
     run_training,
 )
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import STAGE_VERSIONS, JobFolder, Stage
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.rollback import continue_training_job
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage
 from gaussian_wrapping_addon.core.photos.store import PhotoStore
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.scene.scene import load_saved_scene

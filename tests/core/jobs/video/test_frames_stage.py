@@ -17,7 +17,8 @@ from gaussian_wrapping_addon.core.evaluation.report.report import report_markdow
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.stages.cameras import frames_request, run_cameras
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, training_keys
-from gaussian_wrapping_addon.core.jobs.store.job_folder import STAGE_VERSIONS, JobFolder
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS
 from gaussian_wrapping_addon.core.loading import load
 from gaussian_wrapping_addon.core.photos import video_frames
 from gaussian_wrapping_addon.core.photos.finder import list_photos

@@ -16,7 +16,7 @@ from gaussian_wrapping_addon.core.meshing.estimate import (
     occupied_boundary_area,
     two_digits_below,
 )
-from gaussian_wrapping_addon.core.meshing.surface_points import ResolutionRequest, resolved_edges
+from gaussian_wrapping_addon.core.meshing.spacing import ResolutionRequest, resolved_edges
 from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.meshing.meshing_scenes import gaussians_on, some_cameras, sphere
 from tests.core.meshing.test_tiles import (

@@ -10,7 +10,7 @@ import pytest
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.errors import ResourceError
 from gaussian_wrapping_addon.core.mesh.sampling import EDGE_PER_RADIUS, POINTS_PER_SQUARE
-from gaussian_wrapping_addon.core.meshing.surface_points import (
+from gaussian_wrapping_addon.core.meshing.spacing import (
     FINEST_SHARE,
     ResolutionRequest,
     check_expected_points,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.mesh.sampling import EDGE_PER_RADIUS
-from gaussian_wrapping_addon.core.meshing.surface_points import (
+from gaussian_wrapping_addon.core.meshing.spacing import (
     EDGE_PER_PIXEL,
     GRADING,
     Spacing,

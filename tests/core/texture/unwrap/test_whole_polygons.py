@@ -11,17 +11,14 @@ import pytest
 from gaussian_wrapping_addon.core.mesh.components import face_graph, uv_charts
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.texture.unwrap.charts import (
-    flatten_faces,
-    split_wide_charts,
-    texture_stretch,
-)
+from gaussian_wrapping_addon.core.texture.unwrap.charts import flatten_faces, texture_stretch
 from gaussian_wrapping_addon.core.texture.unwrap.overlaps import (
     find_overlaps,
     join_polygons,
     set_cut_apart,
     signed_areas,
 )
+from gaussian_wrapping_addon.core.texture.unwrap.packing_scale import split_wide_charts
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import Unwrap, unwrap
 
 

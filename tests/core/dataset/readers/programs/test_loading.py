@@ -12,7 +12,7 @@ from PIL import Image
 
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.jobs.commands.estimate_command import input_facts
-from gaussian_wrapping_addon.core.jobs.store.job_folder import source_fingerprint
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
 from gaussian_wrapping_addon.core.loading.check import check_input
 from gaussian_wrapping_addon.core.loading.load import load_scene
 from gaussian_wrapping_addon.core.loading.source_kind import source_kind
