@@ -11,11 +11,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from gaussian_wrapping_addon.core.errors import WorkerError
 from gaussian_wrapping_addon.core.files import read_json, write_json
+from gaussian_wrapping_addon.core.settings import JobSettings, declarations
 
 from .provenance import ROOT, code_of_tree
 
@@ -86,7 +88,7 @@ def run_wrap(run: Run, scene: Path, settings: Settings) -> Path:
     folder.mkdir(parents=True)
     arguments = [
         "wrap", str(scene), "--out", str(folder / "out"), "--preset", run.preset,
-        "--seed", str(run.seed), *_region(scene), *run.arguments,
+        "--seed", str(run.seed), *_region(scene), *with_set(run.arguments),
     ]  # fmt: skip
     _batch(arguments, folder, settings)
     return folder
@@ -102,6 +104,27 @@ def warm_up(scene: Path, settings: Settings, more: tuple[str, ...] = ()) -> None
     settings.folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="warm-up-", dir=settings.folder) as folder:
         run_wrap(run, scene, dataclasses.replace(settings, folder=Path(folder)))
+
+
+def with_set(words: Sequence[str]) -> list[str]:
+    """Return arguments with ``--set name=value`` for options that name another setting.
+
+    Runs and records name every setting by an option, ``--dense-start off``.
+    """
+    others = {}
+    for entry in declarations(JobSettings):
+        if entry.option is not None and not entry.option.own:
+            others[entry.option.name] = entry.option
+    left = list(words)
+    spelled = []
+    while left:
+        word = left.pop(0)
+        option = others.get(word)
+        if option is None or (not option.flag and (not left or left[0].startswith("--"))):
+            spelled.append(word)
+        else:
+            spelled += ["--set", f"{option.word}={option.flag or left.pop(0)}"]
+    return spelled
 
 
 def _batch(arguments: list[str], folder: Path, settings: Settings) -> None:

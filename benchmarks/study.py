@@ -26,7 +26,7 @@ from gaussian_wrapping_addon.core.files import finite_json, read_json, write_jso
 from gaussian_wrapping_addon.core.machine import processor_name
 
 from .provenance import DOCUMENTS, RECORDS, ROOT, Code, code_of_tree, versions
-from .runs import BATCH, LAST_LINES, Photos, Settings, judged_by
+from .runs import BATCH, LAST_LINES, Photos, Settings, judged_by, with_set
 from .runs import warm_up as run_warm_up
 from .scenes.cache import ensure_scene
 from .tables import MIDDLE, thin_recall
@@ -474,7 +474,7 @@ def make(
             "wrap", str(scene), "--out", str(job), "--preset", case.preset,
             "--seed", str(case.seed),
         ]  # fmt: skip
-    words += ["--region", str(scene / "region.json"), *case.arguments]
+    words += ["--region", str(scene / "region.json"), *with_set(case.arguments)]
     words += ["--export", "ply", "--no-blend", "--threads", str(threads)]
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     code = code_of_tree()

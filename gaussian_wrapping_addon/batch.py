@@ -44,7 +44,7 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
 
 
 def _run(arguments: list[str], program: str) -> int:
-    from .command_line.options.option_names import with_option_name
+    from .command_line.options import with_option_name
     from .command_line.parser import build_parser
     from .core.errors import EXIT_OTHER, SettingError, WrapError, known_error
     from .core.worker.environment import interpreter_of, ready_worker

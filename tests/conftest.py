@@ -88,6 +88,7 @@ def slow_seconds() -> dict[str, float]:
     return seconds
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark slow tests, keep each file in one process, and start with the slowest files."""
     seconds = slow_seconds()

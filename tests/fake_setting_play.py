@@ -11,9 +11,11 @@ import sys
 from pathlib import Path
 
 import gaussian_wrapping_addon
-from gaussian_wrapping_addon.command_line.options.meshing_options import region_settings
-from gaussian_wrapping_addon.command_line.options.option_names import with_option_name
-from gaussian_wrapping_addon.command_line.options.training_options import training_settings
+from gaussian_wrapping_addon.command_line.options import (
+    region_settings,
+    training_settings,
+    with_option_name,
+)
 from gaussian_wrapping_addon.command_line.parser import build_parser
 from gaussian_wrapping_addon.core.errors import SettingError
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, read_job, write_job
@@ -40,13 +42,13 @@ def main(group: str) -> None:
 
     Path("photos").mkdir()
     path = Path("job.json").resolve()
-    write_job(path, make_job("wrap", Path("photos"), asked("--fake-number", "7")))
+    write_job(path, make_job("wrap", Path("photos"), asked("--set", "fake_number=7")))
     values = {
         "package": gaussian_wrapping_addon.__file__,
         "default": number(asked()),
         "fine": number(asked("--preset", "fine")),
-        "given": number(asked("--fake-number", "7")),
-        "refused": refusal(asked("--fake-number", "12")),
+        "given": number(asked("--set", "fake_number=7")),
+        "refused": refusal(asked("--set", "fake_number=12")),
         "stored": json.loads(path.read_text())["settings"][group]["fake_number"],
         "read": number(read_job(path).settings),
         "table": [line for line in settings_table.table().splitlines() if "fake_number" in line],

@@ -5,18 +5,19 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.command_line import export_command
-from gaussian_wrapping_addon.command_line.options.meshing_options import (
+from gaussian_wrapping_addon.command_line import mesh_commands
+from gaussian_wrapping_addon.command_line.options import (
     method_settings,
+    option_of,
     region_settings,
+    training_settings,
 )
-from gaussian_wrapping_addon.command_line.options.setting_options import option_of
-from gaussian_wrapping_addon.command_line.options.training_options import training_settings
 from gaussian_wrapping_addon.command_line.parser import build_parser
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs.commands import run_in_worker
@@ -54,12 +55,12 @@ def test_without_options_the_preset_stands(name: str) -> None:
         ("--iterations", "70", "iterations", 70),
         ("--max-gaussians", "700", "max_gaussians", 700),
         ("--max-image-px", "96", "max_image_px", 96),
-        ("--sh-degree", "0", "sh_degree", 0),
+        ("--set", "sh_degree=0", "sh_degree", 0),
         ("--holdout", "0", "holdout_every", 0),
-        ("--preview-every", "2.5", "preview_every_s", 2.5),
-        ("--mask-mode", "background", "mask_mode", "background"),
-        *((f"--{n.replace('_', '-')}", "off", n, "off") for n in DECIDED),
-        *((f"--{n.replace('_', '-')}", "on", n, "on") for n in MODEL_SELECTION),
+        ("--set", "preview_every=2.5", "preview_every_s", 2.5),
+        ("--set", "mask_mode=background", "mask_mode", "background"),
+        *(("--set", f"{n}=off", n, "off") for n in DECIDED),
+        *(("--set", f"{n}=on", n, "on") for n in MODEL_SELECTION),
     ],
 )
 def test_an_option_changes_its_setting_alone(
@@ -75,55 +76,68 @@ def test_an_option_changes_its_setting_alone(
     assert after == before
 
 
+def parsed(command: str, *words: str) -> Namespace:
+    """Return parsed options; a word with "=" is given with --set."""
+    given = [w for word in words for w in (("--set", word) if "=" in word else (word,))]
+    return build_parser().parse_args([*command.split(), "--out", "o", *given])
+
+
 @pytest.mark.parametrize("command", ["wrap photos", "mesh"])
 def test_clean_up_options_become_meshing_settings(command: str) -> None:
     def meshing(*arguments: str) -> MeshingSettings:
-        options = build_parser().parse_args([*command.split(), "--out", "o", *arguments])
+        options = parsed(command, *arguments)
         earlier = replace(preset("draft"), meshing=MeshingSettings(target_faces=77, smooth_steps=7))
         return region_settings(earlier, options).meshing
 
     assert meshing() == MeshingSettings(), "what an earlier mesh was given does not stay"
-    assert meshing("--method", "pivots", "--pivots", "9") == MeshingSettings(
-        method="pivots", pivots=9
-    )
-    assert meshing("--spacing", "uniform", "--points", "50", "--tiles", "3") == MeshingSettings(
+    assert meshing("method=pivots", "pivots=9") == MeshingSettings(method="pivots", pivots=9)
+    assert meshing("spacing=uniform", "--points", "50", "tiles=3") == MeshingSettings(
         spacing="uniform", points=50, tiles="3"
     )
     assert meshing("--edge-length", "0.5") == MeshingSettings(edge_length=0.5)
-    assert meshing("--boundary", "open") == MeshingSettings(boundary="open")
-    assert meshing("--method", "pivots", "--pivots", "9", "--pivot-box", "gof") == MeshingSettings(
+    assert meshing("boundary=open") == MeshingSettings(boundary="open")
+    assert meshing("method=pivots", "pivots=9", "pivot_box=gof") == MeshingSettings(
         method="pivots", pivots=9, pivot_box="gof"
     )
-    assert meshing("--method", "pivots", "--pivot-samples", "none") == MeshingSettings(
+    assert meshing("method=pivots", "pivot_samples=none") == MeshingSettings(
         method="pivots", pivot_samples="none"
     )
-    assert meshing("--mesh-cameras", "all") == MeshingSettings(cameras="all")
-    assert meshing("--unseen", "occupied") == MeshingSettings(unseen="occupied")
+    assert meshing("mesh_cameras=all") == MeshingSettings(cameras="all")
+    assert meshing("unseen=occupied") == MeshingSettings(unseen="occupied")
     assert meshing("--faces", "5000") == MeshingSettings(target_faces=5000)
-    assert meshing("--smooth", "3") == MeshingSettings(smooth_steps=3)
-    assert meshing("--parts", "2") == MeshingSettings(most_parts=2)
-    assert meshing("--min-part", "0.2") == MeshingSettings(min_component_share=0.2)
+    assert meshing("smooth=3") == MeshingSettings(smooth_steps=3)
+    assert meshing("parts=2") == MeshingSettings(most_parts=2)
+    assert meshing("min_part=0.2") == MeshingSettings(min_component_share=0.2)
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--method", "pivots", "--points", "50"), ("--points 50", "--method pivots")),
-        (("--method", "pivots", "--edge-length", "0.1"), ("--edge-length 0.1", "--method pivots")),
-        (("--method", "pivots", "--spacing", "uniform"), ("--spacing uniform", "--method pivots")),
-        (("--method", "pivots", "--tiles", "4"), ("--tiles 4", "--method pivots")),
-        (("--pivots", "9"), ("--pivots 9", "--method pam")),
-        (("--method", "pam", "--pivots", "2"), ("--pivots 2", "--method pam")),
-        (("--pivot-box", "gof"), ("--pivot-box gof", "--method pam")),
-        (("--pivot-samples", "none"), ("--pivot-samples none", "--method pam")),
-        (("--method", "pivots", "--pivot-box", "gof"), ("--pivot-box gof", "--pivots 9")),
+        (("method=pivots", "--points", "50"), ("--points 50", "--set method=pivots")),
+        (
+            ("method=pivots", "--edge-length", "0.1"),
+            ("--edge-length 0.1", "--set method=pivots"),
+        ),
+        (
+            ("method=pivots", "spacing=uniform"),
+            ("--set spacing=uniform", "--set method=pivots"),
+        ),
+        (("method=pivots", "tiles=4"), ("--set tiles=4", "--set method=pivots")),
+        (("pivots=9",), ("--set pivots=9", "--set method=pam")),
+        (("method=pam", "pivots=2"), ("--set pivots=2", "--set method=pam")),
+        (("pivot_box=gof",), ("--set pivot_box=gof", "--set method=pam")),
+        (("pivot_samples=none",), ("--set pivot_samples=none", "--set method=pam")),
+        (
+            ("method=pivots", "pivot_box=gof"),
+            ("--set pivot_box=gof", "--set pivots=9"),
+        ),
     ],
 )
 @pytest.mark.parametrize("command", ["wrap photos", "mesh", "estimate-mesh"])
 def test_options_that_the_method_does_not_heed_are_refused(
     command: str, arguments: tuple[str, ...], words: tuple[str, str]
 ) -> None:
-    options = build_parser().parse_args([*command.split(), "--out", "o", *arguments])
+    options = parsed(command, *arguments)
     with pytest.raises(UsageError) as refused:
         method_settings(options)
     assert all(word in refused.value.message for word in words)
@@ -131,7 +145,7 @@ def test_options_that_the_method_does_not_heed_are_refused(
 
 
 def test_words_that_ask_a_method_for_nothing_else_go_with_it() -> None:
-    asked = ["mesh", "--out", "o", "--method", "pivots", "--points", "0", "--tiles", "off"]
+    asked = ["mesh", "--out", "o", "--set", "method=pivots", "--points", "0", "--set", "tiles=off"]
     settings = MeshingSettings(**method_settings(build_parser().parse_args(asked)))
     assert settings == MeshingSettings(method="pivots", tiles="off")
 
@@ -144,9 +158,9 @@ def test_map_options_become_texture_settings(command: str) -> None:
         return region_settings(earlier, options).texture
 
     assert texture() == TextureSettings(), "what an earlier mesh was given does not stay"
-    assert texture("--normal-map", "off") == TextureSettings(normal_map="off")
-    assert texture("--ambient-occlusion") == TextureSettings(ambient_occlusion="on")
-    assert texture("--lods", "3") == TextureSettings(lods=3)
+    assert texture("--set", "normal_map=off") == TextureSettings(normal_map="off")
+    assert texture("--set", "ambient_occlusion=on") == TextureSettings(ambient_occlusion="on")
+    assert texture("--set", "lods=3") == TextureSettings(lods=3)
 
 
 @pytest.mark.parametrize(("word", "wanted"), [("auto", "auto"), ("all", "on"), ("none", "off")])
@@ -156,8 +170,8 @@ def test_needs_sets_the_model_selection_and_a_single_option_wins(word: str, want
     assert {getattr(training, name) for name in names} == {wanted}
     other = "off" if wanted == "on" else "on"
     for arguments in (
-        ("--needs", word, "--exposure", other),
-        ("--exposure", other, "--needs", word),
+        ("--needs", word, "--set", f"exposure={other}"),
+        ("--set", f"exposure={other}", "--needs", word),
     ):
         training = settings_of(*arguments).training
         assert training.exposure == other
@@ -165,7 +179,7 @@ def test_needs_sets_the_model_selection_and_a_single_option_wins(word: str, want
 
 
 @pytest.mark.parametrize(
-    "arguments", [("--needs", "some"), ("--growth", "yes"), ("--sh-degree", "x")]
+    "arguments", [("--needs", "some"), ("--set", "growth=yes"), ("--set", "sh_degree=x")]
 )
 def test_other_words_are_refused(arguments: tuple[str, str]) -> None:
     with pytest.raises(UsageError):
@@ -233,7 +247,44 @@ def test_model_selection_has_an_option_each() -> None:
         "dense_start", "refine_poses",
     )  # fmt: skip
     for name in MODEL_SELECTION:
-        assert option_of(f"training.{name}") == "--" + name.replace("_", "-")
+        assert option_of(f"training.{name}") == f"--set {name}"
+
+
+def test_set_takes_every_setting_without_an_option() -> None:
+    given = settings_of("--set", "lambda-dssim=0.3", "--set", "sh_degree=0", "--set", "wrapping=on")
+    training = given.training
+    assert (training.lambda_dssim, training.sh_degree, training.wrapping) == (0.3, 0, "on")
+    assert settings_of("--set", "sh_degree=0", "--set", "sh_degree=2").training.sh_degree == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message", "hint"),
+    [
+        ("--set wraping=on", "unknown setting 'wraping', the nearest is wrapping", "--help"),
+        ("--set wrapping", "no value in 'wrapping'; give wrapping=VALUE", "--help"),
+        ("--set wrapping=yes", "wrapping: invalid choice: 'yes' .choose from off, on", "--help"),
+        ("--set sh_degree=x", "sh_degree: invalid int value: 'x'", "--help"),
+        ("--set seed=3", "seed has an option of its own: --seed", "--help"),
+        ("--wrapping on", "unrecognized arguments: --wrapping on", "Give it as --set wrapping="),
+        ("--sh-degree=2", "unrecognized arguments: --sh-degree=2", "Give it as --set sh_degree="),
+    ],
+)
+def test_a_wrong_setting_is_refused_with_the_right_one(words: str, message: str, hint: str) -> None:
+    with pytest.raises(UsageError, match=message) as refused:
+        build_parser().parse_args(["wrap", "x", "--out", "o", *words.split()])
+    assert hint in refused.value.hint
+
+
+def test_settings_lists_what_set_takes(caplog: pytest.LogCaptureFixture) -> None:
+    parser = build_parser()
+    with caplog.at_level("INFO"):
+        options = parser.parse_args(["settings", "patch", "deviation"])
+        assert options.run(options) == 0
+    words = [message.partition("=")[0] for message in caplog.messages]
+    assert words == ["patch_contrast", "patch_rise"]
+    options = parser.parse_args(["settings", "no such words"])
+    with pytest.raises(UsageError, match="No setting has no such words"):
+        options.run(options)
 
 
 def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
@@ -245,10 +296,12 @@ def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
     }
     known = {path: option for path in paths if (option := option_of(path))}
     wrap = set(build_parser()._subparsers._group_actions[0].choices["wrap"]._option_string_actions)
-    assert set(known.values()) <= wrap
-    assert wrap - set(known.values()) == {
-        "-h", "--help", "--needs", "--out", "--no-blend", "--user-preset", "--plan-only",
+    own = {option for option in known.values() if not option.startswith("--set ")}
+    assert own <= wrap
+    assert wrap - own == {
+        "-h", "--help", "--needs", "--out", "--no-blend", "--user-preset", "--plan-only", "--set",
     }  # fmt: skip
+    assert len(wrap - {"-h"}) <= 30
     for name in ("preset", "meshing.min_component_share", "training.holdout_every"):
         assert name in known
     assert option_of("training.focus") == ""
@@ -257,12 +310,28 @@ def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["wrap", "photos", "--out", "o", "--start-splat", "no.ply", "--no-blend"], 3, "no.ply"),
-        (["wrap", "photos", "--out", "o", "--sh-degree", "4", "--no-blend"], 2, "--sh-degree is"),
+        (
+            ["wrap", "photos", "--out", "o", "--set", "start_splat=no.ply", "--no-blend"],
+            3,
+            "no.ply",
+        ),
+        (
+            ["wrap", "photos", "--out", "o", "--set", "sh_degree=4", "--no-blend"],
+            2,
+            "--set sh_degree is",
+        ),
         (["wrap", "photos", "--out", "o", "--faces", "3", "--no-blend"], 2, "--faces is"),
-        (["wrap", "photos", "--out", "o", "--smooth", "-1", "--no-blend"], 2, "--smooth is"),
-        (["wrap", "photos", "--out", "o", "--min-part", "7", "--no-blend"], 2, "--min-part is"),
-        (["wrap", "photos", "--out", "o", "--tiles", "x", "--no-blend"], 2, "--tiles is"),
+        (
+            ["wrap", "photos", "--out", "o", "--set", "smooth=-1", "--no-blend"],
+            2,
+            "--set smooth is",
+        ),
+        (
+            ["wrap", "photos", "--out", "o", "--set", "min_part=7", "--no-blend"],
+            2,
+            "--set min_part is",
+        ),
+        (["wrap", "photos", "--out", "o", "--set", "tiles=x", "--no-blend"], 2, "--set tiles is"),
         (["wrap", "photos", "--out", "o", "--texture-size", "7"], 2, "--texture-size is"),
         (["estimate-mesh", "--out", "photos", "--threads", "-1"], 2, "--threads is out of range. "),
         (["run-part", "photos", "train", "--threads", "2000"], 2, "--threads is out of range. "),
@@ -270,8 +339,8 @@ def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
         (["wrap", "photos", "--out", "o", "--processes", "0", "--no-blend"], 2, "--processes is"),
         (["wrap", "photos", "--out", "o", "--computers", "here", "--no-blend"], 2, "--computers"),
         (["evaluate", "m.ply", "--truth", "photos", "--threads", "-1"], 2, "--threads is"),
-        (["wrap", "photos", "--out", "o", "--lods", "9", "--no-blend"], 2, "--lods is"),
-        (["wrap", "photos", "--out", "o", "--pivots", "4", "--no-blend"], 2, "--pivots"),
+        (["wrap", "photos", "--out", "o", "--set", "lods=9", "--no-blend"], 2, "--set lods is"),
+        (["wrap", "photos", "--out", "o", "--set", "pivots=4", "--no-blend"], 2, "--set: pivots"),
         (["more", "--out", "photos", "--iterations", "10", "--no-blend"], 2, "job.json"),
         (["more", "--out", "photos", "--no-blend"], 2, "--iterations"),
         (["estimate", "missing"], 3, "missing"),
@@ -310,7 +379,7 @@ def test_it_runs_as_a_script_of_blender(tmp_path: Path) -> None:
 def test_export_refuses_before_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     parser, out = build_parser(), tmp_path / "out"
     options = parser.parse_args(["export", str(tmp_path), "--out", str(out), "--format", "glb,usd"])
-    monkeypatch.setattr(export_command, "has_bpy", lambda: False)
+    monkeypatch.setattr(mesh_commands, "has_bpy", lambda: False)
     with pytest.raises(UsageError, match="Writing USD needs bpy") as caught:
         options.run(options)
     assert "blender --background" in caught.value.hint

@@ -86,7 +86,7 @@ def test_a_folder_that_is_no_job(place: Path, words: str) -> None:
         f"estimate-mesh --out {LONG}",
         f"estimate {LONG}",
         f"wrap photos --out new --no-blend --region {LONG}.json",
-        f"wrap photos --out new --no-blend --start-splat {LONG}.ply",
+        f"wrap photos --out new --no-blend --set start_splat={LONG}.ply",
         f"wrap {LONG} --out new --no-blend",
     ],
 )

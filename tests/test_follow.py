@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.command_line import follow as module
+from gaussian_wrapping_addon.command_line import job_commands as module
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job

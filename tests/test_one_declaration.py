@@ -42,10 +42,16 @@ def test_a_new_setting_needs_its_declaration_only(tmp_path: Path, group: str) ->
     # Of meshes and textures, what is not given has its default whatever the preset.
     fine = 5 if group == "training" else 3
     assert (found["default"], found["fine"], found["given"]) == (3, fine, 7)
-    assert found["refused"] == "--fake-number is out of range. Give from 1 to 9."
+    assert found["refused"] == "--set fake_number is out of range. Give from 1 to 9."
     assert (found["stored"], found["read"]) == (7, 7)
     (row,) = found["table"]
-    for cell in ("`--fake-number N`", "Fake Number", "3 / 3 / 5 / 3 / 3", "from 1 to 9", "bananas"):
+    for cell in (
+        "`--set fake_number=N`",
+        "Fake Number",
+        "3 / 3 / 5 / 3 / 3",
+        "from 1 to 9",
+        "bananas",
+    ):
         assert f"{cell} |" in row
     assert found["outdated"], "the test of the table would fail until it is written again"
 
@@ -59,7 +65,8 @@ def test_every_setting_stands_in_the_table() -> None:
     for entry in SETTINGS:
         assert f"\n| `{entry.name}` |" in text
         if entry.option is not None:
-            assert f"`{entry.option.name}" in text
+            word = entry.option.name if entry.option.own else f"--set {entry.option.word}="
+            assert f"`{word}" in text
         if entry.panel is not None:
             assert (entry.panel.drawn_label or entry.panel.label) in text
 
@@ -73,7 +80,7 @@ def test_declarations_agree_with_themselves(entry: Declaration) -> None:
     assert entry.help.endswith(".")
     if entry.option is not None:
         assert entry.option.name.startswith("--")
-        assert entry.scope in ("training", "constants", "method", "region", "more")
+        assert entry.scope in ("training", "method", "region", "more")
 
 
 @pytest.mark.parametrize("entry", WITH_PANEL, ids=path_of)

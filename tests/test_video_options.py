@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.command_line.options.training_options import training_settings
+from gaussian_wrapping_addon.command_line.options import training_settings
 from gaussian_wrapping_addon.command_line.parser import build_parser
 from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, EXIT_DONE, EXIT_USAGE, UsageError
 from tests.core.dataset.video.small_videos import pan, write
@@ -72,10 +72,10 @@ def test_blocks_without_other_computers_are_refused(tmp_path: Path) -> None:
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         Image.new("RGB", (64, 48)).save(tmp_path / "photos" / name)
     code, text = batch(
-        "wrap", tmp_path / "photos", "--out", tmp_path / "out", "--no-blend", "--blocks", "2"
+        "wrap", tmp_path / "photos", "--out", tmp_path / "out", "--no-blend", "--set", "blocks=2"
     )
     assert code == EXIT_USAGE
-    assert "Give --computers as well, or omit --blocks." in text
+    assert "Give --computers as well, or omit it." in text
     assert not (tmp_path / "out").exists()
 
 

@@ -42,8 +42,8 @@ objects of their names. `make settings-table` writes this file from the declarat
 
 Without an option or a choice in the panel, the default counts; where the presets differ, the table
 gives the defaults of {", ".join(PRESETS[:-1])} and {PRESETS[-1]}, in this order.
-`--needs auto|all|none` sets all settings of the model selection at once; the option of a single
-setting wins over it.
+`--set NAME=VALUE` gives what has no option of its own. `--needs auto|all|none` sets all settings of
+the model selection at once; a single setting wins over it.
 """
 _COLUMNS = ("setting", "option", "panel", "default", "range", "unit", "what it does")
 
@@ -81,6 +81,8 @@ def _option(declared: Declaration) -> str:
     if option is None:
         return ""
     command = "`more` " if declared.scope == "more" else ""
+    if not option.own:
+        return f"`--set {option.word}={option.metavar or 'X'}`"
     return f"{command}`{option.name} {option.metavar}".rstrip() + "`"
 
 

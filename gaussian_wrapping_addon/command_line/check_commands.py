@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The commands ``check`` and ``doctor``: findings about an input and the worker's Python."""
+"""The commands ``check``, ``doctor`` and ``evaluate``: what is there, and how good it is."""
 
 from __future__ import annotations
 
 import logging
-from argparse import Namespace
+import math
+from argparse import ArgumentTypeError, Namespace
 from pathlib import Path
 
-from .common import Commands
-from .follow import has_bpy
+from ..core.errors import UsageError
+from .job_commands import has_bpy
+from .options import Commands, add_threads
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -79,3 +81,116 @@ def _doctor(_options: Namespace) -> int:
             _logger.info("                 %s", finding.hint)
     _logger.info("bpy               %s", "present" if has_bpy() else "absent: use --no-blend")
     return EXIT_DONE if all(f.good for f in findings) else EXIT_BAD_DATA
+
+
+MIN_IMAGE_PX = 64
+"""Smaller photos hold no surface to speak of."""
+
+
+def add_evaluate(commands: Commands) -> None:
+    """Add ``evaluate``."""
+    parser = commands.add_parser(
+        "evaluate", help="score a mesh or a job against a ground truth or photos"
+    )
+    parser.add_argument(
+        "mesh", type=Path, metavar="MESH_OR_JOB", help="PLY, OBJ, GLB, STL or OFF; or a job folder"
+    )
+    parser.add_argument(
+        "--metric",
+        choices=("surface", "mbr"),
+        default="surface",
+        help="surface: distances to a true surface; mbr: mesh-based rendering, a colour field "
+        "trained on the mesh and compared with photos that were held out",
+    )
+    parser.add_argument(
+        "--truth", type=Path, metavar="PATH", help="mesh, cloud, scene or data set (surface)"
+    )
+    parser.add_argument(
+        "--test",
+        type=Path,
+        metavar="PATH",
+        help="test photos with cameras: COLMAP, transforms, or a folder with cameras.json and "
+        "images (mbr; default: the photos that the job held out)",
+    )
+    parser.add_argument(
+        "--max-image-px", type=int, metavar="N", help="long side of the photos compared (mbr)"
+    )
+    parser.add_argument(
+        "--layout",
+        choices=("auto", "scene", "mesh", "tanks", "dtu"),
+        default="auto",
+        help="layout of the truth; auto detects it from its files",
+    )
+    parser.add_argument("--scan", type=int, help="number of the DTU scan")
+    parser.add_argument("--region", help="region of the job, if it has several")
+    parser.add_argument(
+        "--cameras", type=Path, help="cameras, and photos, of a mesh file: COLMAP, transforms, job"
+    )
+    parser.add_argument(
+        "--thresholds", type=_floats, help="shares of the truth's diagonal, comma separated"
+    )
+    parser.add_argument(
+        "--distances", type=_floats, help="thresholds as lengths instead, comma separated"
+    )
+    parser.add_argument(
+        "--align",
+        choices=("none", "cameras", "icp"),
+        help="alignment of the mesh to the truth: none, by cameras of equal names, by nearest "
+        "points (default: none; tanks icp, dtu cameras)",
+    )
+    parser.add_argument("--protocols", help="comma separated, of uniform,scan,legacy")
+    parser.add_argument("--samples", type=int, help="points drawn on the mesh (uniform protocol)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of these points")
+    add_threads(parser)
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE.json", help="write all figures to this file"
+    )
+    parser.set_defaults(run=_evaluate)
+
+
+def _floats(text: str) -> list[float]:
+    try:
+        values = [float(word) for word in text.split(",") if word]
+    except ValueError:
+        values = [math.nan]
+    if not all(math.isfinite(value) for value in values):
+        raise ArgumentTypeError(f"{text!r}: give numbers separated by commas")
+    return values
+
+
+def _evaluate(options: Namespace) -> int:
+    from ..core.jobs.client import worker_python
+    from ..core.jobs.commands.run_in_worker import run_in_worker
+    from ..core.settings import JobSettings
+
+    JobSettings(seed=options.seed, threads=options.threads).validated()
+    if options.max_image_px is not None and options.max_image_px < MIN_IMAGE_PX:
+        raise UsageError(
+            f"--max-image-px {options.max_image_px} is too small.", f"Give at least {MIN_IMAGE_PX}."
+        )
+    protocols = options.protocols
+    request = {
+        "mesh": str(options.mesh),
+        "metric": options.metric,
+        "truth": None if options.truth is None else str(options.truth),
+        "test": None if options.test is None else str(options.test),
+        "max_image_px": options.max_image_px,
+        "layout": options.layout,
+        "scan": options.scan,
+        "region": options.region,
+        "cameras": None if options.cameras is None else str(options.cameras),
+        "shares": options.thresholds,
+        "distances": options.distances,
+        "align": options.align,
+        "protocols": None if protocols is None else [p for p in protocols.split(",") if p],
+        "samples": options.samples,
+        "seed": options.seed,
+        "threads": options.threads,
+        "out": None if options.out is None else str(options.out),
+    }
+    return run_in_worker(
+        request,
+        python=worker_python(),
+        module="jobs.commands.evaluate_command",
+        what="evaluation",
+    )

@@ -7,15 +7,21 @@ import logging
 from argparse import ArgumentParser
 from typing import Any, NoReturn
 
-from .bake_command import add_bake
-from .check_commands import add_check, add_doctor
-from .evaluate_command import add_evaluate
-from .export_command import add_convert_region, add_export
+from ..core.errors import UsageError
+from .check_commands import add_check, add_doctor, add_evaluate
 from .farm_commands import add_farm
 from .job_commands import add_cancel, add_parts, add_run_part, add_status
-from .meshing_commands import add_estimate_mesh, add_mesh
+from .mesh_commands import add_bake, add_convert_region, add_estimate_mesh, add_export, add_mesh
+from .options import SetAction
 from .setup_command import add_set_up_worker
-from .training_commands import add_continue_training, add_estimate, add_queue, add_resume, add_wrap
+from .training_commands import (
+    add_continue_training,
+    add_estimate,
+    add_queue,
+    add_resume,
+    add_settings,
+    add_wrap,
+)
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -36,6 +42,7 @@ _COMMANDS = (
     add_convert_region,
     add_evaluate,
     add_estimate,
+    add_settings,
     add_check,
     add_doctor,
     add_set_up_worker,
@@ -51,8 +58,6 @@ class Parser(ArgumentParser):
     """Raise :class:`UsageError` instead of exiting the process, so that Blender exits cleanly."""
 
     def error(self, message: str) -> NoReturn:
-        from ..core.errors import UsageError
-
         usage = " ".join(self.format_usage().split()[1:])
         short = f"Usage: {usage}" if len(usage) <= _MOST_USAGE else f"See {self.prog} --help."
         raise UsageError(f"{message}.", short)
@@ -61,7 +66,12 @@ class Parser(ArgumentParser):
         """Refuse unknown options in the command that got them: the main parser names no option."""
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+            message = f"unrecognized arguments: {' '.join(unknown)}"
+            word = unknown[0].partition("=")[0].lstrip("-").replace("-", "_")
+            known = (a.settings for a in self._actions if isinstance(a, SetAction))
+            if any(word in settings for settings in known):
+                raise UsageError(f"{message}.", f"Give it as --set {word}=VALUE.")
+            self.error(message)
         return found, unknown
 
     def _print_message(self, message: str, file: Any = None) -> None:

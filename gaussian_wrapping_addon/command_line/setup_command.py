@@ -10,7 +10,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .common import Commands
+from .options import Commands
 
 if TYPE_CHECKING:
     from ..core.jobs.install import SetupRequest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The commands ``wrap``, ``queue``, ``more``, ``resume`` and ``estimate``: jobs that train."""
+"""``wrap``, ``queue``, ``more``, ``resume``, ``estimate``: jobs that train; and ``settings``."""
 
 from __future__ import annotations
 
@@ -10,12 +10,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.settings import declared
-from .bake_command import follow_bake
-from .common import Commands, add_device, add_no_blend, add_out
-from .follow import follow, require_bpy
-from .options.meshing_options import add_method_options, add_region_options, region_settings
-from .options.setting_options import add_option, option_of
-from .options.training_options import add_training_options, training_settings
+from .job_commands import follow, require_bpy
+from .mesh_commands import follow_bake
+from .options import (
+    Commands,
+    add_device,
+    add_no_blend,
+    add_option,
+    add_options,
+    add_out,
+    add_training_options,
+    declared_options,
+    option_of,
+    region_settings,
+    training_settings,
+)
 
 if TYPE_CHECKING:
     from ..core.jobs.store.job_file import JobFile
@@ -34,8 +43,7 @@ def add_wrap(commands: Commands) -> None:
     parser.add_argument("input", type=Path)
     add_training_options(parser)
     add_out(parser)
-    add_method_options(parser)
-    add_region_options(parser)
+    add_options(parser, declared_options("training", "method", "region"))
     add_no_blend(parser)
     parser.add_argument(
         "--plan-only", action="store_true", help="write the job and its parts, run nothing"
@@ -78,7 +86,7 @@ def checked_job(photos: Path, options: Namespace) -> JobFile:
     job = make_job("wrap", photos, region_settings(settings, options, texture_stays=True))
     if job.settings.training.blocks > 1 and not job.settings.computers:
         raise UsageError(
-            "--blocks saves no time in one process.", "Give --computers as well, or omit --blocks."
+            "--set blocks saves no time in one process.", "Give --computers as well, or omit it."
         )
     require_device(job.settings.device)
     _reject_frames_of_photos(job)
@@ -175,6 +183,7 @@ def add_estimate(commands: Commands) -> None:
     parser = commands.add_parser("estimate", help="estimate time, memory and disk of a training")
     parser.add_argument("input", type=Path)
     add_training_options(parser)
+    add_options(parser, declared_options("training"))
     parser.set_defaults(run=_estimate)
 
 
@@ -197,6 +206,36 @@ def _estimate(options: Namespace) -> int:
     )
 
 
+def add_settings(commands: Commands) -> None:
+    """Add ``settings``."""
+    parser = commands.add_parser("settings", help="list what --set NAME=VALUE can set")
+    parser.add_argument("words", nargs="*", metavar="WORD", help="list those alone that have it")
+    parser.set_defaults(run=_settings)
+
+
+def _settings(options: Namespace) -> int:
+    from ..core.errors import EXIT_DONE, UsageError
+
+    lines = []
+    for entry in declared_options("training", "method", "region"):
+        option = entry.option
+        if option is None or option.own:
+            continue
+        default = entry.default if entry.default != "" else "empty"
+        valid = f" ({entry.check.wanted})" if entry.check is not None else ""
+        text = f"{option.word}={default}{valid}: {option.help or entry.help}"
+        if all(word.lower().replace("-", "_") in text.lower() for word in options.words):
+            lines.append(text)
+    if not lines:
+        raise UsageError(
+            f"No setting has {' '.join(options.words)} in its name or description.",
+            "The command settings without words lists all.",
+        )
+    for line in lines:
+        _logger.info("%s", line)
+    return EXIT_DONE
+
+
 def add_queue(commands: Commands) -> None:
     """Add ``queue``."""
     parser = commands.add_parser(
@@ -205,8 +244,7 @@ def add_queue(commands: Commands) -> None:
     parser.add_argument("input", type=Path, metavar="FOLDER", help="folder of folders of photos")
     add_training_options(parser)
     add_out(parser)
-    add_method_options(parser)
-    add_region_options(parser)
+    add_options(parser, declared_options("training", "method", "region"))
     parser.set_defaults(run=_queue)
 
 

@@ -257,7 +257,10 @@ _HINTS_0_1_0 = (
     ("stand on one line", "Take photos from other heights and directions too."),
     ("models:", "Take photos that connect the parts, so that one model holds them all."),
     ("left out", "Check whether these are needed; if so, export the input again."),
-    ("levels of detail were made", "Ask for fewer with --lods, or for a mesh with more faces."),
+    (
+        "levels of detail were made",
+        "Ask for fewer (--set lods=N), or for a mesh of more faces.",
+    ),
     ("ply_file_path", "Put the file where transforms.json says it is."),
 )
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import hashlib
 import io
 import json
@@ -137,9 +138,36 @@ def run_cases(
     return seconds
 
 
+@functools.cache
+def _options(tree: Path, command: str) -> frozenset[str]:
+    """Return the options of a command in a tree."""
+    done = subprocess.run(
+        [sys.executable, str(tree / BATCH), command, "--help"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return frozenset(re.findall(r"--[\w-]+", done.stdout))
+
+
+def _spelled(tree: Path, words: list[str]) -> list[str]:
+    """Return arguments as a tree takes them: ``--set name=value`` where it has no such option."""
+    known = _options(tree, words[0])
+    if "--set" not in known:
+        return words
+    spelled, left = [], list(words)
+    while left:
+        word = left.pop(0)
+        if not word.startswith("--") or word in known:
+            spelled.append(word)
+        else:
+            value = left.pop(0) if left and not left[0].startswith("--") else "on"
+            spelled += ["--set", f"{word[2:].replace('-', '_')}={value}"]
+    return spelled
+
+
 def _run_step(tree: Path, case: Case, step: Step, inputs: Path, run: Path) -> str:
     """Run one command and return what it said."""
-    arguments = [a.replace("{in}", str(inputs)).replace("{out}", str(run)) for a in step.arguments]
+    words = [a.replace("{in}", str(inputs)).replace("{out}", str(run)) for a in step.arguments]
+    arguments = _spelled(tree, words)
     if step.start:
         shutil.copyfile(run / step.start, run / "start.ply")
         os.utime(run / "start.ply", (MODIFIED_UNIX_S, MODIFIED_UNIX_S))

@@ -154,7 +154,7 @@ _CAMERAS_ARE_GIVEN = ReportWarning(
 _NO_TURNTABLE_OF_PANORAMAS = ReportWarning(
     "no-turntable",
     "The photos are panoramas, of which no turntable is looked for.",
-    "Say --equirectangular off if they are ordinary photos.",
+    "Say --set equirectangular=off if they are ordinary photos.",
 )
 _NO_PANORAMAS = ReportWarning(
     "no-panoramas",

@@ -53,7 +53,7 @@ def shape_warning(photos: Sequence[Path], mode: str) -> list[ReportWarning]:
         "The photos are taken for 360 degree panoramas, as all are exactly twice as wide as high; "
         f"each is cut into {len(VIEWS)} views. Nothing else in them says so."
     )
-    hint = "Set 360° Photos to Off (--equirectangular off) if they are ordinary photos."
+    hint = "Set 360° Photos to Off (--set equirectangular=off) if they are ordinary photos."
     return [ReportWarning("panoramas-by-shape", text, hint)]
 
 

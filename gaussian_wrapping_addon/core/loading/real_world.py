@@ -160,7 +160,7 @@ def find_real_units(
 def _not_placed(error: DatasetError) -> DatasetError:
     return DatasetError(
         f"GPS does not place the scene: {error.message}",
-        f"{error.hint} Or leave --georeference out.".strip(),
+        f"{error.hint} Or leave --set georeference out.".strip(),
     )
 
 

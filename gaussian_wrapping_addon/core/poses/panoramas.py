@@ -374,7 +374,7 @@ def solve_panoramas(
             f"Only {len(placed)} of {len(numbers)} panoramas could be placed; {MIN_IMAGES} are "
             "needed.",
             "Take more panoramas, a few steps apart. If these are ordinary photos, say "
-            "--equirectangular off.",
+            "--set equirectangular=off.",
         )
     warnings = list(model.warnings)
     if len(placed) < len(numbers):

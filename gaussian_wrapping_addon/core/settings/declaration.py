@@ -164,10 +164,9 @@ UP_AXES = ("auto", "y", "z")
 
 _KEY = "setting"
 
-Scope = Literal["training", "constants", "method", "region", "more"]
-"""Groups of options on the command line: training; constants of the training method; meshing method
-and resolution (all that an estimate needs); other options of regions; the command ``more``
-(continue a training)."""
+Scope = Literal["training", "method", "region", "more"]
+"""Groups of settings on the command line: training; meshing method and resolution (all that an
+estimate needs); other settings of regions; the command ``more`` (continue a training)."""
 
 Owner = Literal["scene", "training", "preferences"]
 """Owner of a property in Blender: ``Scene.gwrap``, ``Scene.gwrap.training``, or the add-on."""
@@ -210,8 +209,15 @@ class Option:
     """If not empty, the option takes no value and sets the setting to this word."""
     many: bool = False
     """Whether it takes several values and may be repeated."""
+    own: bool = False
+    """Whether it is an option of its own; others are given as ``--set NAME=VALUE``."""
     parse: Callable[[Any], Any] | None = None
     """Converts the text (``many``: list of texts) to the setting's value; may raise UsageError."""
+
+    @property
+    def word(self) -> str:
+        """The name for ``--set``."""
+        return self.name.lstrip("-").replace("-", "_")
 
 
 @dataclass(frozen=True)

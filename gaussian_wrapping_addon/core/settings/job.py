@@ -66,6 +66,7 @@ def computers_setting() -> Any:
             "local|tls://HOST:PORT",
             "run parts side by side: in processes of this computer, or at a Dask scheduler's",
             scope="region",
+            own=True,
         ),
         affects_result=False,
         since="0.2.0",
@@ -80,7 +81,10 @@ def processes_setting() -> Any:
         check=Range(1, MAX_PROCESSES),
         unit="processes",
         option=Option(
-            "--processes", help="parts side by side with --computers local", scope="region"
+            "--processes",
+            help="parts side by side with --computers local",
+            scope="region",
+            own=True,
         ),
         panel=PanelProperty(
             "Processes",
@@ -107,6 +111,7 @@ def certificates_setting() -> Any:
             "certificates for tls:// addresses",
             scope="region",
             parse=lambda text: str(Path(text)),
+            own=True,
         ),
         affects_result=False,
         since="0.2.0",
@@ -203,7 +208,7 @@ class JobSettings:
         help="Quality against time: sets the numbers of the training that have no value of their "
         "own.",
         check=Choices(PRESETS),
-        option=Option("--preset", help="quality against time", scope="training"),
+        option=Option("--preset", help="quality against time", scope="training", own=True),
         panel=PanelProperty(
             "Preset",
             "Quality against time",
@@ -235,14 +240,16 @@ class JobSettings:
         0,
         help="Seed of all random numbers.",
         check=Range(0, 2**31 - 1),
-        option=Option("--seed", help="seed of all random numbers", scope="training"),
+        option=Option("--seed", help="seed of all random numbers", scope="training", own=True),
     )
     threads: int = setting(
         0,
         help="Processor threads; 0 uses every core this process may use.",
         check=Range(0, 1024),
         unit="threads",
-        option=Option("--threads", help="processor threads; 0 uses every core", scope="training"),
+        option=Option(
+            "--threads", help="processor threads; 0 uses every core", scope="training", own=True
+        ),
         panel=PanelProperty(
             "Threads",
             "Processor threads for jobs; 0 uses all",
@@ -266,6 +273,7 @@ class JobSettings:
             "auto|cpu|cuda|cuda:N",
             "where to compute; auto: an NVIDIA GPU where one can be used",
             scope="training",
+            own=True,
         ),
         panel=PanelProperty(
             "Device",
@@ -296,6 +304,7 @@ class JobSettings:
             scope="region",
             many=True,
             parse=_distinct,
+            own=True,
         ),
     )
     export: tuple[str, ...] = setting(
@@ -307,6 +316,7 @@ class JobSettings:
             help=f"file formats, comma separated, of {','.join(JOB_FORMATS)}",
             scope="region",
             parse=_formats,
+            own=True,
         ),
     )
     start_splat: str = setting(
@@ -338,6 +348,7 @@ class JobSettings:
             "--turntable",
             help="the camera stood still while the object turned: mask what stands still",
             scope="training",
+            own=True,
         ),
         panel=PanelProperty(
             "Turntable",
@@ -447,6 +458,7 @@ class JobSettings:
             "printed markers in the photos, such as 4x4_50:0.05, side in metres: gives the scale",
             scope="training",
             parse=checked_markers,
+            own=True,
         ),
         panel=PanelProperty(
             "Markers",
@@ -466,6 +478,7 @@ class JobSettings:
             "known places and the pixels that show them: gives scale, place and up",
             scope="training",
             parse=lambda text: str(Path(text)),
+            own=True,
         ),
         panel=PanelProperty(
             "Control Points",
@@ -485,6 +498,7 @@ class JobSettings:
             "--make-masks",
             help="region: mask the photos to what stands in the region files (--region)",
             scope="training",
+            own=True,
         ),
         since="0.2.0",
     )
@@ -551,6 +565,7 @@ class JobSettings:
             help="frames of a video that are used; 0: by its motion",
             scope="training",
             exclusive="video frames",
+            own=True,
         ),
         panel=PanelProperty(
             "Frames",
@@ -574,6 +589,7 @@ class JobSettings:
             help="frames of a video that are used for each of its seconds; 0: by its motion",
             scope="training",
             exclusive="video frames",
+            own=True,
         ),
         panel=PanelProperty(
             "Frames per Second",

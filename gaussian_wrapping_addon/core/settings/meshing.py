@@ -47,13 +47,11 @@ class MeshingSettings:
             words=f"a positive length of at least {SHORTEST_EDGE:g}",
         ),
         unit="world units",
-        option=Option(
-            "--edge-length",
+        option=Option("--edge-length",
             "X",
             "target edge length, world units of the input; 0, the default, is automatic",
             scope="method",
-            exclusive="resolution",
-        ),
+            exclusive="resolution", own=True),
         panel=PanelProperty(
             "Edge Length",
             "Length of triangle edges, as seen in Blender",
@@ -67,13 +65,11 @@ class MeshingSettings:
         "photos.",
         check=Range(0, 5_000_000),
         unit="points",
-        option=Option(
-            "--points",
+        option=Option("--points",
             "N",
             "target number of surface points",
             scope="method",
-            exclusive="resolution",
-        ),
+            exclusive="resolution", own=True),
         panel=PanelProperty(
             "Points",
             "Number of points on the surface of a region",
@@ -299,7 +295,7 @@ class MeshingSettings:
         help="The mesh is decimated to this number of faces; 0 keeps all.",
         check=Range(4, 20_000_000, zero="all"),
         unit="faces",
-        option=Option("--faces", "N", "decimate the mesh to N faces; 0 keeps all"),
+        option=Option("--faces", "N", "decimate the mesh to N faces; 0 keeps all", own=True),
         panel=PanelProperty(
             "Faces",
             "Number of triangles that the mesh is decimated to",

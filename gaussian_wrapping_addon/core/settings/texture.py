@@ -41,7 +41,11 @@ class TextureSettings:
         check=Range(64, 8192, zero="automatic"),
         unit="pixels",
         option=Option(
-            "--texture-size", "auto|N", "side of the texture in pixels (default: auto)", parse=_size
+            "--texture-size",
+            "auto|N",
+            "side of the texture in pixels (default: auto)",
+            parse=_size,
+            own=True,
         ),
         panel=PanelProperty(
             "Texture Size",

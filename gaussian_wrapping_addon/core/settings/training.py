@@ -55,7 +55,7 @@ def _constant(
     values = {"paper": paper, "large": large}
     presets = {name: value for name, value in values.items() if value is not None}
     metavar = "" if isinstance(check, Choices) else "X"
-    shown = Option(option, metavar, scope="constants")
+    shown = Option(option, metavar)
     return setting(
         default, help=help, check=check, unit=unit, presets=presets, option=shown, since=since
     )
@@ -404,7 +404,7 @@ class TrainingSettings(MethodSettings):
         check=_TRAINING_COUNT,
         unit="iterations",
         presets={"draft": 800, "fine": 4000, "paper": 30_000, "large": 7000},
-        option=Option("--iterations", "N", "training iterations instead of the preset's"),
+        option=Option("--iterations", "N", "training iterations instead of the preset's", own=True),
         panel=PanelProperty(
             "Iterations",
             "Steps of the training; 0 takes the preset's number",
@@ -416,7 +416,7 @@ class TrainingSettings(MethodSettings):
         help="Iterations added to a finished training, at its last learning rates.",
         check=Range(0, 10**6),
         unit="iterations",
-        option=Option("--iterations", "N", "iterations to be added", scope="more"),
+        option=Option("--iterations", "N", "iterations to be added", scope="more", own=True),
     )
     max_gaussians: int = setting(
         80_000,
@@ -424,7 +424,7 @@ class TrainingSettings(MethodSettings):
         check=Range(100, 20_000_000),
         unit="Gaussians",
         presets={"draft": 40_000, "fine": 120_000, "paper": 6_000_000, "large": 300_000},
-        option=Option("--max-gaussians", "N", "cap of Gaussians instead of the preset's"),
+        option=Option("--max-gaussians", "N", "cap of Gaussians instead of the preset's", own=True),
         panel=PanelProperty(
             "Gaussians, Max",
             "Largest number of Gaussians; fewer need less time and memory. "
@@ -438,7 +438,7 @@ class TrainingSettings(MethodSettings):
         check=Range(32, 16384),
         unit="pixels",
         presets={"draft": 480, "fine": 1024, "paper": 1600, "large": 1600},
-        option=Option("--max-image-px", "N", "training image size instead of the preset's"),
+        option=Option("--max-image-px", "N", "training size instead of the preset's", own=True),
         panel=PanelProperty(
             "Photo Size, Max",
             "Photos are trained at no more than this length of their long side, in pixels. "
@@ -459,7 +459,9 @@ class TrainingSettings(MethodSettings):
         help="Every n-th photo, sorted by name, is held out for measuring; 0 holds out none.",
         check=Range(0, 10**6, words="0 or more"),
         unit="photos",
-        option=Option("--holdout", "N", "hold out each n-th photo for measuring; 0 holds out none"),
+        option=Option(
+            "--holdout", "N", "hold out each n-th photo for measuring; 0 holds out none", own=True
+        ),
     )
     harmonics: str = _part_of_paper(
         help="View-dependent colour. on: up to degree `sh_degree`; off: degree 0, but a splat that "

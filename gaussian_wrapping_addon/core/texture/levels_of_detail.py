@@ -335,7 +335,7 @@ def _warn_fewer_levels(
     """Log and report why there is no further level."""
     text = f"{number - 1} of {settings.lods} levels of detail were made: {reason}."
     _logger.warning("%s", text)
-    hint = "Choose fewer with --lods, or a mesh with more faces."
+    hint = "Choose fewer with --set lods=N, or a mesh with more faces."
     warning = ReportWarning("fewer-levels", text, hint)
     textured.statistics.setdefault("warnings", []).append(warning.to_json())
 

@@ -244,8 +244,8 @@ def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str
     scene, root, _ = wrapped
     box = write_box(root / "open.json", scene, 0.6, (0, 0, 1.0))
     estimate = batch(
-        "estimate-mesh", "--out", str(root / "out"), "--region", str(box), "--method", "pivots",
-        "--pivots", "3",
+        "estimate-mesh", "--out", str(root / "out"), "--region", str(box), "--set", "method=pivots",
+        "--set", "pivots=3",
     )  # fmt: skip
     assert estimate.returncode == 0, estimate.stdout + estimate.stderr
     ranges = {
@@ -255,8 +255,8 @@ def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str
         )
     }
     done = batch(
-        "mesh", "--out", str(root / "out"), "--region", str(box), "--method", "pivots",
-        "--pivots", "3", "--boundary", "open", "--texture-size", "256", "--no-blend",
+        "mesh", "--out", str(root / "out"), "--region", str(box), "--set", "method=pivots",
+        "--set", "pivots=3", "--set", "boundary=open", "--texture-size", "256", "--no-blend",
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((root / "out" / "result" / "report.json").read_text())
@@ -283,8 +283,8 @@ def test_fewer_faces_get_a_normal_map_occlusion_and_levels(
     box = write_box(root / "light.json", scene, 1.3, (0, 0, 0.35))
     done = batch(
         "mesh", "--out", str(root / "out"), "--region", str(box), "--points", "4000",
-        "--faces", "1600", "--lods", "2", "--ambient-occlusion", "--texture-size", "512",
-        "--export", "glb", "--no-blend",
+        "--faces", "1600", "--set", "lods=2", "--set", "ambient_occlusion=on",
+        "--texture-size", "512", "--export", "glb", "--no-blend",
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     (stage,) = (root / "out" / "stages").glob("mesh-light-*")
@@ -326,7 +326,16 @@ def test_a_region_is_estimated_and_meshed_in_tiles_by_two_processes(
 ) -> None:
     scene, root, _ = wrapped
     box = write_box(root / "tiled.json", scene, 1.3, (0, 0, 0.35))
-    asked = ("--out", str(root / "out"), "--region", str(box), "--points", "3000", "--tiles", "3")
+    asked = (
+        "--out",
+        str(root / "out"),
+        "--region",
+        str(box),
+        "--points",
+        "3000",
+        "--set",
+        "tiles=3",
+    )
     estimate = batch("estimate-mesh", *asked)
     assert estimate.returncode == 0, estimate.stdout + estimate.stderr
     low, high = re.search(r"triangles: ([\d ]+) to ([\d ]+)\n", estimate.stdout).groups()

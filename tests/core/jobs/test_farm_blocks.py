@@ -89,6 +89,7 @@ def test_two_processes_train_blocks_side_by_side_to_the_same_gaussians(
     assert same_mesh(folder, alone)
 
 
+@pytest.mark.proof
 def test_a_part_of_each_kind_is_killed_and_the_gaussians_are_the_same(
     alone: JobFolder, tmp_path: Path
 ) -> None:

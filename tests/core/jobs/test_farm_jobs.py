@@ -107,6 +107,7 @@ def test_a_driver_that_dies_leaves_nothing_behind_and_resumes(
     assert {name: states(folder)[name].token for name in kept} == {n: before[n] for n in kept}
 
 
+@pytest.mark.proof
 def test_a_part_that_always_crashes_is_named_and_the_rest_is_done(tmp_path: Path) -> None:
     folder, job = tiled_sphere(tmp_path, computers="local", processes=2)
     times: set[str] = set()

@@ -139,6 +139,7 @@ def test_who_works_for_a_scheduler_of_this_computer_listens_on_it_alone(
     assert found <= here
 
 
+@pytest.mark.proof
 def test_a_scheduler_that_is_killed_ends_the_job_with_a_sentence_and_loses_nothing(
     farm: Farm, alone: farm_jobs.JobFolder, tmp_path: Path
 ) -> None:

@@ -52,6 +52,7 @@ def small_wrap(root: Path, **changes: object) -> JobFile:
     return make_job("wrap", photos, settings)
 
 
+@pytest.mark.proof
 def test_dask_workers_are_killed_in_the_parts_before_training(tmp_path: Path) -> None:
     alone, farmed = JobFolder(tmp_path / "alone"), JobFolder(tmp_path / "farmed")
     assert farm_jobs.run(alone, small_wrap(tmp_path)).state == "DONE"

@@ -171,6 +171,7 @@ def test_a_part_on_a_full_disk_says_so_and_that_it_may_work_later(tmp_path: Path
         assert run(folder, "plan-ball")[0] == 0
 
 
+@pytest.mark.proof
 @pytest.mark.skipif(sys.platform == "win32", reason="links need rights on Windows")
 def test_links_are_refused_wherever_a_part_looks(planned: JobFolder, tmp_path: Path) -> None:
     for name in ("cameras", "train", "plan-ball"):

@@ -73,10 +73,10 @@ def test_a_worker_removes_what_killed_ones_left(tmp_path: Path) -> None:
     ("command", "stage", "result", "meshing", "wanted", "unwanted"),
     [
         ("mesh", "", True, {}, "--points", "--max-gaussians"),
-        ("mesh", "mesh", True, {}, "--tiles N. The earlier result is unchanged", "more tiles"),
+        ("mesh", "mesh", True, {}, "--set tiles=N. The earlier result is unchanged", "more tiles"),
         ("mesh", "texture", False, {}, "--edge-length", "unchanged"),
         ("mesh", "mesh", True, {"tiles": "4"}, "more tiles", "--max-gaussians"),
-        ("mesh", "mesh", True, {"method": "pivots"}, "--method pam", "--tiles"),
+        ("mesh", "mesh", True, {"method": "pivots"}, "--set method=pam", "--set tiles"),
         ("wrap", "mesh", True, {}, "--points", "unchanged"),
         ("more", "texture", True, {}, "--points", "--max-gaussians"),
         ("wrap", "train", False, {}, "--max-gaussians 48000", "--points"),

@@ -43,8 +43,8 @@ _LINES = Case(
         ),
         _line(
             "pivots and a length",
-            ("wrap", "set", "--method", "pivots", "--edge-length", "1", *_OUT),
-            "--edge-length 1.0 has no effect with --method pivots.*Omit one",
+            ("wrap", "set", "--set", "method=pivots", "--edge-length", "1", *_OUT),
+            "--edge-length 1.0 has no effect with --set method=pivots.*Leave out one",
             build=colmap(),
         ),
         _line(

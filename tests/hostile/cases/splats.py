@@ -264,7 +264,7 @@ _OTHER = Case(
             pipe("set.ply"),
             3,
             r"The start splat set\.ply does not exist\. Check the path",
-            ("wrap", "/dev", "--start-splat", "set.ply", "--out", "out", "--no-blend"),
+            ("wrap", "/dev", "--set", "start_splat=set.ply", "--out", "out", "--no-blend"),
             needs=Needs.POSIX,
         ),
         Variant(

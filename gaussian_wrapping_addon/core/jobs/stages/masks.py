@@ -195,8 +195,8 @@ _KEPT_SHARE = 1e-4
 """Of a photo, at least: those whose mask keeps less do not show the object."""
 _MAKE_HINT = "Check the region, or the masks in the folder masks of the job."
 _OWN_HINT = (
-    "Leave one of the two out, or set --mask-mode background if your masks leave out all but the "
-    "object."
+    "Leave one of the two out, or give --set mask_mode=background if your masks leave out all but "
+    "the object."
 )
 
 

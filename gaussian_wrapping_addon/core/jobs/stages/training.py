@@ -172,8 +172,8 @@ def within_memory(what: str) -> Iterator[None]:
             raise
         raise ResourceError(
             f"{what} ran out of memory ({_first_line(error)}).",
-            "Choose more --blocks, fewer --max-gaussians or a smaller --max-image-px; or close "
-            "other programs and resume.",
+            "Choose a larger --set blocks=N, fewer --max-gaussians or a smaller --max-image-px; "
+            "or close other programs and resume.",
         ) from error
 
 
@@ -216,11 +216,11 @@ def killed_mesh_hint(meshing: MeshingSettings, *, kept: bool) -> str:
     kept : bool
         Whether the folder has the result of an earlier job.
     """
-    alternatives = "fewer --points, a larger --edge-length, or --tiles N with more tiles"
+    alternatives = "fewer --points, a larger --edge-length, or --set tiles=N with more tiles"
     if meshing.method == "pivots":
-        alternatives = "a smaller region, or --method pam with fewer --points"
+        alternatives = "a smaller region, or --set method=pam with fewer --points"
     elif meshing.tiles == "auto":
-        alternatives = "fewer --points, a larger --edge-length, or --tiles N"
+        alternatives = "fewer --points, a larger --edge-length, or --set tiles=N"
     unchanged = " The earlier result is unchanged." if kept else ""
     return f"Close other programs and resume; or use mesh with {alternatives}.{unchanged}"
 

@@ -104,7 +104,7 @@ class BakeRequest:
                 "A format cannot be written by a bake.", f"Use {', '.join(RESULT_FORMATS)}."
             )
         if self.texture.lods:
-            raise UsageError("Baking makes no levels of detail.", "Leave out --lods.")
+            raise UsageError("Baking makes no levels of detail.", "Leave out --set lods.")
         JobSettings(texture=self.texture).validated()
         return replace(self, name=file_stem(self.name, 0))
 
@@ -260,7 +260,7 @@ def make_job(
     if command == "wrap" and settings.training.blocks > 1 and from_splat:
         raise UsageError(
             "A training that starts from a splat cannot be divided into blocks.",
-            "Leave out --blocks.",
+            "Leave out --set blocks.",
         )
     control = settings.control_points
     # A finished training is meshed without it.
@@ -297,7 +297,7 @@ def _makes_masks_of_regions(settings: JobSettings, source: Path, bodies: Mapping
         if settings.make_masks != "off":
             raise UsageError(
                 "Masks are made of regions or by a model, not both.",
-                "Give --make-masks region or --mask-model.",
+                "Give --make-masks region or --set mask_model=FILE.",
             )
         return False
     if not bodies:

@@ -162,7 +162,7 @@ def test_bad_gps_is_refused_or_noted(tmp_path: Path) -> None:
     scene = loaded(folder)
     assert "georeference" not in scene.facts
     assert "GPS" in scene.facts["georeference_note"] or "agree" in scene.facts["georeference_note"]
-    with pytest.raises(DatasetError, match=r"GPS does not place the scene: .*leave --georeference"):
+    with pytest.raises(DatasetError, match=r"GPS does not place the scene: .*--set georeference"):
         loaded(folder, georeference="on")
     bare = write_set(tmp_path / "bare", gps=False)
     with pytest.raises(DatasetError, match="0 of 12 photos have a GPS position"):
@@ -181,7 +181,7 @@ def test_photos_without_gps_are_refused_before_cameras_are_solved(
     words = "GPS does not place the scene: 0 of 12 photos have a GPS position; 5 are needed"
     with pytest.raises(DatasetError, match=words) as refused:
         loaded(folder, georeference="on")
-    assert "leave --georeference out" in refused.value.hint
+    assert "leave --set georeference out" in refused.value.hint
     UnitsRequest("on", control_points="x").check_gps([])  # control points place it
     with pytest.raises(AssertionError, match="cameras are solved"):
         loaded(folder)

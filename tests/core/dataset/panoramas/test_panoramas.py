@@ -181,7 +181,7 @@ def test_only_sets_of_panoramas_are_taken_for_them(tmp_path: Path) -> None:
     assert panorama_evidence(files) == BY_SHAPE
     (warning,) = [f for f in check_input(tmp_path) if f.severity == "warning" and f.hint]
     assert "taken for 360 degree panoramas, as all are exactly twice as wide" in warning.message
-    assert "--equirectangular off" in warning.hint
+    assert "--set equirectangular=off" in warning.hint
     for mode, count in (("off", 0), ("on", 1)):
         found = check_input(tmp_path, panoramas=mode)
         assert sum("360" in finding.message for finding in found) == count

@@ -68,6 +68,7 @@ def test_masks_of_a_turntable_show_background(solved: Scene, tmp_path: Path) -> 
     assert load_saved_scene(tmp_path).mask_mode("auto") == "background"
 
 
+@pytest.mark.proof
 def test_masks_of_the_user_are_taken_instead(made: Turntable, photos: Path, tmp_path: Path) -> None:
     """They mean what the user says, not that nothing is there."""
     source = tmp_path / "own"

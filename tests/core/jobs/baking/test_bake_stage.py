@@ -157,7 +157,7 @@ def test_a_finished_bake_is_used_again_and_the_job_stays_what_it_was(
     assert code.returncode == 0, code.stdout
     assert "results:" in code.stdout
     # Another texture of the same mesh is another bake.
-    assert bake(job, mesh, "--uvs", "new", "--ambient-occlusion")[0] == 0
+    assert bake(job, mesh, "--uvs", "new", "--set", "ambient_occlusion=on")[0] == 0
     assert (job.baked / "again" / "occlusion.png").is_file()
     assert len(list(job.stages.glob("bake-again-*"))) == 2
 
@@ -212,7 +212,7 @@ def test_refined_poses_are_used_where_the_training_has_them(tmp_path: Path) -> N
     save_poses(trained, poses)
     mesh = tmp_path / "ball.ply"
     BALL.export(mesh)
-    code, said = bake(folder, mesh, "--texture-source", "photos")
+    code, said = bake(folder, mesh, "--set", "texture_source=photos")
     assert code == 0, said
     loaded = trimesh.load(folder.baked / "ball" / "mesh.ply", process=False)
     colors = np.asarray(loaded.visual.vertex_colors)[:, :3].astype(float)

@@ -196,7 +196,7 @@ def test_too_little_memory_names_the_block_and_may_work_elsewhere(
     monkeypatch.setattr(block_module, "train_block", full)
     with pytest.raises(ResourceError, match="Block 1 ran out of memory") as caught:
         trained(folder, job)
-    assert "--blocks" in caught.value.hint
+    assert "--set blocks" in caught.value.hint
     assert caught.value.exit_code == EXIT_RESOURCES
 
 

@@ -59,6 +59,7 @@ def doctor(folder: Path, address: str, *more: str) -> subprocess.CompletedProces
     )  # fmt: skip
 
 
+@pytest.mark.proof
 def test_each_worker_has_a_line_and_nothing_is_left(farm: Farm, tmp_path: Path) -> None:
     here, seen, other = (tmp_path / name for name in ("here", "seen", "other"))
     here.mkdir()

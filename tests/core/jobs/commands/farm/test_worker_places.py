@@ -133,6 +133,7 @@ def workers_of(address: str) -> list[int]:
     return found
 
 
+@pytest.mark.proof
 @pytest.mark.parametrize("number", first_then_proofs([signal.SIGINT, signal.SIGKILL]))
 def test_computers_by_ssh_work_and_end_with_the_command(
     stubs: Path, run: Callable[..., Running], tmp_path: Path, number: signal.Signals
