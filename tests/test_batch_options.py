@@ -418,7 +418,7 @@ def test_parts_that_gain_nothing_are_the_papers_and_off_elsewhere(name: str) -> 
     for word in PRESETS:
         given = getattr(settings_of("--preset", word, "--needs", "auto").training, name)
         assert given == ("on" if word == "paper" else "off")
-    asked = settings_of("--preset", "paper", f"--{name}", "off").training
+    asked = settings_of("--preset", "paper", "--set", f"{name}=off").training
     assert getattr(asked, name) == "off"
     with pytest.raises(UsageError, match="invalid choice: 'auto'"):
-        settings_of(f"--{name}", "auto")
+        settings_of("--set", f"{name}=auto")
