@@ -29,7 +29,7 @@ from .losses import (
     footprint_shares,
     normal_losses,
 )
-from .multi_view import MultiViewOptions, multi_view_losses
+from .multi_view import MultiViewOptions, PhotoView, multi_view_losses
 
 
 class CpuBackend(Backend):
@@ -148,12 +148,8 @@ class CpuBackend(Backend):
         found = multi_view_losses(
             image,
             image.gaussians,
-            camera,
-            shown.photo,
-            shown.mask,
-            other_camera,
-            other.photo,
-            other.mask,
+            PhotoView(camera, shown.photo, shown.mask),
+            PhotoView(other_camera, other.photo, other.mask),
             options,
             random,
             threads=self.threads,

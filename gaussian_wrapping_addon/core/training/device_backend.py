@@ -35,7 +35,7 @@ from .device_losses import (
 )
 from .exposure import PIVOT, Exposure
 from .losses import FAINT, SURE
-from .multi_view import MultiViewOptions
+from .multi_view import MultiViewOptions, PhotoView
 
 # -- Photos and masks kept on a device, so that an iteration sends none that it has ---------------
 
@@ -295,12 +295,8 @@ class DeviceBackend(Backend):
             self.kernels,
             image,
             adam.on_device(),
-            camera,
-            shown.photo,
-            shown.mask,
-            other_camera,
-            other.photo,
-            other.mask,
+            PhotoView(camera, shown.photo, shown.mask),
+            PhotoView(other_camera, other.photo, other.mask),
             options,
             random,
         )

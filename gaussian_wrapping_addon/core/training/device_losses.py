@@ -27,7 +27,7 @@ from ..render.projection import pack_camera
 from ..render.types import ImageGradients, RenderOptions
 from ..resampling import LUMA
 from ..scene.camera import Camera
-from .multi_view import BLOCK_PX, BORDER_PX, MultiViewOptions
+from .multi_view import BLOCK_PX, BORDER_PX, MultiViewOptions, PhotoView
 from .multi_view_kernels import KEPT, SAMPLES
 
 # -- Losses on images of a device: those of :mod:`.losses` and :mod:`.losses` as kernels
@@ -258,12 +258,8 @@ def device_multi_view_losses(
     kernels: Kernels,
     images: DeviceImages,
     gaussians: OrientedGaussians,
-    camera: Camera,
-    photo: Tensor,
-    mask: Tensor | None,
-    other_camera: Camera,
-    other_photo: Tensor,
-    other_mask: Tensor | None,
+    shown: PhotoView,
+    other: PhotoView,
     settings: MultiViewOptions,
     random: np.random.Generator,
 ) -> DeviceMultiViewLoss:
@@ -280,11 +276,8 @@ def device_multi_view_losses(
         Rendered with depth.
     gaussians : OrientedGaussians
         Rendered Gaussians, scene frame.
-    camera, other_camera : Camera
-        Scene frame; sizes may differ.
-    photo, other_photo : (h, w, 3) uint8
-    mask, other_mask : (h, w) bool or ``None``
-        False pixels are ignored.
+    shown, other : PhotoView
+        The rendered view's and another; sizes may differ.
     settings : MultiViewOptions
     random : numpy Generator
         ``settings.pixels`` numbers are drawn, none where all pixels are taken.
@@ -296,21 +289,22 @@ def device_multi_view_losses(
     ResourceError
         If the tile lists are too long to be indexed.
     """
-    _check(camera, photo, mask, images.depth)
-    _check(other_camera, other_photo, other_mask)
+    _check(shown.camera, shown.photo, shown.mask, images.depth)
+    _check(other.camera, other.photo, other.mask)
     options = RenderOptions(sh_degree=0)
-    grey, other_grey = grey_on_device(kernels, photo), grey_on_device(kernels, other_photo)
+    grey, other_grey = (grey_on_device(kernels, view.photo) for view in (shown, other))
     # A null pointer is no mask.
-    none = torch.empty(0, dtype=torch.bool, device=photo.device)
-    our_mask = none if mask is None else mask.contiguous()
-    their_mask = none if other_mask is None else other_mask.contiguous()
+    none = torch.empty(0, dtype=torch.bool, device=shown.photo.device)
+    our_mask, their_mask = (
+        none if view.mask is None else view.mask.contiguous() for view in (shown, other)
+    )
     depth = images.depth.detach().contiguous()
     normals = images.geometric_normal.detach().contiguous()
     alpha = images.alpha.detach().contiguous()
     pixels = choose_on_device(kernels, grey, depth, our_mask, settings.pixels, random)
-    pair = _Pair(kernels, pixels, camera, other_camera, options.near_z)
+    pair = _Pair(kernels, pixels, shown.camera, other.camera, options.near_z)
     positions, position_slopes = pair.lift(depth, their_mask)
-    view = query_view(kernels, gaussians, other_camera, options)
+    view = query_view(kernels, gaussians, other.camera, options)
     depths = solve_depths(view, positions)
     noise, weights, by_found, by_positions = pair.reproject(positions, depths.values)
     states, errors, depth_slopes, normal_slopes = pair.compare(
@@ -327,12 +321,12 @@ def device_multi_view_losses(
     shares = torch.stack(
         [factor / count for factor, count in zip(factors, counts.clamp(min=1), strict=True)]
     ).double()  # (2,)
-    other = None
+    on_other = None
     if factors[1] != 0.0:
         grad_params = torch.zeros_like(view.screen.params)  # (n, 24)
         incoming = shares[1] * weights * by_found
         on_positions = add_query_gradients(view, depths, incoming, grad_params)
-        other = project_query_gradients(view, depths, grad_params)
+        on_other = project_query_gradients(view, depths, grad_params)
     else:
         on_positions = torch.zeros_like(positions)
     gradients = DeviceImageGradients(torch.zeros_like(depth), torch.zeros_like(normals))
@@ -354,7 +348,7 @@ def device_multi_view_losses(
     )
     figures = DeviceMultiViewMetrics(means[0], means[1], (pixels >= 0).sum(), counts[1], counts[0])
     value = factors[0] * means[0] + factors[1] * means[1]
-    return DeviceMultiViewLoss(value, gradients, other, figures)
+    return DeviceMultiViewLoss(value, gradients, on_other, figures)
 
 
 def grey_on_device(kernels: Kernels, photo: Tensor) -> Tensor:

@@ -379,15 +379,21 @@ class MultiViewLoss:
     figures: MultiViewMetrics
 
 
+@dataclass(frozen=True)
+class PhotoView:
+    """A photo with its camera, as arrays or as tensors of a device."""
+
+    camera: Camera
+    """Scene frame."""
+    photo: Any  # (h, w, 3) uint8; arrays may be floats in [0, 1]
+    mask: Any = None  # (h, w) bool or None; false pixels are ignored
+
+
 def multi_view_losses(
     image: ViewPass,
     gaussians: RawArrays,
-    camera: Camera,
-    photo: np.ndarray,
-    mask: np.ndarray | None,
-    other_camera: Camera,
-    other_photo: np.ndarray,
-    other_mask: np.ndarray | None,
+    shown: PhotoView,
+    other: PhotoView,
     settings: MultiViewOptions,
     random: np.random.Generator,
     *,
@@ -408,11 +414,8 @@ def multi_view_losses(
         Rendered with depth; any object with the same images will do.
     gaussians : RawArrays
         Rendered Gaussians, scene frame.
-    camera, other_camera : Camera
-        Scene frame; sizes may differ.
-    photo, other_photo : (h, w, 3) uint8, or floats in [0, 1]
-    mask, other_mask : (h, w) bool or ``None``
-        False pixels are ignored.
+    shown, other : PhotoView
+        The rendered view's and another; sizes may differ.
     settings : MultiViewOptions
     random : numpy Generator
         ``settings.pixels`` numbers are drawn, none where all pixels are taken.
@@ -432,15 +435,16 @@ def multi_view_losses(
     """
     threads = threads or default_threads()
     store = ArrayStore() if store is None else store
-    _check_sizes(camera, image=image.depth, photo=photo, mask=mask)
-    _check_sizes(other_camera, photo=other_photo, mask=other_mask)
+    camera, mask = shown.camera, shown.mask
+    _check_sizes(camera, image=image.depth, photo=shown.photo, mask=mask)
+    _check_sizes(other.camera, photo=other.photo, mask=other.mask)
     options = RenderOptions(sh_degree=0, threads=threads)
-    grey = grey_image(photo, "multi-view grey", threads=threads, store=store)
+    grey = grey_image(shown.photo, "multi-view grey", threads=threads, store=store)
     pixels = choose_pixels(
         grey, image.depth, mask, settings.pixels, random, threads=threads, store=store
     )
-    pair = _ViewPair(image, camera, other_camera, pixels, options.near_z, threads)
-    kept_there = NO_MASK if other_mask is None else np.ascontiguousarray(other_mask, np.bool_)
+    pair = _ViewPair(image, camera, other.camera, pixels, options.near_z, threads)
+    kept_there = NO_MASK if other.mask is None else np.ascontiguousarray(other.mask, np.bool_)
     positions, position_slopes = pair.lift(kept_there)
     by_depth = store.zeros("multi-view by depth", image.depth.shape, np.float32)
     by_normal = store.zeros("multi-view by normal", image.geometric_normal.shape, np.float32)
@@ -450,7 +454,7 @@ def multi_view_losses(
     if not np.isfinite(positions[:, 0]).any():
         nothing = MultiViewMetrics(0.0, 0.0, len(pixels), 0, 0, int((~given).sum()))
         return MultiViewLoss(0.0, on_images, None, nothing)
-    view = query_view(gaussians, other_camera, options)
+    view = query_view(gaussians, other.camera, options)
     depths = solve_depths(view, positions)
     noise, by_found, by_positions = pair.reproject(positions, depths.values)
     valid = noise < np.inf  # (m,)
@@ -461,7 +465,7 @@ def multi_view_losses(
     states, errors, depth_slopes, normal_slopes = pair.compare(
         noise,
         grey,
-        grey_image(other_photo, "multi-view other grey", threads=threads, store=store),
+        grey_image(other.photo, "multi-view other grey", threads=threads, store=store),
         NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_),
         kept_there,
         settings.correlation == "squared",
@@ -475,9 +479,9 @@ def multi_view_losses(
     pixel_depth = share * depth_slopes  # (m,)
     pixel_normal = share[:, None] * normal_slopes  # (m, 3)
     share = lambda_geometric * weights / max(1, int(valid.sum()))
-    other, broken = None, 0
+    on_other, broken = None, 0
     if lambda_geometric != 0.0 and valid.any():
-        other, on_positions, broken = _other_gradients(gaussians, view, depths, share * by_found)
+        on_other, on_positions, broken = _other_gradients(gaussians, view, depths, share * by_found)
         on_positions = share[:, None] * by_positions + on_positions
         pixel_depth = pixel_depth + (on_positions * position_slopes).sum(1)
     sound = given & np.isfinite(pixel_depth) & np.isfinite(pixel_normal).all(1)
@@ -493,7 +497,7 @@ def multi_view_losses(
         int((~sound | (states == BROKEN)).sum()) + broken,
     )
     value = lambda_photometric * photometric + lambda_geometric * geometric
-    return MultiViewLoss(value, on_images, other, figures)
+    return MultiViewLoss(value, on_images, on_other, figures)
 
 
 class _ViewPair:

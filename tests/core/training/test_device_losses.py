@@ -43,6 +43,7 @@ from gaussian_wrapping_addon.core.training.losses import (
 from gaussian_wrapping_addon.core.training.multi_view import (
     MultiViewLoss,
     MultiViewOptions,
+    PhotoView,
     choose_pixels,
     grey_image,
     multi_view_losses,
@@ -250,8 +251,9 @@ class Case:
     def on_cpu(self, images: SimpleNamespace) -> MultiViewLoss:
         """Return the CPU's losses."""
         return multi_view_losses(
-            images, RawArrays.from_gaussians(self.gaussians), self.camera, bytes_of(self.camera),
-            self.mask, self.other, bytes_of(self.other), self.other_mask, self.options,
+            images, RawArrays.from_gaussians(self.gaussians),
+            PhotoView(self.camera, bytes_of(self.camera), self.mask),
+            PhotoView(self.other, bytes_of(self.other), self.other_mask), self.options,
             np.random.default_rng(1), threads=1,
         )  # fmt: skip
 
@@ -268,8 +270,9 @@ class Case:
             kernels,
             SimpleNamespace(**{name: there(array) for name, array in vars(images).items()}),
             OrientedGaussians(**gaussians),
-            self.camera, there(bytes_of(self.camera)), there(self.mask), self.other,  # type: ignore[arg-type]
-            there(bytes_of(self.other)), there(self.other_mask), self.options,  # type: ignore[arg-type]
+            PhotoView(self.camera, there(bytes_of(self.camera)), there(self.mask)),
+            PhotoView(self.other, there(bytes_of(self.other)), there(self.other_mask)),
+            self.options,
             np.random.default_rng(1),
         )  # fmt: skip
 

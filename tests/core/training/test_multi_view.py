@@ -25,6 +25,7 @@ from gaussian_wrapping_addon.core.training.multi_view import (
     MultiViewLoss,
     MultiViewOptions,
     NeighbourLimits,
+    PhotoView,
     choose_pixels,
     find_neighbours,
     grey_image,
@@ -76,8 +77,8 @@ def losses(
     raw, image = rendered(gaussians)
     random = np.random.default_rng(1)
     return multi_view_losses(
-        image, raw, REFERENCE, photo, mask, other, other_photo, other_mask, options, random,
-        threads=threads,
+        image, raw, PhotoView(REFERENCE, photo, mask), PhotoView(other, other_photo, other_mask),
+        options, random, threads=threads,
     )  # fmt: skip
 
 
@@ -191,7 +192,7 @@ def test_value_and_gradients_are_those_of_the_definition(
     raw, image = rendered(gaussians)
     random = np.random.default_rng(1)
     found = multi_view_losses(
-        image, raw, REFERENCE, photo, None, OTHER, OTHER_PHOTO, None, options, random
+        image, raw, PhotoView(REFERENCE, photo), PhotoView(OTHER, OTHER_PHOTO), options, random
     )
     assert found.other is not None
     merged = merge_gradients(image.backward(found.gradients), found.other, len(raw))
@@ -296,7 +297,7 @@ def test_patches_across_a_step_of_the_surface_are_left_out() -> None:
 
     def pulled(max_rise: float) -> np.ndarray:
         found = multi_view_losses(
-            stepped, raw, REFERENCE, PHOTO, None, OTHER, OTHER_PHOTO, None,  # type: ignore[arg-type]
+            stepped, raw, PhotoView(REFERENCE, PHOTO), PhotoView(OTHER, OTHER_PHOTO),  # type: ignore[arg-type]
             dataclasses.replace(options, max_rise=max_rise), np.random.default_rng(1),
         )  # fmt: skip
         return np.asarray(found.gradients.depth != 0.0)
@@ -337,7 +338,7 @@ def test_numbers_that_are_not_finite_are_dropped_and_counted() -> None:
     photo[20:22, 20:22] = np.nan
     random = np.random.default_rng(1)
     found = multi_view_losses(
-        image, raw, REFERENCE, PHOTO, None, OTHER, photo, None, OPTIONS, random
+        image, raw, PhotoView(REFERENCE, PHOTO), PhotoView(OTHER, photo), OPTIONS, random
     )
     assert np.isfinite(found.value)
     assert found.value > 0.0

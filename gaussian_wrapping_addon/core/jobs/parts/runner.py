@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from ...devices import DeviceChoice
 from ...errors import EXIT_CANCELLED, EXIT_DONE, Cancelled, WorkerError, WrapError
@@ -281,10 +281,7 @@ class PartRunner:
                     f"Tiles of region {part.region} are missing.", "Resume the job: it makes them."
                 ) from None
             # A list of parts that cannot grow was made before the plan.
-            inputs = self._inputs(
-                self._job, self._requests[part.region], self._cameras(), self._stage("train"),
-                self._device, self._threads,
-            )  # fmt: skip
+            inputs = self._inputs(part.region, self._device)
             TileMaker(planned.stage_folder / TILES_FOLDER).make_all(
                 inputs.field, progress.span(0.1, 0.9)
             )
@@ -295,19 +292,22 @@ class PartRunner:
     def _meshed(self, region: str, progress: Progress) -> Stage:
         warning = self._fallen_back.get(region)
         return run_mesh(
-            self._folder, self._job, self._requests[region], region, self._cameras(),
-            self._stage("train"), progress, threads=self._threads,
-            device=self._device if warning is None else ON_PROCESSOR, load=self._inputs,
+            self._folder, self._job, self._requests[region], region, self._stage("train"), progress,
+            device=self._device if warning is None else ON_PROCESSOR,
+            load=lambda device: self._inputs(region, device),
             tile_processes=self._tile_processes(region),
             warnings=() if warning is None else (warning,),
         )  # fmt: skip
 
-    def _inputs(self, *given: Any) -> RegionInputs:
+    def _inputs(self, region: str, device: DeviceChoice) -> RegionInputs:
         """Return what a region is made from; that of the last one asked for is kept."""
-        request, device = str(given[1]), given[4].device
-        if self._region is None or self._region[:2] != (request, device):
+        request = self._requests[region]
+        if self._region is None or self._region[:2] != (request, device.device):
             self._region = None
-            self._region = (request, device, load_region(*given))
+            inputs = load_region(
+                self._job, request, self._cameras(), self._stage("train"), device, self._threads
+            )
+            self._region = (request, device.device, inputs)
         return self._region[2]
 
     def _run_tile(self, part: Part, progress: Progress) -> PartResult:
@@ -322,10 +322,8 @@ class PartRunner:
         device = self._device if warning is None else ON_PROCESSOR
         if self._tiles is None or self._tiles[0] != part.region:
             self._tiles = (part.region, TileMaker(folder))
-        request = self._requests[part.region]
-        cameras, trained = self._cameras(), self._stage("train")
         try:
-            inputs = self._inputs(self._job, request, cameras, trained, device, self._threads)
+            inputs = self._inputs(part.region, device)
             path = self._tiles[1].make(part.kind, part.tile, inputs.field, progress)
         except Exception as error:
             if not (self._is_alone and device.is_cuda and is_device_failure(error)):

@@ -327,7 +327,6 @@ def mesh_in_stage(
     stage_folder: Path,
     field: Field,
     arrays: GaussianArrays,
-    cameras: Sequence[Camera],
     region: Region,
     meshing: MeshingSettings,
     progress: Progress,
@@ -365,7 +364,7 @@ def mesh_in_stage(
     from ...meshing.tiles.store import is_planned, save_plan
     from ...meshing.tiles.tiled_mesh import plan_tiles
 
-    folder = stage_folder / TILES_FOLDER
+    folder, cameras = stage_folder / TILES_FOLDER, field.vacancy.cameras
     if is_planned(folder):
         return _joined(stage_folder, field, meshing, progress)
     depth_samples = sampled()
@@ -440,7 +439,6 @@ def mesh_by_pivots_in_stage(
     stage_folder: Path,
     vacancy: VacancyField,
     arrays: GaussianArrays,
-    cameras: Sequence[Camera],
     region: Region,
     meshing: MeshingSettings,
     progress: Progress,
@@ -448,7 +446,6 @@ def mesh_by_pivots_in_stage(
     seed: int,
     threads: int,
     depth_samples: DepthSamples | None,
-    warnings: Sequence[ReportWarning] = (),
 ) -> tuple[SurfaceMesh, dict[str, Any]]:
     """Estimate the mesh of a region by pivots, then make it; see :func:`mesh_in_stage`."""
     from ...meshing.pivot_meshing import mesh_by_pivots
@@ -459,9 +456,9 @@ def mesh_by_pivots_in_stage(
     memory_bytes = free_bytes(stage_folder, threads)
     expected.refuse(memory_bytes)
     mesh = mesh_by_pivots(
-        vacancy, arrays, cameras, region, meshing, progress, seed=seed, depth_samples=depth_samples
-    )
-    _note(mesh, warnings)
+        vacancy, arrays, vacancy.cameras, region, meshing, progress, seed=seed,
+        depth_samples=depth_samples,
+    )  # fmt: skip
     return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": False}
 
 
@@ -595,10 +592,6 @@ class TileMaker:
 # -- Mesh stage: mesh a region of a finished training and clean the mesh up -----------------------
 
 
-if TYPE_CHECKING:
-    Loader = Callable[[JobFile, str, Stage, Stage, DeviceChoice, int], RegionInputs]
-
-
 ON_PROCESSOR = DeviceChoice(CPU, "", "The GPU failed.")
 
 DENSE_MESH = "dense.npz"
@@ -610,13 +603,11 @@ def run_mesh(
     job: JobFile,
     request: str,
     name: str,
-    cameras: Stage,
     trained: Stage,
     progress: Progress,
     *,
-    threads: int,
     device: DeviceChoice,
-    load: Loader = load_region,
+    load: Callable[[DeviceChoice], RegionInputs],
     tile_processes: int = 1,
     warnings: Sequence[ReportWarning] = (),
 ) -> Stage:
@@ -632,7 +623,7 @@ def run_mesh(
         The job's; vacancy is evaluated and depth maps are rendered there. Everything else gets
         arrays and CPU tensors.
     load : callable
-        Takes the place of :func:`load_region`, to keep what it loads.
+        Returns what :func:`load_region` does for a device.
     tile_processes : int
         How many processes made the tiles, for the report.
     warnings : sequence of ReportWarning
@@ -665,14 +656,15 @@ def run_mesh(
         from ...render.types import Renderer
         from ...scene.frames import snapped_length
 
-        inputs = load(job, request, cameras, trained, chosen, threads)
+        inputs = load(chosen)
         region, vacancy = inputs.region, inputs.field.vacancy
 
         def sampled() -> DepthSamples:
             def on(renderer: Renderer) -> DepthSamples:
                 return sample_depth_maps(
                     inputs.gaussians, vacancy.cameras, lambda points: region.contains(points, 0.0),
-                    progress.span(0.0, 0.15), threads=threads, renderer=renderer,
+                    progress.span(0.0, 0.15), threads=inputs.field.threads,
+                    renderer=renderer,
                 )  # fmt: skip
 
             return with_renderer(vacancy.device, "Depth maps", on)
@@ -680,13 +672,14 @@ def run_mesh(
         if meshing.method == "pivots":
             alone = meshing.pivot_samples == "none"
             mesh, expected = mesh_by_pivots_in_stage(
-                stage_folder, vacancy, inputs.arrays, vacancy.cameras, region, meshing,
-                progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
-                depth_samples=None if alone else sampled(), warnings=warnings,
+                stage_folder, vacancy, inputs.arrays, region, meshing, progress.span(0.15, 0.9),
+                seed=job.settings.seed, threads=inputs.field.threads,
+                depth_samples=None if alone else sampled(),
             )  # fmt: skip
+            _note(mesh, warnings)
         else:
             mesh, expected = mesh_in_stage(
-                stage_folder, inputs.field, inputs.arrays, vacancy.cameras, region, meshing,
+                stage_folder, inputs.field, inputs.arrays, region, meshing,
                 progress.span(0.15, 0.9), seed=job.settings.seed, sampled=sampled,
                 edge_length_scene=snapped_length(
                     meshing.edge_length / inputs.scene.world_from_scene.scale

@@ -17,7 +17,7 @@ from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.files import load_gaussians, save_gaussians
 from gaussian_wrapping_addon.core.jobs.stages import training
 from gaussian_wrapping_addon.core.jobs.stages.cameras import run_cameras
-from gaussian_wrapping_addon.core.jobs.stages.meshing import DENSE_MESH, run_mesh
+from gaussian_wrapping_addon.core.jobs.stages.meshing import DENSE_MESH, load_region, run_mesh
 from gaussian_wrapping_addon.core.jobs.stages.texture import run_texture
 from gaussian_wrapping_addon.core.jobs.stages.training import run_training
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
@@ -157,11 +157,10 @@ def test_a_damaged_mesh_is_made_again(
             job,
             str(path),
             "ball",
-            cameras,
             trained,
             Progress(),
-            threads=1,
             device=PROCESSOR,
+            load=lambda device: load_region(job, str(path), cameras, trained, device, 1),
         )
 
     made = mesh()
