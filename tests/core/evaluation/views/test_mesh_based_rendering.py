@@ -8,7 +8,6 @@ import functools
 import itertools
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,9 +20,8 @@ from gaussian_wrapping_addon.core.evaluation.mesh_based_rendering import (
     PhotoView,
     mesh_based_rendering,
 )
-from gaussian_wrapping_addon.core.image_metrics import WEIGHTS_VARIABLE, Lpips
 from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
-from tests.core.evaluation.views.lpips_weights import random_states, write
+from tests.core.imaging.test_view_metrics import MeanDifference
 from tests.core.texture.texture_scenes import look_at, ring, shoot, sphere_hit
 
 TRAINING = 14
@@ -238,12 +236,8 @@ def test_the_result_does_not_depend_on_threads() -> None:
     assert one == many
 
 
-def test_lpips_is_measured_where_it_is_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write(tmp_path, *random_states())
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
-    found = mesh_based_rendering(*ball(3), *views(), lpips=Lpips.load())
+def test_lpips_is_measured_where_it_is_given() -> None:
+    found = mesh_based_rendering(*ball(3), *views(), lpips=MeanDifference())
     assert 0.0 < found.to_json()["lpips"] < 1.0
     assert "lpips" not in of_ball().to_json()
 

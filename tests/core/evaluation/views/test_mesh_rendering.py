@@ -6,7 +6,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,11 +17,11 @@ from gaussian_wrapping_addon.core.evaluation.mesh_rendering import (
     TexturedRenderer,
     render_views,
 )
-from gaussian_wrapping_addon.core.image_metrics import PSNR_CAP_DB, WEIGHTS_VARIABLE, Lpips
+from gaussian_wrapping_addon.core.image_metrics import PSNR_CAP_DB
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from tests.core.evaluation.views.gradient_wall import CAMERAS, gradient_wall
-from tests.core.evaluation.views.lpips_weights import random_states, write
+from tests.core.imaging.test_view_metrics import MeanDifference
 from tests.core.texture.texture_scenes import look_at, ring, shoot, sphere_hit, waves
 
 FLAT = (200, 40, 120)
@@ -203,12 +202,8 @@ def test_views_without_a_pixel_to_judge_are_left_out_and_counted() -> None:
     assert "psnr" not in values
 
 
-def test_lpips_is_measured_where_it_is_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write(tmp_path, *random_states())
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
-    metric = Lpips.load()
+def test_lpips_is_measured_where_it_is_given() -> None:
+    metric = MeanDifference()
     textured, cameras, photos = flat_wall(2)
     photos[1] = 255 - photos[1]
     found = render_views(textured, cameras, photos, lpips=metric)
@@ -216,7 +211,7 @@ def test_lpips_is_measured_where_it_is_given(
     assert found.views[0].scores.lpips == 0.0
     shown = photos[1].copy()
     shown[5:85, 20:100] = FLAT
-    expected = metric.distance(shown, photos[1])
+    expected = metric.distance(shown / 255.0, photos[1] / 255.0)
     assert found.views[1].scores.lpips == pytest.approx(expected, rel=1e-5)
     values = found.to_json()
     assert values["lpips"] == pytest.approx(expected / 2, rel=1e-5)

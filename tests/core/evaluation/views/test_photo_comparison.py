@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core import image_metrics
-from gaussian_wrapping_addon.core.errors import ParseError
 from gaussian_wrapping_addon.core.evaluation import photo_views
 from gaussian_wrapping_addon.core.evaluation.mesh_based_rendering import bake_held_out_texture
 from gaussian_wrapping_addon.core.evaluation.photo_views import (
@@ -151,17 +149,3 @@ def test_a_mesh_that_no_photo_shows_has_no_figures(tmp_path: Path) -> None:
     values = compare_with_photos(behind, scene_of(photos), photos, [], tmp_path, Progress())
     assert (values["views"], values["pictures"], values["left_out"]) == ([], [], 2)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_broken_weights_of_lpips_do_not_end_the_job(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken() -> None:
-        raise ParseError("alex.pth", "whole file", "not weights.")
-
-    monkeypatch.setattr(image_metrics.Lpips, "load", broken)
-    assert photo_views.lpips_if_ready is image_metrics.lpips_if_ready
-    photos = wall_photos(1)
-    values = compared(photos, [], tmp_path)
-    assert "alex.pth" in values["lpips_note"]
-    assert "lpips" not in values
