@@ -216,8 +216,8 @@ def test_lpips_is_measured_where_it_is_given() -> None:
     values = found.to_json()
     assert values["lpips"] == pytest.approx(expected / 2, rel=1e-5)
     assert "lpips_note" not in values
-    small = cameras[0].resized(24, 18)
-    tiny = render_views(textured, [small], [np.zeros((18, 24, 3), np.uint8)], lpips=metric)
+    small = cameras[0].resized(16, 12)
+    tiny = render_views(textured, [small], [np.zeros((12, 16, 3), np.uint8)], lpips=metric)
     assert tiny.lpips is None
     assert "too small" in tiny.to_json()["lpips_note"]
 
