@@ -33,6 +33,7 @@ from gaussian_wrapping_addon.core.mesh.sampling import distances_to_mesh, sample
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing.checks import mesh_statistics
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
+from gaussian_wrapping_addon.core.meshing.surface_points import Field
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.scene_regions import automatic_region, parse_region
 from gaussian_wrapping_addon.core.regions.shapes import Region
@@ -96,10 +97,15 @@ class MeasuredScene:
         """Return a mesh, its wall seconds and its processor seconds."""
         begun_s, cpu_s = time.monotonic(), time.process_time()
         mesh = mesh_region(
-            self.vacancy, self.vectors, self.arrays, self.cameras, self.region,
-            MeshingSettings(points=points, spacing=spacing), Progress(), seed=0,
-            threads=self.threads, depth_samples=self.depth_samples,
-        )  # fmt: skip
+            Field(self.vacancy, self.vectors, self.threads),
+            self.arrays,
+            self.cameras,
+            self.region,
+            MeshingSettings(points=points, spacing=spacing),
+            Progress(),
+            seed=0,
+            depth_samples=self.depth_samples,
+        )
         return mesh, time.monotonic() - begun_s, time.process_time() - cpu_s
 
     def judged(self, mesh: SurfaceMesh, reference: SurfaceMesh) -> dict[str, float]:

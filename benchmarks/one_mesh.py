@@ -24,7 +24,7 @@ from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh, save_mes
 from gaussian_wrapping_addon.core.meshing.clean_up import clean_up
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import mesh_by_pivots
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
-from gaussian_wrapping_addon.core.meshing.surface_points import MARGIN_SHARE
+from gaussian_wrapping_addon.core.meshing.surface_points import MARGIN_SHARE, Field
 from gaussian_wrapping_addon.core.parallel import default_threads
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.scene_regions import automatic_region, read_region
@@ -181,9 +181,15 @@ def make_mesh(trained: Trained, method: Method, *, threads: int, seed: int = 0) 
         )
     settings = MeshingSettings(points=method.size, spacing=method.name)
     mesh = mesh_region(
-        vacancy, VectorField(arrays, threads=threads), arrays, cameras, region, settings,
-        Progress(), seed=seed, threads=threads, depth_samples=depth_samples,
-    )  # fmt: skip
+        Field(vacancy, VectorField(arrays, threads=threads), threads),
+        arrays,
+        cameras,
+        region,
+        settings,
+        Progress(),
+        seed=seed,
+        depth_samples=depth_samples,
+    )
     return clean_up(mesh, region, settings, vacancy, Progress()).mesh
 
 

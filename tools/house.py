@@ -6,8 +6,8 @@
 
 Only files that end in ``.py`` count. "Called in one place" counts the names of functions and
 methods for which the package has exactly one call of that name. Parameters exclude ``self`` and
-``cls``, and functions that are compiled (``kernel``, ``part``, ``inline``) are left out there. The
-options of ``wrap`` are those that ``wrap --help`` shows in a process of that tree.
+``cls``, and functions that are compiled (``kernel``, ``part``, ``inline``, ``intrinsic``) are left
+out there. The options of ``wrap`` are those that ``wrap --help`` shows in a process of that tree.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "gaussian_wrapping_addon"
-COMPILED = {"kernel", "part", "inline"}
+COMPILED = {"kernel", "part", "inline", "intrinsic"}
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 _NO_CODE = {
     tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT,

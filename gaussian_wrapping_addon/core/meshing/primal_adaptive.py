@@ -32,6 +32,7 @@ from .surface_points import (
     KIND_CAP,
     KIND_JUMP,
     KIND_SURFACE,
+    Field,
     SurfacePoints,
     SurfaceSampler,
     candidate_surface,
@@ -51,8 +52,7 @@ LONGEST_EDGE_SHARE = 1 / 8
 
 
 def mesh_region(
-    vacancy: Any,
-    vectors: Any,
+    field: Field,
     arrays: GaussianArrays,
     cameras: Sequence[Camera],
     region: Region,
@@ -60,22 +60,18 @@ def mesh_region(
     progress: Progress,
     *,
     seed: int,
-    threads: int,
     edge_length_scene: float = 0.0,
     depth_samples: DepthSamples | None = None,
 ) -> SurfaceMesh:
     """Mesh the surface ``vacancy = 0.5`` inside a region, closed by caps on the region's boundary.
 
     With adaptive spacing a denser mesh is extracted and simplified to the vertices that its shape
-    needs (:mod:`.simplification`). ``vacancy`` decides about space that no
+    needs (:mod:`.simplification`). The vacancy decides about space that no
     camera sees. Without an edge length or a number of points the mesh has about 50 thousand faces.
 
     Parameters
     ----------
-    vacancy : VacancyField
-        Or any object with ``vacancy(points)`` and ``is_empty(points)``.
-    vectors : VectorField
-        Or any object with ``evaluate(points)``.
+    field : Field
     arrays : GaussianArrays
         Scene frame.
     cameras : sequence of Camera
@@ -109,6 +105,7 @@ def mesh_region(
     """
     if len(cameras) == 0:
         raise MeshingError("The scene has no cameras.", "Check the scene.")
+    vacancy = field.vacancy
     request = checked_request(edge_length_scene, settings.points, region)
     rng = np.random.default_rng(seed)
     surface = candidate_surface(
@@ -117,7 +114,7 @@ def mesh_region(
     )  # fmt: skip
     adaptive = settings.spacing == "adaptive"
     sampler = SurfaceSampler(
-        vacancy, vectors, region, surface, threads, cameras=cameras if adaptive else ()
+        vacancy, field.vectors, region, surface, field.threads, cameras=cameras if adaptive else ()
     )
     dense = (
         dense_request(request, sampler.area, region) if adaptive else DenseRequest(request, 0, 1.0)

@@ -459,6 +459,17 @@ class _ProjectedPoints:
     evaluations: int
 
 
+@dataclass(frozen=True)
+class Field:
+    """The fields that define the surface; duck-typed."""
+
+    vacancy: Any
+    """``VacancyField``, or any object with ``vacancy(points)`` and ``is_empty(points)``."""
+    vectors: Any
+    """``VectorField``, or any object with ``evaluate(points)``."""
+    threads: int
+
+
 class SurfaceSampler:
     """Samples a candidate surface and projects the points onto the isosurface."""
 

@@ -26,6 +26,7 @@ from gaussian_wrapping_addon.core.field.isosurface_projection import project_to_
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
+from gaussian_wrapping_addon.core.meshing.surface_points import Field
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.projection import RawArrays
 from gaussian_wrapping_addon.core.render.render import render
@@ -163,9 +164,14 @@ def meshing() -> str:
     distance, region = sphere_distance(), cube(1.3)
     field = ShapeField(distance, 0.02)
     mesh = mesh_region(
-        field, field, gaussians_on(distance, region, 800, 0.02), some_cameras(), region,
-        settings(300, 0.01), Progress(), seed=0, threads=THREADS,
-    )  # fmt: skip
+        Field(field, field, THREADS),
+        gaussians_on(distance, region, 800, 0.02),
+        some_cameras(),
+        region,
+        settings(300, 0.01),
+        Progress(),
+        seed=0,
+    )
     return digest(mesh.vertices, mesh.faces)
 
 

@@ -16,6 +16,7 @@ from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing import surface_points
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.meshing.spacing import MIN_VERTICES
+from gaussian_wrapping_addon.core.meshing.surface_points import Field
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.field.field_scenes import camera_at
@@ -48,9 +49,15 @@ def mesh_shape(
     field = ShapeField(distance, sigma)
     arrays = gaussians_on(distance, region, 800, sigma)
     return mesh_region(
-        field, field, arrays, some_cameras(), region, settings(points, share, spacing), Progress(),
-        seed=seed, threads=threads, edge_length_scene=edge,
-    )  # fmt: skip
+        Field(field, field, threads),
+        arrays,
+        some_cameras(),
+        region,
+        settings(points, share, spacing),
+        Progress(),
+        seed=seed,
+        edge_length_scene=edge,
+    )
 
 
 def test_a_request_for_too_few_points_is_said() -> None:
@@ -176,9 +183,14 @@ def test_solid_ends_with_a_flat_wall_where_sight_ends() -> None:
     field = HalfSeen(sphere(), 0.02)
     arrays = gaussians_on(sphere(), cube(1.3), 800, 0.02)
     mesh = mesh_region(
-        field, field, arrays, some_cameras(), cube(1.3), settings(2000), Progress(), seed=0,
-        threads=1,
-    )  # fmt: skip
+        Field(field, field, 1),
+        arrays,
+        some_cameras(),
+        cube(1.3),
+        settings(2000),
+        Progress(),
+        seed=0,
+    )
     figures = assert_closed_manifold(mesh)
     assert (figures.components, figures.genus) == (1, 0)
     missing = 0.7**2 * (3 - 0.7) * np.pi / 3
@@ -223,7 +235,7 @@ def test_scale_invariance(scale: float) -> None:
     arrays = dataclasses.replace(arrays, means=scale * arrays.means, scales=scale * arrays.scales)
     cameras = [camera_at(scale * np.array([0.0, -5.0, 1.0]))]
     other = mesh_region(
-        field, field, arrays, cameras, region, settings(800), Progress(), seed=0, threads=1
+        Field(field, field, 1), arrays, cameras, region, settings(800), Progress(), seed=0
     )
     figures, small = assert_closed_manifold(other), assert_closed_manifold(small_torus())
     assert (figures.genus, figures.components) == (small.genus, small.components) == (1, 1)
@@ -260,9 +272,14 @@ def test_empty_region_and_region_without_gaussians() -> None:
         field = ShapeField(distance, 0.02)
         with pytest.raises(MeshingError, match=text) as caught:
             mesh_region(
-                field, field, arrays, some_cameras(), region, settings(500), Progress(), seed=0,
-                threads=1,
-            )  # fmt: skip
+                Field(field, field, 1),
+                arrays,
+                some_cameras(),
+                region,
+                settings(500),
+                Progress(),
+                seed=0,
+            )
         assert caught.value.hint
 
 
@@ -296,7 +313,13 @@ def test_progress_grows_and_cancelling_stops() -> None:
     field = ShapeField(sphere(), 0.02)
     arrays = gaussians_on(sphere(), cube(1.3), 500, 0.02)
     run = lambda progress: mesh_region(  # noqa: E731
-        field, field, arrays, some_cameras(), cube(1.3), settings(500), progress, seed=0, threads=1
+        Field(field, field, 1),
+        arrays,
+        some_cameras(),
+        cube(1.3),
+        settings(500),
+        progress,
+        seed=0,
     )
     run(Progress("mesh", events.append))
     fractions = [e.fraction for e in events]

@@ -12,6 +12,7 @@ from gaussian_wrapping_addon.core.field.vacancy import VacancyField, brute_force
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
+from gaussian_wrapping_addon.core.meshing.surface_points import Field
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.shapes import Region
 from tests.core.field.field_scenes import cameras_around, shell_arrays, unit_sphere
@@ -28,7 +29,7 @@ def mesh_shell(region: Region, points: int, scale: float = 1.0) -> SurfaceMesh:
     vacancy = VacancyField(arrays, cameras, threads=2, near_z=0.2 * scale)
     vectors = VectorField(arrays, threads=2)
     return mesh_region(
-        vacancy, vectors, arrays, cameras, region, settings(points), Progress(), seed=0, threads=2
+        Field(vacancy, vectors, 2), arrays, cameras, region, settings(points), Progress(), seed=0
     )
 
 

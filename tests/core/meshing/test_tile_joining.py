@@ -23,7 +23,7 @@ from gaussian_wrapping_addon.core.meshing.primal_adaptive import (
     simplified,
     small_handles_closed,
 )
-from gaussian_wrapping_addon.core.meshing.tiles.plan import Field
+from gaussian_wrapping_addon.core.meshing.surface_points import Field
 from gaussian_wrapping_addon.core.meshing.tiles.store import load_surface, save_surface
 from gaussian_wrapping_addon.core.meshing.tiles.tile import BorderFaces, tile_faces
 from gaussian_wrapping_addon.core.progress import Progress
@@ -138,7 +138,7 @@ def test_vertices_of_removed_parts_are_not_missed() -> None:
     )  # fmt: skip
     mesh = tiles.join(settings)
     whole = mesh_region(
-        field, field, arrays, some_cameras(), region, settings, Progress(), seed=0, threads=1
+        Field(field, field, 1), arrays, some_cameras(), region, settings, Progress(), seed=0
     )
     assert assert_closed_manifold(mesh).components == 1
     assert mesh.provenance["removed_solids"] == whole.provenance["removed_solids"] == 4

@@ -16,12 +16,12 @@ from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.meshing.spacing import Spacing
 from gaussian_wrapping_addon.core.meshing.surface_points import (
     CandidateSurface,
+    Field,
     SurfacePoints,
     no_caps,
 )
 from gaussian_wrapping_addon.core.meshing.tiles.plan import (
     CLEARANCE_RADII,
-    Field,
     TilePlan,
     steiner_lattice,
 )
@@ -260,8 +260,8 @@ def mesh_whole(
 ) -> SurfaceMesh:
     field = ShapeField(distance, SIGMA)
     return mesh_region(
-        field, field, gaussians_on(distance, region, 800, SIGMA), some_cameras(), region,
-        MeshingSettings(points=points), Progress(), seed=0, threads=1, edge_length_scene=edge,
+        Field(field, field, 1), gaussians_on(distance, region, 800, SIGMA), some_cameras(), region,
+        MeshingSettings(points=points), Progress(), seed=0, edge_length_scene=edge,
     )  # fmt: skip
 
 

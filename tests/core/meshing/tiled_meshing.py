@@ -12,7 +12,8 @@ import numpy as np
 from gaussian_wrapping_addon.core.field.samples import DepthSamples
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.tiles.plan import Field, TilePlan
+from gaussian_wrapping_addon.core.meshing.surface_points import Field
+from gaussian_wrapping_addon.core.meshing.tiles.plan import TilePlan
 from gaussian_wrapping_addon.core.meshing.tiles.tile import (
     BorderFaces,
     GatheredPoints,

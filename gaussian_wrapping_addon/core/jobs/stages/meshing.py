@@ -17,7 +17,8 @@ from ...array_file import is_whole
 from ...devices import CPU, DeviceChoice, stage_device
 from ...devices.checks import is_device_failure
 from ...errors import DatasetError, MeshingError, WrapError
-from ...meshing.tiles.plan import Field, TilePlan
+from ...meshing.surface_points import Field
+from ...meshing.tiles.plan import TilePlan
 from ...meshing.tiles.store import (
     faces_path,
     gathered_path,
@@ -107,7 +108,7 @@ def load_region(
     """
     from ...field.vector_field import VectorField
     from ...gaussians.files import load_gaussians
-    from ...meshing.tiles.plan import Field
+    from ...meshing.surface_points import Field
     from ...scene.scene import load_refined_scene
 
     scene = load_refined_scene(cameras.folder, trained.folder)
@@ -389,9 +390,16 @@ def mesh_in_stage(
         save_plan(folder, plan, noted)
         raise TilesPlanned(stage_folder)
     mesh = mesh_region(
-        field.vacancy, field.vectors, arrays, cameras, region, meshing, progress, seed=seed,
-        threads=field.threads, edge_length_scene=edge_length_scene, depth_samples=depth_samples,
-    )  # fmt: skip
+        field,
+        arrays,
+        cameras,
+        region,
+        meshing,
+        progress,
+        seed=seed,
+        edge_length_scene=edge_length_scene,
+        depth_samples=depth_samples,
+    )
     _note(mesh, warnings)
     return mesh, told
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,7 +15,7 @@ from ...progress import Progress, ReportWarning
 from ...regions.shapes import Region, Tiling, split_evenly
 from ...scene.camera import Camera
 from ..spacing import DenseRequest, ResolutionRequest, Spacing, dense_request, nominal_edge
-from ..surface_points import CandidateSurface, Caps, SurfaceSampler, cap_points
+from ..surface_points import CandidateSurface, Caps, Field, SurfaceSampler, cap_points
 
 # -- Steiner points on a jittered lattice, which bound empty balls and so make Delaunay cells
 #    local
@@ -120,15 +119,6 @@ WHOLE_POINTS = 400_000
 JITTER_SHARE = 1e-6
 """Perturbation of all points, as a share of the region's diagonal, for the triangulation: that of
 delaunay.JITTER_SHARE with its bounding points. Tiles must agree on it."""
-
-
-@dataclass(frozen=True)
-class Field:
-    """The fields that define the surface; duck-typed as in :func:`.primal_adaptive.mesh_region`."""
-
-    vacancy: Any
-    vectors: Any
-    threads: int
 
 
 @dataclass(frozen=True)

@@ -19,15 +19,15 @@ from ..delaunay import bounding_points, delaunay
 from ..primal_adaptive import DEGENERATE_SHARE, KIND_SPLIT, LONGEST_EDGE_SHARE
 from ..repair import remove_degenerate, split_nonmanifold
 from ..spacing import ResolutionRequest
-from ..surface_points import KIND_CAP, KIND_JUMP, PRIORITY_SURFACE, SurfacePoints, SurfaceSampler
-from .plan import (
-    CLEARANCE_CAP_RADII,
-    CLEARANCE_RADII,
-    JITTER_SHARE,
+from ..surface_points import (
+    KIND_CAP,
+    KIND_JUMP,
+    PRIORITY_SURFACE,
     Field,
-    TilePlan,
-    outside_clearance,
+    SurfacePoints,
+    SurfaceSampler,
 )
+from .plan import CLEARANCE_CAP_RADII, CLEARANCE_RADII, JITTER_SHARE, TilePlan, outside_clearance
 
 # -- Sample the surface points of one tile, and gather the points of all tiles --------------------
 

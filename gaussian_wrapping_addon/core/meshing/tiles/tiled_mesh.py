@@ -22,9 +22,9 @@ from ...settings import MeshingSettings
 from ..primal_adaptive import residuals_on_surface, small_handles_closed, vertex_counts
 from ..repair import remove_degenerate
 from ..spacing import checked_request
-from ..surface_points import candidate_surface
+from ..surface_points import Field, candidate_surface
 from .join import Joined, LoadTile, flip_by_tiles, joined, overview
-from .plan import Field, TilePlan, make_plan
+from .plan import TilePlan, make_plan
 from .tile import KIND_STEINER, cost_units, longest_edge
 
 _logger = logging.getLogger(__name__)

@@ -20,7 +20,7 @@ from gaussian_wrapping_addon.core.jobs.stages.meshing import (
 )
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import mesh_by_pivots
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
-from gaussian_wrapping_addon.core.meshing.surface_points import halo_bounds
+from gaussian_wrapping_addon.core.meshing.surface_points import Field, halo_bounds
 from gaussian_wrapping_addon.core.photos.store import PhotoStore
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.shapes import Region
@@ -216,8 +216,15 @@ def test_nobody_asks_beyond_the_halo(method: str) -> None:
     field = WatchedField(sphere(), 0.05)
     arrays = gaussians_on(sphere(), cube(1.5), 3000, 0.05)
     if method == "pam":
-        mesh_region(field, field, arrays, field.cameras, region, MeshingSettings(points=800),
-                    Progress(), seed=0, threads=1)  # fmt: skip
+        mesh_region(
+            Field(field, field, 1),
+            arrays,
+            field.cameras,
+            region,
+            MeshingSettings(points=800),
+            Progress(),
+            seed=0,
+        )
     else:
         mesh_by_pivots(field, arrays, field.cameras, region, MeshingSettings(), Progress(), seed=0)
     low, high = halo_bounds(region)

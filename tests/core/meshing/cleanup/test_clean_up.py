@@ -12,6 +12,7 @@ from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
 from gaussian_wrapping_addon.core.meshing.clean_up import clean_up
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
+from gaussian_wrapping_addon.core.meshing.surface_points import Field
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
@@ -31,8 +32,8 @@ FIELD = ShapeField(torus(), 0.02)
 def mesh() -> SurfaceMesh:
     """A torus cut flat, so that a part of its surface is the region's boundary."""
     return mesh_region(
-        FIELD, FIELD, gaussians_on(torus(), REGION, 800, 0.02), some_cameras(), REGION,
-        settings(3000), Progress(), seed=0, threads=1,
+        Field(FIELD, FIELD, 1), gaussians_on(torus(), REGION, 800, 0.02), some_cameras(), REGION,
+        settings(3000), Progress(), seed=0,
     )  # fmt: skip
 
 

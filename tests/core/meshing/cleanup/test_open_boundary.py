@@ -14,6 +14,7 @@ from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
 from gaussian_wrapping_addon.core.meshing.clean_up import split_fans, without_caps
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
+from gaussian_wrapping_addon.core.meshing.surface_points import Field
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
@@ -34,8 +35,8 @@ def test_primal_adaptive_meshes(shape: str, spacing: str) -> None:
     region = Region.box("half", np.array([-0.1, -2, -2]), np.array([2, 2, 2]), TURNED)
     field, arrays = ShapeField(distance, 0.05), gaussians_on(distance, region, 1500, 0.05)
     closed = mesh_region(
-        field, field, arrays, field.cameras, region,
-        MeshingSettings(points=1500, spacing=spacing), Progress(), seed=0, threads=1,
+        Field(field, field, 1), arrays, field.cameras, region,
+        MeshingSettings(points=1500, spacing=spacing), Progress(), seed=0,
     )  # fmt: skip
     mesh = without_caps(closed, region)
     check = validate_manifold(mesh.vertices, mesh.faces, region)
@@ -56,9 +57,14 @@ def test_a_round_region_of_many_planes_is_not_left(moved: bool) -> None:
     body = Region("round", 0.8 * ball(2)[0] + [0.7, 0.0, 0.0])
     field, arrays = ShapeField(sphere(), 0.05), gaussians_on(sphere(), body, 1500, 0.05)
     closed = mesh_region(
-        field, field, arrays, field.cameras, body, MeshingSettings(points=3000, spacing="uniform"),
-        Progress(), seed=0, threads=1,
-    )  # fmt: skip
+        Field(field, field, 1),
+        arrays,
+        field.cameras,
+        body,
+        MeshingSettings(points=3000, spacing="uniform"),
+        Progress(),
+        seed=0,
+    )
     assert body.distance(closed.vertices).max() < 1e-9
     if moved:  # as repair does with vertices at which parts touch
         inner = np.flatnonzero(np.abs(body.distance(closed.vertices)) < 1e-9)[::40]
