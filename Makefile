@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 PY := .venv/bin/python
 
-# One process of tests for each core, at most four; each file stays in one (tests/conftest.py).
-PARALLEL := -n auto --maxprocesses 4 --dist loadgroup --no-loadscope-reorder
+# One process of tests for each core, at most four; each file stays in one: fixtures are made once.
+PARALLEL := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test quick proofs lint docs settings-table zip prepare blenders clean
 

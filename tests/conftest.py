@@ -88,20 +88,16 @@ def slow_seconds() -> dict[str, float]:
     return seconds
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark slow tests, keep each file in one process, and start with the slowest files."""
+    """Mark slow tests, and start with the slowest files."""
     seconds = slow_seconds()
     of_file: Counter[str] = Counter()
     for name, value in seconds.items():
         of_file[name.partition("::")[0]] += value
-    parallel = "PYTEST_XDIST_WORKER" in os.environ
     for item in items:
         file = item.path.relative_to(_ROOT).as_posix()
         test = f"{file}::{getattr(item, 'originalname', item.name)}"
         if file in seconds or test in seconds:
             item.add_marker(pytest.mark.slow)
-        if parallel and item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(file))
-    if parallel:
+    if "PYTEST_XDIST_WORKER" in os.environ:
         items.sort(key=lambda item: -of_file[item.path.relative_to(_ROOT).as_posix()])

@@ -69,7 +69,7 @@ _LINES = Case(
         _line(
             "bake without a mesh",
             ("bake", "--out", "out"),
-            r"required: --mesh\. See batch\.py bake --help",
+            r"required: --mesh\. Usage: batch\.py bake \[-h\] --out DIR --mesh FILE",
         ),
         _line(
             "bake of a mesh that is gone",
