@@ -13,7 +13,7 @@ from PIL import Image
 from gaussian_wrapping_addon.command_line.options import training_settings
 from gaussian_wrapping_addon.command_line.parser import build_parser
 from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, EXIT_DONE, EXIT_USAGE, UsageError
-from tests.core.dataset.video.small_videos import pan, write
+from tests.core.photos.small_videos import pan, write
 
 BATCH = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon" / "batch.py"
 

@@ -24,7 +24,7 @@ from gaussian_wrapping_addon.ops.panel_settings import job_settings
 from gaussian_wrapping_addon.ui import computers_panel
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.panel_states import buttons, choose_photos, words
-from tests.core.farm.job_parts import graph, job_folder, write_state
+from tests.core.jobs.parts.job_parts import graph, job_folder, write_state
 
 pytestmark = pytest.mark.usefixtures("addon")
 

@@ -11,6 +11,6 @@ import pytest
 @pytest.fixture(scope="session")
 def emulator_library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the CUDA text compiled for the host."""
-    from .render.cuda.emulation import build_emulator  # torch, which not every test needs
+    from tests.core.render.cuda.emulation import build_emulator  # torch, which not every test needs
 
     return build_emulator(tmp_path_factory.mktemp("emulator"))

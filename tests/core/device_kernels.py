@@ -18,6 +18,6 @@ def kernels_of(device: str, request: pytest.FixtureRequest) -> Kernels:
         if not usable:
             pytest.skip(reason)
         return device_kernels(0)
-    from .render.cuda.emulation import EmulatedKernels
+    from tests.core.render.cuda.emulation import EmulatedKernels
 
     return EmulatedKernels(request.getfixturevalue("emulator_library"))

@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageFilter
 
-from tests.core.dataset.model_writers import ring_model, write_binary
-from tests.core.dataset.video import small_videos
-from tests.core.farm.job_parts import graph, job_folder, write_state
+from tests.core.jobs.parts.job_parts import graph, job_folder, write_state
+from tests.core.photos import small_videos
+from tests.core.readers.model_writers import ring_model, write_binary
 from tests.gui.conftest import ADDON, HERE, REPOSITORY, with_window
 
 PICTURES = REPOSITORY / "docs" / "images"

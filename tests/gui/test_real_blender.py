@@ -13,8 +13,7 @@ import pytest
 
 from tests.blender import synthetic_result
 from tests.blender.ball_job import write_ball_job
-
-from .conftest import REPOSITORY, Visit, colours_of
+from tests.gui.conftest import REPOSITORY, Visit, colours_of
 
 pytestmark = [pytest.mark.gui, pytest.mark.proof]
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from tests.core.dataset.model_writers import (
+from tests.core.readers.model_writers import (
     Model,
     ring_model,
     ring_poses,

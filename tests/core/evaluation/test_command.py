@@ -34,7 +34,7 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.scene_regions import write_region
 from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.scene.camera import Similarity
-from tests.core.evaluation.layouts.written_layouts import (
+from tests.core.evaluation.written_layouts import (
     JOB_FROM_TRUTH,
     bumpy_sphere,
     ring_of_cameras,

@@ -27,7 +27,7 @@ from gaussian_wrapping_addon.core.texture.files import write_glb, write_textured
 from gaussian_wrapping_addon.core.texture.unwrap import charts
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
 from gaussian_wrapping_addon.core.training.state import load_checkpoint, save_checkpoint
-from tests.core.texture.files.test_textured_files import UTM, cube
+from tests.core.texture.test_files import UTM, cube
 from tests.core.training.test_state import filled
 
 ROOT = Path(__file__).resolve().parents[3]

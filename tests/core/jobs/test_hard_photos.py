@@ -29,7 +29,7 @@ from gaussian_wrapping_addon.core.settings import (
     TextureSettings,
     TrainingSettings,
 )
-from tests.core.dataset.model_writers import ImageRecord, Model, write_text
+from tests.core.readers.model_writers import ImageRecord, Model, write_text
 from tests.poses import look_at_pose
 from tests.proofs import first_then_proofs
 from tests.synthetic import trace

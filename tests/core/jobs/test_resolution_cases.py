@@ -20,8 +20,7 @@ from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.parts import runner as part_runner
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-
-from .finished_sphere import write_cube, write_finished_sphere
+from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
 
 BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"
 

@@ -55,7 +55,7 @@ def lattice(bars: int = 3, edge: float = 0.12) -> Mesh:
     """A grid of square bars in a plane: genus ``bars**2``, made of unit cells."""
     size = 2 * bars + 1
     cells = [(x, y, 0) for x in range(size) for y in range(size) if x % 2 == 0 or y % 2 == 0]
-    from tests.core.meshing.cleanup.test_repair import cubes
+    from tests.core.meshing.test_repair import cubes
 
     vertices, faces = cubes(*cells)
     mesh = trimesh.Trimesh(vertices, faces, process=False)

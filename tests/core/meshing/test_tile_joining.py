@@ -29,8 +29,7 @@ from gaussian_wrapping_addon.core.meshing.tiles.tile import BorderFaces, tile_fa
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
-
-from .meshing_scenes import (
+from tests.core.meshing.meshing_scenes import (
     Distance,
     ShapeField,
     assert_closed_manifold,
@@ -40,8 +39,8 @@ from .meshing_scenes import (
     sphere,
     torus,
 )
-from .test_tiles import SHAPES, points_on_sheet
-from .tiled_meshing import LabelledTiles, labelled_tiles
+from tests.core.meshing.test_tiles import SHAPES, points_on_sheet
+from tests.core.meshing.tiled_meshing import LabelledTiles, labelled_tiles
 
 SIGMA = 0.02
 ALL_PARTS = MeshingSettings(points=1, min_component_share=0.0)

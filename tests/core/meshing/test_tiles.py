@@ -36,9 +36,7 @@ from gaussian_wrapping_addon.core.meshing.tiles.tile import (
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.shapes import Region, Tiling
 from gaussian_wrapping_addon.core.settings import MeshingSettings
-from tests.proofs import first_then_proofs
-
-from .meshing_scenes import (
+from tests.core.meshing.meshing_scenes import (
     Distance,
     ShapeField,
     assert_closed_manifold,
@@ -49,7 +47,8 @@ from .meshing_scenes import (
     sphere,
     torus,
 )
-from .tiled_meshing import LabelledTiles, mesh_in_tiles
+from tests.core.meshing.tiled_meshing import LabelledTiles, mesh_in_tiles
+from tests.proofs import first_then_proofs
 
 SIGMA = 0.02
 PLATE = rounded_box((1.0, 0.9, 0.02), 0.02)

@@ -19,8 +19,7 @@ from gaussian_wrapping_addon.core.render.reference import render_reference
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
-
-from .first_principles import IMAGES, TRAINED, FirstPrinciples, Truth
+from tests.core.render.first_principles import IMAGES, TRAINED, FirstPrinciples, Truth
 
 BLENDED = IMAGES[:4]
 Renderer = Callable[[OrientedGaussians, Camera, RenderOptions], Render]

@@ -10,10 +10,16 @@ import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.scene.camera import Camera
-
-from .comparisons import narrowed
-from .first_principles import Truth
-from .scenes import coloured, front_camera, isotropic, look_at, one_gaussian, random_gaussians
+from tests.core.render.comparisons import narrowed
+from tests.core.render.first_principles import Truth
+from tests.core.render.scenes import (
+    coloured,
+    front_camera,
+    isotropic,
+    look_at,
+    one_gaussian,
+    random_gaussians,
+)
 
 
 def joined(*parts: OrientedGaussians) -> OrientedGaussians:

@@ -14,8 +14,7 @@ from gaussian_wrapping_addon.core.render.projection import (
 )
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
-
-from .scenes import isotropic, look_at
+from tests.core.render.scenes import isotropic, look_at
 
 CAMERA = look_at((2.0, 0.6, 0.9))
 OPTIONS = RenderOptions(threads=1)

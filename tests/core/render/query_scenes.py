@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.scene.camera import Camera
-
-from .scenes import look_at, random_gaussians
+from tests.core.render.scenes import look_at, random_gaussians
 
 SHAPES = ("means", "log_scales", "quats", "opacity_logits")
 EYE = (2.2, 1.0, 0.8)

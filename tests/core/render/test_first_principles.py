@@ -21,10 +21,9 @@ from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.reference import reference_projection, render_reference
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
-
-from .comparisons import gradients_of, images_of, random_weights, relative_l2
-from .first_principles import IMAGES, TRAINED, FirstPrinciples, Truth
-from .scenes import front_camera, look_at, one_gaussian, random_gaussians
+from tests.core.render.comparisons import gradients_of, images_of, random_weights, relative_l2
+from tests.core.render.first_principles import IMAGES, TRAINED, FirstPrinciples, Truth
+from tests.core.render.scenes import front_camera, look_at, one_gaussian, random_gaussians
 
 BACKGROUND = (0.3, 0.1, 0.2)
 

@@ -21,8 +21,7 @@ from gaussian_wrapping_addon.core.render.reference import reference_projection
 from gaussian_wrapping_addon.core.render.types import ImageGradients, RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.scene.camera import Camera
-
-from .scenes import look_at, random_gaussians
+from tests.core.render.scenes import look_at, random_gaussians
 
 OPTIONS = RenderOptions(near_z=0.0, threads=1)
 # At the origin, along +z.

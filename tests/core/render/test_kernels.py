@@ -15,10 +15,9 @@ from gaussian_wrapping_addon.core.render.reference import reference_projection, 
 from gaussian_wrapping_addon.core.render.render import project_view, render
 from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
-
-from .comparisons import leaves, relative_l2
-from .first_principles import IMAGES, TRAINED
-from .scenes import isotropic, look_at, random_gaussians
+from tests.core.render.comparisons import leaves, relative_l2
+from tests.core.render.first_principles import IMAGES, TRAINED
+from tests.core.render.scenes import isotropic, look_at, random_gaussians
 
 BACKGROUND = (0.2, 0.5, 0.1)
 

@@ -19,9 +19,8 @@ from gaussian_wrapping_addon.core.render.view_renderer import (
     ViewPass,
     ViewRenderer,
 )
-
-from .scenes import isotropic, look_at, random_gaussians
-from .test_views import assert_equal, image_gradients, run
+from tests.core.render.scenes import isotropic, look_at, random_gaussians
+from tests.core.render.test_views import assert_equal, image_gradients, run
 
 CAMERA = look_at((2.2, 1.0, 0.8), width=85, height=70, focal=80.0)
 INTERSECTION_ARRAYS = (

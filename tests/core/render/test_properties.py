@@ -15,11 +15,10 @@ from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
+from tests.core.render.comparisons import judge, leaves
+from tests.core.render.first_principles import IMAGES, TRAINED
+from tests.core.render.scenes import look_at, random_gaussians
 from tests.poses import look_at_pose
-
-from .comparisons import judge, leaves
-from .first_principles import IMAGES, TRAINED
-from .scenes import look_at, random_gaussians
 
 
 def steady(examples: int) -> settings:

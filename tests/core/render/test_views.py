@@ -21,8 +21,7 @@ from gaussian_wrapping_addon.core.render.types import (
 )
 from gaussian_wrapping_addon.core.render.view_renderer import ViewPass, ViewRenderer
 from gaussian_wrapping_addon.core.scene.camera import Camera
-
-from .scenes import isotropic, look_at, random_gaussians
+from tests.core.render.scenes import isotropic, look_at, random_gaussians
 
 IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")
 CAMERA = look_at((2.2, 1.0, 0.8), width=41, height=35)

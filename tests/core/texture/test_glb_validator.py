@@ -22,7 +22,7 @@ from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.scene.camera import Similarity
 from gaussian_wrapping_addon.core.texture.files import glb_bytes, write_textured
 from tests.core.texture.detail_scenes import bumpy_ball, flat_uvs
-from tests.core.texture.files.test_textured_files import UTM, cube
+from tests.core.texture.test_files import UTM, cube
 
 HERE = Path(__file__).parent
 PACKAGE = Path(

@@ -28,8 +28,8 @@ from gaussian_wrapping_addon.core.training.losses import (
     normal_losses,
     normals_from_depth,
 )
-from tests.core.imaging.test_view_metrics import naive_ssim
 from tests.core.render.scenes import look_at
+from tests.core.test_image_metrics import naive_ssim
 
 # -- Losses against naive definitions, gradients against float64 central differences --------------
 

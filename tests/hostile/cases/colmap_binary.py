@@ -6,7 +6,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-from tests.core.dataset.model_writers import Model
+from tests.core.readers.model_writers import Model
 from tests.hostile.case import Case, Group, Needs, Variant, Way
 from tests.hostile.inputs import (
     changed,
@@ -22,7 +22,7 @@ from tests.hostile.inputs import (
 )
 
 _WANTED = "Give a folder of photos"
-_READER = "tests/core/dataset/readers/test_colmap_reader.py"
+_READER = "tests/core/readers/test_colmap.py"
 _AGAIN = "Export the model again, or solve the cameras from the photos"
 
 _NO_SET = Case(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gaussian_wrapping_addon.core.scene.camera import quaternion_from_rotation
-from tests.core.dataset.model_writers import Model, ring_model, write_binary, write_text
+from tests.core.readers.model_writers import Model, ring_model, write_binary, write_text
 from tests.hostile.case import Build, Case, Group, Variant, Way
 from tests.hostile.inputs import (
     COUNT,
@@ -24,7 +24,7 @@ from tests.hostile.inputs import (
 )
 from tests.poses import look_at_pose
 
-_READER = "tests/core/dataset/readers/test_colmap_reader.py"
+_READER = "tests/core/readers/test_colmap.py"
 _SPARSE = "set/sparse/0"
 _GOOD = "6 photos: 6 of 64 x 48"
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from tests.core.dataset.model_writers import HEIGHT, WIDTH, Model
+from tests.core.readers.model_writers import HEIGHT, WIDTH, Model
 from tests.hostile.case import Case, Group, Needs, Variant, Way
 from tests.hostile.inputs import colmap, link, renamed, steps
 
 _GOOD = [60.0, 60.0, 32.0, 24.0]
-_READER = "tests/core/dataset/readers/test_colmap_reader.py"
+_READER = "tests/core/readers/test_colmap.py"
 _SOLVE = "Solve the cameras again"
 
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from tests.core.dataset.model_writers import Model, ring_model, write_photos
-from tests.core.dataset.photos.test_image_formats import EPS
+from tests.core.photos.test_formats import EPS
+from tests.core.readers.model_writers import Model, ring_model, write_photos
 from tests.hostile.case import Build, Case, Group, Needs, Variant, Way
 from tests.hostile.inputs import (
     colmap,
@@ -22,8 +22,8 @@ from tests.hostile.inputs import (
 )
 from tests.hostile.jobs import begun, status
 
-_PHOTOS = "tests/core/dataset/photos/test_image_formats.py"
-_HOSTILE_PHOTOS = "tests/core/dataset/loading/test_hostile_photos.py"
+_PHOTOS = "tests/core/photos/test_formats.py"
+_HOSTILE_PHOTOS = "tests/core/loading/test_hostile_folders.py"
 
 
 def _eps(path: Path) -> None:
@@ -183,7 +183,7 @@ _LONG_NAMES = Case(
     (f"{_HOSTILE_PHOTOS}::test_an_over_long_name_is_left_out_and_named",),
 )
 
-_LINKED = "tests/core/dataset/loading/test_linked_folders.py"
+_LINKED = "tests/core/loading/test_hostile_folders.py"
 
 
 def _elsewhere(build: Build) -> Build:
@@ -281,7 +281,7 @@ _AGREES = Case(
     "What loading refuses, check refuses",
     (),
     (
-        "tests/core/dataset/loading/test_check.py::test_the_check_refuses_what_loading_refuses",
+        "tests/core/loading/test_hostile_folders.py::test_the_check_refuses_what_loading_refuses",
         "tests/hostile/test_check_agrees.py::test_what_check_passes_is_loaded",
     ),
 )

@@ -208,8 +208,8 @@ _KILLED = Case(
         f"{_WORKER}::test_a_killed_worker_is_told_what_its_stage_can_do_with_less",
         "tests/blender/test_jobs.py::test_a_worker_killed_from_outside_is_lost_and_can_be_resumed",
         "tests/blender/test_jobs.py::test_failures_are_shown_with_the_next_step",
-        "tests/core/processes/test_helper_process.py::test_a_crash_names_the_signal",
-        "tests/core/processes/test_helper_process.py::test_the_memory_limit_holds",
+        "tests/core/worker/test_helper_process.py::test_a_crash_names_the_signal",
+        "tests/core/worker/test_helper_process.py::test_the_memory_limit_holds",
     ),
 )
 _CANCELLED = Case(
@@ -246,17 +246,14 @@ _ORPHANS = Case(
     (),
     (
         f"{_WORKER}::test_a_worker_ends_with_its_caller_even_if_that_dies_first",
-        (
-            "tests/core/processes/test_process_identity.py::"
-            "test_a_caller_that_was_dead_at_the_start_has_ended"
-        ),
+        ("tests/core/worker/test_processes.py::test_a_caller_that_was_dead_at_the_start_has_ended"),
     ),
 )
 _SIGNALS = Case(
     57,
     "SIGTERM after pycolmap was imported",
     (),
-    ("tests/core/processes/test_signal_handlers.py::test_the_handlers_of_a_worker_stay",),
+    ("tests/core/worker/test_signal_handlers.py::test_the_handlers_of_a_worker_stay",),
 )
 _LOSERS = Case(
     62,
@@ -270,7 +267,7 @@ _CUT_TRACEBACKS = Case(
     (),
     (
         (
-            "tests/core/processes/test_helper_process.py::"
+            "tests/core/worker/test_helper_process.py::"
             "test_an_exception_brings_its_last_words_and_the_log_the_others"
         ),
     ),

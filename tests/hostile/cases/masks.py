@@ -11,7 +11,7 @@ from tests.hostile.case import Build, Case, Group, Needs, Variant
 from tests.hostile.inputs import colmap, file, json_file, link, region, steps
 
 _WORDS = ("wrap", "set", "--set", "mask_model=model.onnx", "--out", "out", "--no-blend")
-_STAGE = "tests/core/jobs/masking/test_masks_stage.py"
+_STAGE = "tests/core/jobs/stages/test_masks_stage.py"
 _MODEL = "tests/core/masks/test_segmentation_model.py"
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.core.dataset.photos.test_image_formats import EPS, glb_with_texture
+from tests.core.photos.test_formats import EPS, glb_with_texture
 from tests.hostile.case import Build, Case, Group, Needs, Variant
 from tests.hostile.inputs import changed, file, folder_of, link, pipe, steps
 from tests.hostile.jobs import sphere, trained, with_result

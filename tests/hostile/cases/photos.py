@@ -26,7 +26,7 @@ from tests.hostile.inputs import (
 )
 
 _IMAGE = "set/images/p00.png"
-_PHOTOS = "tests/core/dataset/photos/test_image_formats.py"
+_PHOTOS = "tests/core/photos/test_formats.py"
 _HARD = "tests/core/jobs/test_hard_photos.py"
 _EXPORT = "Export it again as JPEG or PNG, or remove it"
 _DROPPED = (

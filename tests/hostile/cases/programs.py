@@ -7,9 +7,9 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.core.dataset.model_writers import HEIGHT, WIDTH, ring_poses
-from tests.core.dataset.readers.programs import writers
-from tests.core.dataset.readers.programs.writers import Shots
+from tests.core.readers import writers
+from tests.core.readers.model_writers import HEIGHT, WIDTH, ring_poses
+from tests.core.readers.writers import Shots
 from tests.hostile.case import Build, Variant
 from tests.hostile.inputs import COUNT, changed, file, remove, steps, transforms
 

@@ -13,7 +13,7 @@ from tests.hostile.case import Build, Case, Group, Needs, Variant, Way
 from tests.hostile.inputs import file, link, pipe
 
 _EXPECTED = "A 3D Gaussian splat has x, y, z"
-_FOREIGN = "tests/core/gaussians/test_foreign_splat.py"
+_FOREIGN = "tests/core/gaussians/test_files.py"
 _WORDS = ("check", "set.ply")
 Columns = dict[str, np.ndarray]
 
@@ -276,7 +276,7 @@ _OTHER = Case(
             needs=Needs.POSIX,
         ),
     ),
-    ("tests/core/jobs/store/test_hostile_job_files.py::test_devices_and_pipes_are_no_splats",),
+    ("tests/core/jobs/store/test_hostile_folders.py::test_devices_and_pipes_are_no_splats",),
 )
 
 _FAR = Case(
@@ -288,7 +288,7 @@ _FAR = Case(
     ),
     (
         (
-            "tests/core/dataset/loading/test_splat_cameras.py::"
+            "tests/core/loading/test_splat_cameras.py::"
             "test_one_gaussian_as_far_away_as_numbers_go_changes_nothing"
         ),
     ),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report holds every measured figure and every warning, and nothing that was not measured."""
+"""The report holds what was measured, warned of and decided, and nothing else."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from typing import Any
 import pytest
 
 from gaussian_wrapping_addon.core.evaluation.report.figures import (
+    FEW_HELD_OUT,
     NOT_MEASURED,
+    TEXELLESS_SHARE,
     bar,
     collect_warnings,
     duration,
@@ -24,9 +26,16 @@ from gaussian_wrapping_addon.core.evaluation.report.figures import (
     percent,
     table,
 )
-from gaussian_wrapping_addon.core.evaluation.report.report import headline, report_markdown
+from gaussian_wrapping_addon.core.evaluation.report.report import (
+    estimate_lines,
+    headline,
+    report_markdown,
+    selection_lines,
+)
 from gaussian_wrapping_addon.core.files import finite_json
-from gaussian_wrapping_addon.core.settings import JobSettings, to_json
+from gaussian_wrapping_addon.core.progress import ReportWarning, read_warnings
+from gaussian_wrapping_addon.core.settings import JobSettings, TrainingSettings, to_json
+from gaussian_wrapping_addon.core.training.model_selection import Decision, ModelSelection, decide
 from tests.core.evaluation.report.report_examples import (
     PICTURES,
     REGION,
@@ -38,6 +47,7 @@ from tests.core.evaluation.report.report_examples import (
 )
 
 LINK = re.compile(r"!\[[^\n]*?\]\(([^)\s]+)\)")
+
 
 WRONG_NUMBER = re.compile(r"\b(nan|inf|infinity|none)\b", re.IGNORECASE)
 
@@ -402,3 +412,231 @@ def test_metres_and_how_well_they_are_known_are_said(tmp_path: Path) -> None:
     note = {"kind": "photos", "georeference_note": "too little"}
     text = report_markdown({"cameras": {"facts": note}}, tmp_path)
     assert row(text, "GPS is not used") == "too little"
+
+
+EXPECTED = {"seconds_low": 60.0, "seconds_high": 120.0, "memory_bytes": 2**30}
+
+
+@pytest.mark.parametrize(
+    ("took", "words"), [(59.0, "below it"), (60.0, "within it"), (121.0, "above it")]
+)
+def test_the_comparison_says_where_the_time_lay(took: float, words: str) -> None:
+    text = " ".join(estimate_lines({"estimate": EXPECTED, "seconds_training": took}))
+    assert words in text
+
+
+@pytest.mark.parametrize("training", [{}, {"seconds_training": 5.0}, {"estimate": EXPECTED}])
+def test_without_both_figures_nothing_is_said(training: dict) -> None:
+    assert estimate_lines(training) == []
+
+
+def test_the_report_says_where_the_photos_were() -> None:
+    photos = {"photos": 400, "all_bytes": 6 * 2**30, "budget_bytes": 3 * 2**30}
+    told = {"estimate": {**EXPECTED, "photos": photos}, "seconds_training": 70.0}
+    text = " ".join(estimate_lines(told))
+    assert text.endswith("read on demand: 6.00 GiB decoded, 3.00 GiB of memory for them.")
+    photos["all_bytes"] = 2**29
+    assert " ".join(estimate_lines(told)).endswith("All photos fitted into memory (512 MiB).")
+    photos["all_bytes"] = "much"
+    assert " ".join(estimate_lines(told)).endswith("within it.")
+
+
+def test_every_warning_is_listed_with_stage_and_next_step(tmp_path: Path) -> None:
+    report, text = write(tmp_path)
+    warnings = section(text, "## Warnings")
+    entries = [line for line in warnings.splitlines() if line.startswith("- ")]
+    expected = [
+        ("cameras", "2 of 16 photos could not be placed"),
+        ("cameras", "reprojection error of the cameras is 3.50 px"),
+        ("training", "numbers were not finite"),
+        ("training", "Only 2 photos held out: too few for a reliable mean"),
+        ("training", "more than twice the error"),
+        (f"mesh {REGION}", "The edge length was raised to 0.02."),
+        (f"mesh {REGION}", "not closed (4 open edges)"),
+        (f"mesh {REGION}", "do not lie on the reconstructed surface"),
+        (f"mesh {REGION}", "3 faces with zero area"),
+        (f"texture {REGION}", "the rest is filled in"),
+        (f"texture {REGION}", "the unwrapper crashed"),
+        (f"texture {REGION}", "5 faces smaller than a texel"),
+        (f"texture {REGION}", "2 texels belong to two faces"),
+    ]
+    assert len(entries) == len(expected)
+    for entry, (stage, words) in zip(entries, expected, strict=True):
+        assert entry.startswith(f"- **{escaped(stage)}**: ")
+        assert escaped(words) in entry
+        assert ("*Next step:*" in entry) == ("edge length was raised" not in entry)
+    assert [w["stage"] for w in report["warnings"]] == [stage for stage, _ in expected]
+    summary = section(text, "## Summary")
+    assert all(escaped(w["text"]) in summary for w in report["warnings"])
+    for warning, line in zip(report["warnings"], headline(report)[3:], strict=True):
+        assert line == f"warning ({warning['stage']}): {warning['text']}"
+
+
+def test_texts_of_version_0_1_0_are_read_with_their_hints(tmp_path: Path) -> None:
+    """``report.json`` and ``done.json`` held plain texts then; old stages are used again."""
+    summary, region = full_summary(), full_region()
+    whole = write(tmp_path, copy.deepcopy(summary), {REGION: copy.deepcopy(region)})[0]
+    for place in (summary["cameras"], summary["training"]):
+        place["warnings"] = [warning["text"] for warning in place["warnings"]]
+    region["provenance"]["notes"] = [n["text"] for n in region["provenance"]["notes"]]
+    report, text = write(tmp_path, summary, {REGION: region})
+    stated = "2 of 16 photos could not be placed and are not used: a|b.jpg, c.jpg."
+    hint = "Take more photos with more overlap there, or remove blurred ones."
+    assert report["warnings"][0] == {"stage": "cameras", "code": "", "text": stated, "hint": hint}
+    assert [w["text"] for w in report["warnings"]] == [w["text"] for w in whole["warnings"]]
+    line = next(x for x in text.splitlines() if escaped(stated) in x and x.startswith("- "))
+    assert escaped(hint) in line
+
+
+def test_warnings_of_stages_are_written_as_they_were_made(tmp_path: Path) -> None:
+    report, _ = write(tmp_path)
+    made = report["cameras"]["warnings"][0]
+    assert made == {
+        "code": "photos-not-placed",
+        "text": "2 of 16 photos could not be placed and are not used: a|b.jpg, c.jpg.",
+        "hint": "Take more photos with more overlap there.",
+    }
+    assert report["warnings"][0] == {"stage": "cameras", **made}
+    assert all(warning["code"] for warning in report["warnings"])
+
+
+@pytest.mark.parametrize(
+    "values",
+    [None, "text", {"text": "a"}, [None, 3, [], {}, {"text": 3}, {"code": "a", "hint": "b"}]],
+)
+def test_what_is_no_warning_is_passed_over(values: Any) -> None:
+    assert read_warnings(values) == ()
+    assert read_warnings([{"text": "a", "code": 3, "hint": None}]) == (ReportWarning("", "a"),)
+
+
+def good() -> dict[str, Any]:
+    """A report without anything to warn about."""
+    report = {**full_summary(), "regions": {REGION: full_region()}}
+    report["cameras"]["warnings"] = report["training"]["warnings"] = []
+    report["cameras"]["facts"]["mean_reprojection_error_px"] = 0.5
+    photo = {"name": "x.jpg", "psnr": 29.0, "ssim": 0.9}
+    report["training"].update(held_out=[photo] * FEW_HELD_OUT, held_out_psnr=29.0)
+    region = report["regions"][REGION]
+    region["statistics"].update(closed=True, boundary_edges=0)
+    region["provenance"].update(notes=[], degenerate_faces_left=0, level_error_p99=0.01)
+    region["texture"].update(
+        coverage=0.9, unwrap_fallback_reason="", texels_overlapping=0, faces_without_texel=5,
+        area_without_texel_share=0.9 * TEXELLESS_SHARE,
+    )  # fmt: skip
+    return report
+
+
+def test_nothing_is_judged_where_nothing_is_wrong(tmp_path: Path) -> None:
+    assert collect_warnings(good()) == []
+    assert "No stage reported a warning" in section(
+        report_markdown(good(), tmp_path), "## Warnings"
+    )
+
+
+def test_a_boundary_that_is_open_by_request_is_no_defect(tmp_path: Path) -> None:
+    report = good()
+    region = report["regions"][REGION]
+    region["statistics"].update(closed=False, boundary_edges=4)
+    region["provenance"].update(boundary="open")
+    assert collect_warnings(report) == []
+    text = report_markdown(report, tmp_path)
+    assert "open by request at the region boundary" in text
+    assert "not closed" not in text
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        (("cameras", "facts", "mean_reprojection_error_px"), 2.01, "reprojection error"),
+        (("training", "held_out_psnr"), 23.9, "twice the error"),
+        (("training", "held_out"), [], "No photo was held out"),
+        (("regions", REGION, "texture", "coverage"), 0.499, "filled in"),
+        (("regions", REGION, "texture", "coverage"), 0.0, "plain grey"),
+        (
+            ("regions", REGION, "provenance", "level_error_p99"),
+            0.251,
+            "not lie on the reconstructed surface",
+        ),
+    ],
+)
+def test_each_judgement_stands_alone(path: tuple[str, ...], value: Any, words: str) -> None:
+    report = good()
+    place = report
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    (warning,) = collect_warnings(report)
+    assert words in warning.text
+    assert warning.hint
+    assert warning.code
+
+
+NAMES = ("exposure", "multi_view", "growth", "full_size", "dense_start", "refine_poses")
+
+
+def training() -> dict[str, Any]:
+    model_selection = ModelSelection()
+    for name in NAMES:
+        model_selection = model_selection.with_decision(
+            decide(name, "auto", True, f"Seen in {name} a|b.")
+        )
+    model_selection = model_selection.with_decision(
+        decide("exposure", "off", True, "Photos differ by 20 %.")
+    )
+    return {"decisions": model_selection.to_json()}
+
+
+def test_every_decision_is_listed_with_its_evidence_and_setting() -> None:
+    text = "\n".join(selection_lines(training()))
+    for name in NAMES:
+        if name != "exposure":
+            assert f"Seen in {name.replace('_', chr(92) + '_')} a\\|b." in text
+        assert f"setting `{name}`" in text
+        assert name in TrainingSettings.__dataclass_fields__
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    assert len(rows) == 2 + len(NAMES)
+    assert text.count("*To change this:*") == len(NAMES)
+
+
+def test_what_a_person_decided_is_told_apart() -> None:
+    text = "\n".join(selection_lines(training()))
+    assert "| off | you (off) |" in text
+    assert text.count("| the photos |") == len(NAMES) - 1
+    assert "Set by you. Evidence from the photos: Photos differ by 20 %." in text
+    assert text.count('"auto" chooses from the photos') == 1
+
+
+def test_where_nothing_was_measured_the_photos_say_nothing() -> None:
+    evidence = "The settings decide."
+    decision = Decision("growth", "off", "off", evidence, measured=False)
+    stored = Decision.from_json(json.loads(json.dumps(decision.to_json())))
+    assert stored == decision
+    text = "\n".join(selection_lines({"decisions": [stored.to_json()]}))
+    assert f"{evidence}\n" in text
+    assert "Set by you" not in text
+    values = decision.to_json()
+    del values["measured"]  # as version 0.1.0 wrote it
+    assert Decision.from_json(values).measured
+    text = "\n".join(selection_lines({"decisions": [values]}))
+    assert f"Set by you. Evidence from the photos: {evidence}" in text
+
+
+def test_the_section_stands_between_training_and_regions() -> None:
+    summary = full_summary()
+    summary["training"] |= training()
+    text = report_markdown(summary, Path("nowhere"))
+    order = [text.index(f"\n## {title}") for title in ("Training", "Model selection", "Warnings")]
+    assert order == sorted(order)
+    assert "## Model selection" not in report_markdown(full_summary(), Path("nowhere"))
+
+
+@pytest.mark.parametrize("decisions", [None, 3, "x", [], [None, 3, {}, {"chosen": "on"}]])
+def test_nothing_is_written_where_nothing_was_decided(decisions: Any) -> None:
+    assert selection_lines({"decisions": decisions}) == []
+
+
+def test_an_unknown_decision_is_shown_as_it_is() -> None:
+    text = "\n".join(selection_lines({"decisions": [{"name": "new_one", "chosen": "x`y"}]}))
+    assert "new\\_one" in text
+    assert "x\\`y" in text
+    assert "No evidence was recorded" in text

@@ -53,7 +53,7 @@ from gaussian_wrapping_addon.core.settings import JobSettings
 from gaussian_wrapping_addon.core.texture.files import write_textured
 from tests.core.jobs.finished_sphere import write_cube
 from tests.core.render.scenes import front_camera, random_gaussians
-from tests.core.texture.files.test_textured_files import UTM, cube
+from tests.core.texture.test_files import UTM, cube
 from tests.core.texture.test_glb_validator import with_maps
 
 COS, SIN = np.cos(0.4), np.sin(0.4)

@@ -23,7 +23,7 @@ from gaussian_wrapping_addon.core.jobs.parts.graph import (
 )
 from gaussian_wrapping_addon.core.jobs.parts.runner import Outcome, PartError, Walk
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from tests.core.jobs.parts.test_planning import job_of
+from tests.core.jobs.parts.test_graph import job_of
 
 
 class Told:

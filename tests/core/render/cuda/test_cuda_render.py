@@ -14,9 +14,7 @@ from gaussian_wrapping_addon.core.render.cuda.device_renderer import render_cuda
 from gaussian_wrapping_addon.core.render.cuda.kernels import cuda_available
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
-
-from ..scenes import isotropic, look_at, random_gaussians
-from .comparison import (
+from tests.core.render.cuda.comparison import (
     IMAGES,
     STATISTICS,
     Outcome,
@@ -29,6 +27,7 @@ from .comparison import (
     random_weights,
     relative_l2,
 )
+from tests.core.render.scenes import isotropic, look_at, random_gaussians
 
 CAMERA = look_at((2.2, 1.0, 0.8), width=33, height=17)
 

@@ -27,14 +27,13 @@ from gaussian_wrapping_addon.core.render.cuda.kernels import (
 from gaussian_wrapping_addon.core.render.projection import RawArrays, RawGradients, project_backward
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
+from tests.core.render.cuda.comparison import relative_l2
+from tests.core.render.cuda.emulation import EmulatedKernels, build_emulator
+from tests.core.render.depth_scenes import joined
 from tests.core.render.query_scenes import SCENES, SHAPES, Oracle, assert_depths, scene
 from tests.core.render.query_scenes import random_positions as positions_of
 from tests.core.render.scenes import isotropic, look_at, random_gaussians
-
-from ..depth_scenes import joined
-from ..test_properties import ABSURD, one_wild
-from .comparison import relative_l2
-from .emulation import EmulatedKernels, build_emulator
+from tests.core.render.test_properties import ABSURD, one_wild
 
 FRONT = look_at((0.0, -4.0, 0.0)).cam_from_world
 COLUMNS = [*range(13), 22]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""CUDA kernels, emulated on the host, equal definition and CPU kernels on generic scenes."""
+"""CUDA kernels, emulated on the host, on generic, difficult and extreme scenes."""
 
 from __future__ import annotations
 
@@ -9,28 +9,48 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gaussian_wrapping_addon.core.errors import ResourceError
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.cuda.device_view import KEPT_BYTES, PASSING_BYTES
-from gaussian_wrapping_addon.core.render.reference import render_reference
+from gaussian_wrapping_addon.core.render.reference import reference_projection, render_reference
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
-
-from ..scenes import look_at, random_gaussians
-from .comparison import (
+from gaussian_wrapping_addon.core.scene.camera import Camera
+from tests.core.render.cuda.comparison import (
+    IMAGES,
+    STATISTICS,
     Outcome,
     assert_bitwise_equal,
     assert_same_gradients,
     assert_same_images,
     depth_weights,
     emulated,
+    leaves,
     outcome,
     random_weights,
     relative_l2,
 )
-from .emulation import EmulatedKernels
+from tests.core.render.cuda.emulation import EmulatedKernels
+from tests.core.render.depth_scenes import SCENES as HARD_SCENES
+from tests.core.render.depth_scenes import assert_depth, doubled, joined
+from tests.core.render.depth_scenes import scene as hard_scene
+from tests.core.render.first_principles import FirstPrinciples
+from tests.core.render.scenes import isotropic, look_at, random_gaussians
+from tests.core.render.test_properties import (
+    ABSURD,
+    PLAIN,
+    cameras,
+    one_wild,
+    steady,
+    wild_gaussians,
+)
 
 BACKGROUND = (0.2, 0.5, 0.1)
+
+
 # Several tiles, odd sizes, exactly one tile, less than one tile.
 SCENES = [(60, 40, 30), (150, 33, 17), (40, 16, 16), (25, 7, 5)]
 
@@ -219,3 +239,305 @@ def test_bands_change_only_the_order_of_sums(emulator_library: Path) -> None:
 def pair_count(found: Outcome) -> int:
     """Return how many pairs of Gaussian and tile the view has."""
     return len(found.render.color.grad_fn.view.band_lists[0].gaussian_ids)  # type: ignore[union-attr]
+
+
+FRONT = look_at((0.0, -3.0, 0.0), width=21, height=19, focal=40.0)
+
+
+def uneven(
+    means: list[tuple[float, float, float]], sigmas: list[float], opacities: list[float]
+) -> OrientedGaussians:
+    """Return turned ellipsoids: round ones have no gradient on their rotation to compare."""
+    gaussians = isotropic(means, sigmas, opacities, torch.float32)
+    return gaussians.replaced(
+        log_scales=gaussians.log_scales + torch.tensor([0.3, 0.0, -0.3]),
+        quats=torch.tensor([[0.9, 0.1, -0.2, 0.3]]).repeat(len(means), 1),
+    )
+
+
+def compared(
+    library: Path,
+    gaussians: OrientedGaussians,
+    camera: Camera = FRONT,
+    options: RenderOptions | None = None,
+    *,
+    tolerance: float = 1e-5,
+) -> Outcome:
+    """Compare images with the CPU kernels' and all with the definition in float64.
+
+    Return what was rendered; all of it is finite.
+    """
+    options = options or RenderOptions(background=BACKGROUND)
+    well = depth_weights(EmulatedKernels(library), gaussians, camera, options)
+    weights = random_weights(camera, options, well)
+    found = outcome(emulated(EmulatedKernels(library)), gaussians, camera, options, weights=weights)
+    assert all(torch.isfinite(value).all() for value in found.values())
+    assert_same_images(found, outcome(render, gaussians, camera, options, weights=weights))
+    exact = outcome(
+        render_reference, gaussians, camera, dataclasses.replace(options, statistics=False),
+        weights=weights, dtype=torch.float64,
+    )  # fmt: skip
+    assert_same_images(found, exact)
+    assert_same_gradients(found, exact, tolerance)
+    return found
+
+
+def test_saturated_opacity(emulator_library: Path) -> None:
+    gaussians = uneven([(0.0, 0.0, 0.0), (0.1, 0.6, 0.0)], [0.4, 0.5], [0.5, 0.5])
+    for logits in ((20.0, 20.0), (-20.0, 20.0), (100.0, -100.0)):
+        found = compared(emulator_library, gaussians.replaced(opacity_logits=torch.tensor(logits)))
+        assert float(found.images["alpha"].max()) > 0.98
+
+
+def test_nothing_visible(emulator_library: Path) -> None:
+    away = uneven([(0.0, -9.0, 0.0)], [0.1], [0.9])
+    for gaussians in (away, away.select(torch.zeros(1, dtype=torch.bool))):
+        found = compared(
+            emulator_library,
+            gaussians,
+            options=RenderOptions(background=BACKGROUND, statistics=True),
+        )
+        color = found.images["color"]
+        assert torch.equal(color, torch.tensor(BACKGROUND).expand_as(color))
+        assert not found.images["alpha"].any()
+        assert not found.images["depth"].any()
+        assert not any(gradient.any() for gradient in found.gradients.values())
+        assert found.render.statistics is not None
+        assert found.render.statistics.strongest is not None
+        assert (found.render.statistics.strongest == -1).all()
+
+
+def test_identical_depths_keep_the_order_of_indices(emulator_library: Path) -> None:
+    gaussians = uneven([(0.0, 0.0, 0.0)] * 6, [0.3] * 6, [0.5] * 6)
+    sh = torch.zeros((6, 1, 3))
+    sh[:, 0, 0] = torch.linspace(-1.0, 1.5, 6)
+    found = compared(emulator_library, gaussians.replaced(sh=sh))
+    swapped = compared(emulator_library, gaussians.replaced(sh=sh.flip(0)))
+    assert (found.images["color"] - swapped.images["color"]).abs().max() > 0.1
+
+
+def test_transmittance_on_a_plateau(emulator_library: Path) -> None:
+    # Behind the first sheet exactly half of the light is left, up to the second far behind it.
+    gaussians = isotropic(
+        [(0.0, 0.0, 0.0), (0.0, 2.0, 0.0)], [0.05, 0.05], [0.5, 0.9], torch.float32
+    )
+    gaussians = gaussians.replaced(
+        log_scales=torch.tensor([[2.0, -3.0, 2.0]] * 2), opacity_logits=torch.tensor([0.0, 3.0])
+    )
+    camera = look_at((0.0, -3.0, 0.0), width=20, height=17, focal=40.0)
+    options = RenderOptions()
+    with torch.no_grad():
+        found = emulated(EmulatedKernels(emulator_library))(gaussians, camera, options)
+        exact = render_reference(gaussians, camera, options)
+    assert torch.equal(found.depth > 0, exact.depth > 0)
+    assert (found.depth > 0).all()
+    # Any depth between the sheets has T within rounding of 0.5; none outside of them has.
+    assert float(found.depth.min()) > 2.9
+    assert float(found.depth.max()) < 5.0 + 3.0 * float(np.exp(-3.0))
+
+
+def test_final_transmittance_near_the_rule(emulator_library: Path) -> None:
+    # One sheet after the other: T behind all of them is below, between and above 0.45 and 0.5.
+    for opacities, valid in (
+        ([0.3, 0.2], False),  # 0.56
+        ([0.3, 0.32], False),  # 0.476
+        ([0.3, 0.4], True),  # 0.42
+        ([0.56], True),
+        ([0.54], False),
+    ):
+        count = len(opacities)
+        gaussians = uneven([(0.0, 0.4 * i, 0.0) for i in range(count)], [0.05] * count, opacities)
+        gaussians = gaussians.replaced(log_scales=torch.tensor([[4.0, -3.0, 4.0]] * count))
+        found = compared(emulator_library, gaussians)
+        assert bool((found.images["depth"] > 0).all()) == valid
+        assert bool((found.images["depth"] > 0).any()) == valid
+
+
+def test_opaque_layers_end_the_walk(emulator_library: Path) -> None:
+    # Far more pairs than a batch, and all but the first few behind an opaque wall.
+    count = 150
+    means = [(0.0, 0.01 * i, 0.0) for i in range(count)]
+    gaussians = uneven(means, [0.6] * count, [0.9] * count)
+    gaussians = gaussians.replaced(log_scales=torch.tensor([[3.0, -2.0, 2.5]] * count))
+    # Behind them the light that is left is a difference of nearly equal sums.
+    found = compared(
+        emulator_library,
+        gaussians,
+        options=RenderOptions(background=BACKGROUND, statistics=True),
+        tolerance=5e-5,
+    )
+    assert found.render.statistics is not None
+    assert (found.render.statistics.weight_sum[-60:] == 0.0).all()
+    assert not found.gradients["means"][-60:].any()
+
+
+def test_many_nearly_transparent_layers(emulator_library: Path) -> None:
+    count = 2000
+    positions = np.linspace(-0.5, 0.5, count)
+    gaussians = isotropic(
+        [(0.0, y, 0.0) for y in positions], [1.0] * count, [0.006] * count, torch.float32
+    )
+    camera = look_at((0.0, -3.0, 0.0), width=4, height=3, focal=60.0)
+    options = RenderOptions()
+    with torch.no_grad():
+        found = emulated(EmulatedKernels(emulator_library))(gaussians, camera, options)
+        exact = render_reference(
+            gaussians.replaced(**{k: v.double() for k, v in gaussians.tensors()}), camera, options
+        )
+    for name in IMAGES[:4]:
+        # 1500 factors of float32 each round by 6e-8.
+        assert (getattr(found, name) - getattr(exact, name)).abs().max() < 3e-5, name
+    assert (exact.depth > 0).all()
+    assert ((found.depth - exact.depth).abs() / exact.depth).max() < 1e-5
+
+
+def test_camera_inside_gaussians(emulator_library: Path) -> None:
+    gaussians = uneven(
+        [(0.0, -2.4, 0.0), (0.3, -1.0, 0.2), (0.0, 6.0, 0.0)], [1.5, 2.5, 30.0], [0.3, 0.6, 0.7]
+    )
+    compared(emulator_library, gaussians)
+    blocked = uneven([(0.0, -2.4, 0.0)] * 3, [2.0] * 3, [0.9] * 3)
+    found = compared(emulator_library, blocked, tolerance=1e-4)
+    assert float(found.images["alpha"].min()) > 0.9
+    assert not found.images["depth"].any()
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.02, 0.7, np.pi / 2])
+@pytest.mark.parametrize("scales", [(1e-3, 0.5, 0.5), (0.02, 1.0, 0.02)])
+def test_thin_discs_and_needles(
+    emulator_library: Path, scales: tuple[float, float, float], turn: float
+) -> None:
+    gaussians = isotropic([(0.05, 0.0, 0.02)], [1.0], [0.9], torch.float32)
+    gaussians = gaussians.replaced(
+        log_scales=torch.tensor([scales]).log(),
+        quats=torch.tensor([[np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)]]).float(),
+    )
+    # Seen edge-on, a disc is a step across a pixel, where rounding of the position counts.
+    compared(emulator_library, gaussians, tolerance=5e-5 if scales[0] == 1e-3 else 1e-5)
+
+
+def test_wild_parameters_stay_finite(emulator_library: Path) -> None:
+    random = np.random.default_rng(7)
+    count = 200
+    gaussians = random_gaussians(count, seed=7, dtype=torch.float32, spread=3.0)
+    quats = random.normal(size=(count, 4)) * 10.0 ** random.uniform(-10, 10, (count, 1))
+    quats[::10] = 0.0
+    orientation = random.normal(size=(count, 4)) * 30.0
+    orientation[::7, :3] = 0.0
+    log_scales = random.uniform(np.log(1e-5), np.log(20.0), (count, 3))
+    gaussians = gaussians.replaced(
+        log_scales=torch.tensor(log_scales).float(),
+        quats=torch.tensor(quats).float(),
+        opacity_logits=torch.tensor(random.uniform(-20, 20, count)).float(),
+        orientation=torch.tensor(orientation).float(),
+    )
+    options = RenderOptions(statistics=True)
+    for seed in range(2):
+        eye = random.normal(size=3) * (1.0 + seed)
+        camera = look_at((float(eye[0]), float(eye[1]), float(eye[2])), width=33, height=25)
+        found = outcome(
+            emulated(EmulatedKernels(emulator_library)), gaussians, camera, options,
+            weights=random_weights(camera, options),
+        )  # fmt: skip
+        assert all(torch.isfinite(value).all() for value in found.values())
+
+
+def test_values_that_are_not_finite_hide_the_gaussian(emulator_library: Path) -> None:
+    gaussians = random_gaussians(8, seed=1, dtype=torch.float32)
+    camera = look_at((2.2, 1.0, 0.8), width=18, height=18, focal=24.0)
+    broken = {name: tensor.clone() for name, tensor in gaussians.tensors()}
+    broken["means"][1, 0] = np.nan
+    broken["log_scales"][2, 1] = np.inf
+    broken["quats"][3] = np.nan
+    broken["sh"][4, 0, 1] = np.nan
+    broken["orientation"][5, 0] = np.inf
+    weights = random_weights(camera, RenderOptions())
+    rest = gaussians.select(torch.tensor([0, 6, 7]))
+    found, cpu, alone = (
+        outcome(renderer, some, camera, RenderOptions(), weights=weights)
+        for renderer, some in (
+            (emulated(EmulatedKernels(emulator_library)), OrientedGaussians(**broken)),
+            (render, OrientedGaussians(**broken)),
+            (emulated(EmulatedKernels(emulator_library)), rest),
+        )
+    )
+    assert_same_images(found, cpu)
+    for name in IMAGES:
+        assert torch.equal(found.images[name], alone.images[name]), name
+    hidden = torch.tensor([1, 2, 3, 4, 5])
+    for one in (found, cpu):
+        for name, gradient in one.gradients.items():
+            assert not gradient[hidden].any(), name
+    for name, gradient in alone.gradients.items():
+        assert torch.equal(found.gradients[name][[0, 6, 7]], gradient), name
+
+
+@pytest.mark.parametrize("ulp", [0.0, 1.0])
+@pytest.mark.parametrize("name", HARD_SCENES)
+def test_depth_against_bisection(emulator_library: Path, name: str, ulp: float) -> None:
+    gaussians, camera = hard_scene(name)
+    with torch.no_grad():
+        found = emulated(EmulatedKernels(emulator_library, ulp=ulp))(
+            leaves(gaussians, torch.float32), camera, RenderOptions()
+        )
+    # Disturbed by their documented bounds, quotients alone move a peak by two roundings.
+    truth = FirstPrinciples(gaussians, camera).images()
+    assert_depth(found.depth.double().numpy(), truth, 3.0 if ulp else 1.0)
+
+
+def usable_in_float64(
+    gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
+) -> torch.Tensor:
+    """Return (n,) what is not hidden; at the edge of the rule float32 decides otherwise."""
+    return reference_projection(doubled(gaussians), camera, options).usable
+
+
+def rendered(
+    library: Path, gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
+) -> Outcome:
+    """Render and differentiate; everything is finite."""
+    found = outcome(
+        emulated(EmulatedKernels(library)), gaussians, camera, options,
+        weights=random_weights(camera, options),
+    )  # fmt: skip
+    for name, value in (*found.images.items(), *found.gradients.items()):
+        assert torch.isfinite(value).all(), name
+    assert found.render.statistics is not None
+    for name in STATISTICS:
+        assert np.isfinite(getattr(found.render.statistics, name)).all(), name
+    return found
+
+
+@pytest.mark.parametrize("name", ABSURD)
+@pytest.mark.parametrize("near_z", [0.2, -1.0])
+def test_absurd_values_stay_finite(emulator_library: Path, name: str, near_z: float) -> None:
+    gaussians, camera = ABSURD[name]
+    both = joined(gaussians, one_wild())
+    options = RenderOptions(near_z=near_z, statistics=True)
+    found = rendered(emulator_library, both, camera, options)
+    if camera is PLAIN:
+        # The plain one behind it is not lost.
+        assert found.render.statistics is not None
+        assert found.render.statistics.visible[1]
+        assert found.gradients["means"][1].any()
+    usable = usable_in_float64(both, camera, options)
+    for name, gradient in found.gradients.items():
+        assert not gradient[~usable].any(), name
+
+
+@steady(100)
+@given(
+    gaussians=wild_gaussians(),
+    camera=cameras(),
+    near_z=st.sampled_from([0.2, 0.0, 1e-6, -1.0]),
+)
+def test_finite_parameters_give_finite_images_and_gradients(
+    emulator_library: Path, gaussians: OrientedGaussians, camera: Camera, near_z: float
+) -> None:
+    options = RenderOptions(near_z=near_z, statistics=True)
+    found = rendered(emulator_library, gaussians, camera, options)
+    usable = usable_in_float64(gaussians, camera, options)
+    assert found.render.statistics is not None
+    assert not found.render.statistics.visible[~usable.numpy()].any()
+    assert float(found.images["alpha"].min()) >= 0.0
+    assert float(found.images["depth"].min()) >= 0.0

@@ -10,10 +10,9 @@ import torch
 
 from gaussian_wrapping_addon.core.render.cuda.kernels import Kernels, cuda_source
 from gaussian_wrapping_addon.core.render.types import RenderOptions
-
-from ..scenes import look_at, random_gaussians
-from .comparison import emulated, outcome, random_weights
-from .emulation import EmulatedKernels, build_emulator
+from tests.core.render.cuda.comparison import emulated, outcome, random_weights
+from tests.core.render.cuda.emulation import EmulatedKernels, build_emulator
+from tests.core.render.scenes import look_at, random_gaussians
 
 HEAD = "typedef long long int64;\n"
 ENTRY = 'extern "C" __global__ void {name}({arguments}) {{ {body} }}\n'

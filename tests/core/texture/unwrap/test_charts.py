@@ -1,24 +1,42 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Charts: exact overlaps, splits at folds, relaxation to the true shapes of faces."""
+"""Charts: overlaps, splits, relaxation, stretch, whole polygons, UVs that a mesh has."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.mesh.components import components, face_graph
+from gaussian_wrapping_addon.core.errors import MeshingError
+from gaussian_wrapping_addon.core.limits import MAX_ATLASES
+from gaussian_wrapping_addon.core.mesh.components import components, face_graph, uv_charts
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.textured_mesh import udim_uvs
+from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.texture.unwrap.charts import (
     chart_points,
     equalise_density,
     flatten_faces,
     relax,
     smooth_vertices,
+    texture_stretch,
 )
 from gaussian_wrapping_addon.core.texture.unwrap.overlaps import (
     find_overlaps,
+    join_polygons,
     overlapping_pairs,
+    set_cut_apart,
     signed_areas,
     split_overlaps,
+)
+from gaussian_wrapping_addon.core.texture.unwrap.packing_scale import split_wide_charts
+from gaussian_wrapping_addon.core.texture.unwrap.unwrap import (
+    Unwrap,
+    overlap_warning,
+    own_uvs,
+    unwrap,
+    uv_area,
 )
 from tests.core.texture.texture_scenes import sphere
 
@@ -202,3 +220,232 @@ def test_pairs_of_boxes_of_all_shapes_are_those_of_brute_force() -> None:
     assert found == wanted
     assert len(wanted) > 300
     assert candidates < 0.5 * len(faces) ** 2 / 6
+
+
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+
+
+FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+
+
+def uvs_of(points: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
+    return (points[:, :2] * scale)[FACES].astype(np.float32)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
+@pytest.mark.parametrize("away", [0.0, 100.0])
+def test_an_even_map_has_none(size: float, away: float) -> None:
+    stretch = texture_stretch((SQUARE + away) * size, FACES, uvs_of(SQUARE, (0.25, 0.25)))
+    assert abs(stretch.mean - 1.0) < 1e-6
+    assert abs(stretch.p95 - 1.0) < 1e-6
+    assert stretch.collapsed_share == 0.0
+
+
+def test_a_map_twice_as_wide_as_high() -> None:
+    # Relative to the mean scale a step moves by sqrt(2) and by 1 / sqrt(2).
+    stretch = texture_stretch(SQUARE, FACES, uvs_of(SQUARE, (0.2, 0.4)))
+    assert abs(stretch.mean - np.sqrt((2.0 + 0.5) / 2)) < 1e-6
+
+
+def test_it_is_weighted_by_area() -> None:
+    vertices = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    faces = np.array([[0, 1, 2], [3, 4, 5]], np.int32)
+    uvs = np.array([[[0, 0], [0.3, 0], [0, 0.3]], [[0, 0], [0.01, 0], [0, 0.01]]], np.float32)
+    stretch = texture_stretch(vertices, faces, uvs)
+    scale = np.sqrt(10.0 / 0.0901)
+    assert abs(stretch.mean - (0.9 * 10 + 0.1 * 100) / scale) < 1e-5
+    assert abs(stretch.p95 - 100 / scale) < 1e-5
+
+
+def test_collapsed_faces_are_counted_and_not_measured() -> None:
+    uvs = uvs_of(SQUARE, (0.25, 0.25))
+    uvs[1] = uvs[0, 0]
+    stretch = texture_stretch(SQUARE, FACES, uvs)
+    assert abs(stretch.mean - 1.0) < 1e-6
+    assert stretch.collapsed_share == 0.5
+
+
+def quad_torus(around: int, across: int) -> tuple[SurfaceMesh, np.ndarray]:
+    """A torus of quads, each of two triangles, and the quad of each triangle."""
+    i, j = (a.ravel() for a in np.meshgrid(np.arange(around), np.arange(across), indexing="ij"))
+    u, v = 2 * np.pi * i / around, 2 * np.pi * j / across
+    ring = 1.0 + 0.3 * np.cos(v)
+    vertices = np.stack([ring * np.cos(u), ring * np.sin(u), 0.3 * np.sin(v)], axis=1)
+    vertices += np.random.default_rng(0).normal(0.0, 0.02, vertices.shape)
+    right, up = (i + 1) % around, (j + 1) % across
+    quads = np.stack(
+        [i * across + j, right * across + j, right * across + up, i * across + up], axis=1
+    )
+    faces = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3).astype(np.int32)
+    return SurfaceMesh(vertices, faces), np.repeat(np.arange(len(quads)), 2)
+
+
+def cut_quads(mesh: SurfaceMesh, unwrapped: Unwrap) -> int:
+    """Return how many quads have other UVs on either side of their diagonal."""
+    uvs = unwrapped.corner_uvs
+    if unwrapped.face_atlas is not None:
+        uvs = uvs + 2.0 * unwrapped.face_atlas[:, None, None]
+    apart = np.abs(uvs[0::2][:, [0, 2]] - uvs[1::2][:, [0, 1]])
+    return int((apart > 1e-6).any(axis=(1, 2)).sum())
+
+
+@pytest.mark.parametrize("atlases", [1, 4])
+def test_no_quad_is_cut(atlases: int, tmp_path: Path) -> None:
+    mesh, polygons = quad_torus(60, 24)
+    found = [
+        unwrap(mesh, 512, 4, tmp_path, Progress(), atlases=atlases, polygons=kept)
+        for kept in (None, polygons)
+    ]
+    assert [one.method for one in found] == ["xatlas", "xatlas"]  # and so checked for overlaps
+    assert cut_quads(mesh, found[0]) > 20
+    assert cut_quads(mesh, found[1]) == 0
+    stretch = [texture_stretch(mesh.vertices, mesh.faces, one.corner_uvs).p95 for one in found]
+    assert stretch[1] < stretch[0] + 0.01
+    charts = [len(np.unique(one.charts)) for one in found]
+    assert charts[1] <= 1.1 * charts[0]
+
+
+def grid(side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A flat grid of quads: vertices, faces, and the quad of each face."""
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(side + 1), np.arange(side + 1)))
+    vertices = np.stack([x, y, 0 * x], axis=1).astype(float)
+    at = np.flatnonzero((x < side) & (y < side))
+    quads = np.stack([at, at + 1, at + side + 2, at + side + 1], axis=1)
+    return (
+        vertices, quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), np.repeat(np.arange(len(quads)), 2),
+    )  # fmt: skip
+
+
+def test_triangles_fill_the_notches_of_the_chart_that_they_join() -> None:
+    """A border along the diagonals of a row of quads moves to the edges beside them."""
+    vertices, faces, polygons = grid(5)
+    graph, shapes = face_graph(vertices, faces), flatten_faces(vertices, faces)
+    charts = np.where(np.arange(len(faces)) >= 2 * 10 + 1, 1, 0)
+    charts[20:30] = np.tile([0, 1], 5)  # the middle row is cut along its diagonals
+    flat = vertices[faces][..., :2] + np.where(charts == 1, 100.0, 0.0)[:, None, None]
+    joined = join_polygons(flat, charts, faces, shapes, graph, polygons)
+    labels = uv_charts(graph, faces, joined)
+    assert len(np.unique(labels)) == 2
+    assert (labels[0::2] == labels[1::2]).all()
+    assert len(find_overlaps(joined, labels)) == 0
+    assert np.allclose(signed_areas(joined), 0.5)
+    assert np.array_equal(joined[:20], flat[:20])
+
+
+def test_what_still_is_cut_gets_a_chart_of_its_own() -> None:
+    vertices, faces, polygons = grid(3)
+    graph, shapes = face_graph(vertices, faces), flatten_faces(vertices, faces)
+    charts = np.where(np.arange(len(faces)) >= 9, 1, 0)  # through the middle quad
+    flat = vertices[faces][..., :2] + np.where(charts == 1, 100.0, 0.0)[:, None, None]
+    apart, labels = set_cut_apart(flat, charts, faces, shapes, graph, polygons)
+    assert (labels[0::2] == labels[1::2]).all()
+    assert np.flatnonzero(labels == labels[8]).tolist() == [8, 9]
+    assert len(np.unique(labels)) == 3
+    assert np.array_equal(apart[8][[0, 2]], apart[9][[0, 1]])
+    assert np.allclose(signed_areas(apart), 0.5)
+    assert len(find_overlaps(apart, labels)) == 0
+
+
+def test_wide_charts_are_split_between_quads() -> None:
+    vertices, faces, polygons = grid(9)
+    flat = vertices[faces][..., :2]
+    charts = np.zeros(len(faces), np.int32)
+    labels = split_wide_charts(flat, charts, 4, polygons)
+    assert len(np.unique(labels)) >= 4
+    assert (labels[0::2] == labels[1::2]).all()
+    without = split_wide_charts(flat, charts, 4)
+    assert (without[0::2] != without[1::2]).any()
+
+
+STRIP_FACES = 24
+
+
+TRIANGLE = np.array([[0.1, 0.1], [0.9, 0.1], [0.1, 0.9]])
+
+
+def strip_of_tiles(count: int = STRIP_FACES) -> SurfaceMesh:
+    """Separate triangles of equal area."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
+    vertices = (corners + np.arange(count)[:, None, None] * [2.0, 0, 0]).reshape(-1, 3)
+    return SurfaceMesh(vertices, np.arange(3 * count, dtype=np.int32).reshape(-1, 3))
+
+
+def test_ordinary_uvs_are_kept_bit_by_bit() -> None:
+    uvs = np.broadcast_to(TRIANGLE, (STRIP_FACES, 3, 2)).astype(np.float32)
+    own = own_uvs(strip_of_tiles(), uvs)
+    assert own.udims == (1001,)
+    assert own.warnings == ()
+    assert own.unwrapped.face_atlas is None
+    assert np.array_equal(own.unwrapped.corner_uvs, uvs)
+    assert len(np.unique(own.unwrapped.charts)) == STRIP_FACES
+    assert uv_area(uvs) == pytest.approx(STRIP_FACES * 0.32)
+
+
+def test_tiles_are_numbered_by_column_and_row_and_lead_back() -> None:
+    tiles = np.array([[0, 0], [9, 0], [0, 1], [3, 7]])[np.arange(STRIP_FACES) % 4]
+    uvs = (TRIANGLE + tiles[:, None]).astype(np.float32)
+    own = own_uvs(strip_of_tiles(), uvs)
+    assert own.udims == (1001, 1010, 1011, 1074)
+    face_atlas = own.unwrapped.face_atlas
+    assert face_atlas is not None
+    assert face_atlas.tolist() == (np.arange(STRIP_FACES) % 4).tolist()
+    inside = own.unwrapped.corner_uvs
+    assert inside.min() >= 0.0
+    assert inside.max() <= 1.0
+    assert np.abs(udim_uvs(inside, face_atlas, own.udims) - uvs).max() < 1e-6
+
+
+def test_edges_of_tiles_belong_to_the_tile_of_their_face() -> None:
+    """From 0 to 1, beyond it by rounding, and faces collapsed to a point of the far edge."""
+    whole = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    uvs = np.stack([whole, whole + [0.0, 0.99995] * (whole == 9), whole - 5e-5, np.ones((3, 2)),
+                    whole + 5e-5] + [whole] * 5)  # fmt: skip
+    own = own_uvs(strip_of_tiles(len(uvs)), uvs)
+    assert own.udims == (1001,)
+    assert own.unwrapped.corner_uvs.min() == 0.0
+    assert own.unwrapped.corner_uvs.max() == 1.0
+    (warning,) = own.warnings
+    assert warning.code == "uv-flat"
+    assert warning.text.startswith("1 of 10 faces have no area in the UV map, 10 %")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [(np.nan, r"Face 5 of the mesh has UVs that are not finite\."),
+     (-1.0, "Face 5 of the mesh has UVs outside of the UDIM tiles"),
+     (11.0, "outside of the UDIM tiles"), (0.5, "cross the edge of a tile")],
+)  # fmt: skip
+def test_uvs_that_cannot_be_used_are_refused_by_face(change: float, words: str) -> None:
+    uvs = np.array(np.broadcast_to(TRIANGLE, (STRIP_FACES, 3, 2)))
+    uvs[5] += [change, 0.0]
+    with pytest.raises(MeshingError, match=words) as caught:
+        own_uvs(strip_of_tiles(), uvs)
+    assert "--uvs new" in caught.value.hint
+
+
+def test_repeated_textures_say_how_many_faces_do_so() -> None:
+    with pytest.raises(MeshingError, match=f"as do {STRIP_FACES} faces in all"):
+        own_uvs(strip_of_tiles(), np.broadcast_to(3.0 * TRIANGLE, (STRIP_FACES, 3, 2)))
+
+
+def test_uvs_without_area_are_refused() -> None:
+    uvs = np.array(np.broadcast_to(TRIANGLE, (STRIP_FACES, 3, 2)))
+    uvs[: STRIP_FACES // 2 + 1] = 0.25
+    with pytest.raises(MeshingError, match="54 % of the surface have no area"):
+        own_uvs(strip_of_tiles(), uvs)
+
+
+def test_too_many_tiles_are_refused() -> None:
+    uvs = (
+        TRIANGLE
+        + np.stack([np.arange(STRIP_FACES) % 10, np.arange(STRIP_FACES) // 10], axis=1)[:, None]
+    )
+    with pytest.raises(MeshingError, match=f"{STRIP_FACES} UDIM tiles; the limit is {MAX_ATLASES}"):
+        own_uvs(strip_of_tiles(), uvs)
+
+
+def test_overlaps_are_a_warning() -> None:
+    assert overlap_warning(0, 9) is None
+    warning = overlap_warning(3, 9)
+    assert warning is not None
+    assert warning.text.startswith("3 of 9 texels")

@@ -1,0 +1,541 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Surface scores: perfect on the truth, closed forms, bias; folders of ground truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from gaussian_wrapping_addon.core.errors import DatasetError, MeshingError, ParseError, UsageError
+from gaussian_wrapping_addon.core.evaluation import surface_scores
+from gaussian_wrapping_addon.core.evaluation.surface_scores import (
+    PROTOCOLS,
+    RegionCrop,
+    SurfaceSamples,
+    SurfaceScore,
+    Truth,
+    face_normals,
+    read_truth,
+    sample_legacy,
+    sample_uniformly,
+    score_clouds,
+    score_protocols,
+    score_surface,
+)
+from gaussian_wrapping_addon.core.mesh import sampling as surface_distance
+from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
+from tests.core.evaluation.surface_scenes import (
+    Mesh,
+    ball,
+    cameras_around,
+    cylinder,
+    exact_sphere,
+    fanned,
+    halves,
+    joined,
+    moved_camera,
+    truth_of,
+    without_mesh,
+)
+
+CAMERAS = cameras_around()
+
+
+OFFSET = np.array([5e5, 4e6, -300.0])
+
+
+EMPTY = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+
+
+def uniform(mesh: Mesh, truth: Truth, *thresholds: float, count: int = 20_000) -> SurfaceScore:
+    return score_protocols(
+        *mesh, truth, [], thresholds, count=count, seed=1, protocols=["uniform"]
+    )["uniform"]
+
+
+@pytest.mark.parametrize("offset", [np.zeros(3), OFFSET], ids=["origin", "huge coordinates"])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_the_truth_itself_is_perfect(offset: np.ndarray, scale: float) -> None:
+    vertices, faces = joined(ball(3), cylinder([0, 0, 0.9], [0, 0, 2], 0.05))
+    mesh = vertices * scale + offset, faces
+    truth = truth_of(mesh, seen=np.full(20_000, 2, np.int32), thin=np.ones(20_000, bool))
+    rounding = 1e-9 * scale if not offset.any() else 4e-9
+    for score in (
+        uniform(mesh, truth, rounding, 0.1 * scale),
+        score_surface(truth.samples, None, without_mesh(truth), [rounding, 0.1 * scale]),
+    ):
+        ones = (1.0, 1.0)
+        assert score.precision == score.recall == score.f1 == ones
+        assert score.visible_recall == score.thin_recall == ones
+        assert score.chamfer_mean <= rounding
+        assert score.chamfer_median <= rounding
+        # Coordinates of millions move the corners of a face of a few millimetres.
+        if not offset.any():
+            assert score.normal_consistency == pytest.approx(1.0, abs=1e-12)
+            assert score.normal_agreement == 1.0
+    if scale == 1.0 and not offset.any():
+        assert score.chamfer_mean == 0.0
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_every_protocol_is_perfect_on_the_truth_beyond_its_spacing(protocol: str) -> None:
+    mesh = ball(4)
+    truth = truth_of(mesh, 5000)
+    score = score_protocols(
+        *mesh, truth, CAMERAS, [0.06], count=5000, seed=0, threads=2, protocols=[protocol]
+    )[protocol]
+    assert score.precision == score.recall == score.f1 == (1.0,)
+    assert score.accuracy_mean < 1e-15
+    assert score.normal_agreement == 1.0
+    assert score.normal_consistency > 0.998
+
+
+@pytest.mark.parametrize("scale", [0.95, 1.05])
+def test_a_scaled_sphere_is_its_distance_away(scale: float) -> None:
+    vertices, faces = ball(5)
+    truth = truth_of((vertices, faces))
+    score = uniform((vertices * scale, faces), truth, 0.0485, 0.0515)
+    # Chords of the polygons are 2e-4 inside of the sphere.
+    for distance in (
+        score.accuracy_mean, score.accuracy_median, score.completeness_mean,
+        score.completeness_median, score.chamfer_mean, score.chamfer_median,
+    ):  # fmt: skip
+        assert distance == pytest.approx(0.05, abs=2e-4)
+    assert score.precision == score.recall == score.f1 == (0.0, 1.0)
+    assert score.normal_consistency > 0.9995
+
+
+@pytest.mark.parametrize("shift", [0.02, 0.1, 0.4])
+def test_a_shifted_sphere_has_the_distances_of_theory(shift: float) -> None:
+    """Heights on a sphere are even, and r dr = R d dc for r = |x + d|, c the cosine to d: the
+    share of points nearer than t is the integral of r dr over R - t .. R + t, over 2 R d = t / d.
+    The distances are even between 0 and d: mean and median d / 2."""
+    fine = ball(5)
+    samples = exact_sphere(20_000)
+    truth = Truth(samples, *fine)
+    moved = samples.points + np.array([0.0, 0.0, shift])
+    limits = np.array([0.1, 0.25, 0.5, 0.75]) * shift
+    score = score_surface(
+        SurfaceSamples(moved, samples.normals),
+        (fine[0] + np.array([0.0, 0.0, shift]), fine[1]),
+        truth,
+        limits,
+    )
+    sag = 3e-4
+    for distance in (score.accuracy_mean, score.completeness_mean):
+        assert distance == pytest.approx(shift / 2, abs=sag)
+    for distance in (score.accuracy_median, score.completeness_median):
+        assert distance == pytest.approx(shift / 2, abs=2 * sag)
+    for got in (score.precision, score.recall, score.f1):
+        assert got == pytest.approx(limits / shift, abs=sag / shift + 1e-3)
+
+
+def test_legacy_scores_depend_on_tessellation_and_uniform_ones_do_not() -> None:
+    upper, lower = halves(ball(4))
+    wrong = lower[0] * 1.05, lower[1]
+    plain, dense = joined(upper, wrong), joined(fanned(upper, 10), wrong)
+    truth = truth_of(ball(4))
+    scores = {
+        name: score_protocols(
+            *mesh, truth, [], [0.03], count=20_000, seed=0, protocols=["uniform", "legacy"]
+        )
+        for name, mesh in (("plain", plain), ("dense", dense))
+    }
+
+    def figures(protocol: str, name: str) -> np.ndarray:
+        score = scores[name][protocol]
+        return np.array([score.precision[0], score.recall[0], score.f1[0], score.chamfer_mean])
+
+    areas = [face_normals(*half)[1].sum() for half in (upper, wrong)]
+    share = areas[0] / sum(areas)
+    assert scores["plain"]["uniform"].precision[0] == pytest.approx(share, abs=1e-3)
+    change = np.abs(figures("uniform", "dense") - figures("uniform", "plain"))
+    assert (change <= 0.005 * figures("uniform", "plain")).all()
+
+    # Legacy precision is the share of vertices and centres on the half that is right.
+    for name, mesh in (("plain", upper), ("dense", fanned(upper, 10))):
+        right = len(sample_legacy(*mesh))
+        expected = right / (right + len(sample_legacy(*wrong)))
+        assert scores[name]["legacy"].precision[0] == pytest.approx(expected, abs=1e-12)
+    change = figures("legacy", "dense") - figures("legacy", "plain")
+    assert change[0] > 0.4
+    assert change[2] > 0.1
+
+
+def test_uniform_punishes_a_hidden_shell_and_a_scan_does_not() -> None:
+    outer = ball(4)
+    mesh = joined(outer, (outer[0] * 0.5, outer[1]))
+    truth = truth_of(outer)
+    scores = score_protocols(*mesh, truth, CAMERAS, [0.05], count=20_000, seed=0)
+    assert scores["uniform"].precision[0] == pytest.approx(0.8, abs=1e-3)  # areas 1 and 1/4
+    assert scores["uniform"].accuracy_mean == pytest.approx(0.2 * 0.5, abs=2e-3)
+    assert scores["scan"].precision == (1.0,)
+    assert scores["scan"].recall[0] > 0.999
+
+
+def test_cameras_that_crowd_do_not_weigh_more_in_a_scan() -> None:
+    upper, lower = halves(ball(4))
+    mesh = joined(upper, (lower[0] * 1.05, lower[1]))
+    truth = truth_of(ball(4), 2000)
+    crowd = [camera for camera in CAMERAS if camera.center[2] > 1] * 4
+    assert len(crowd) > 12
+    few, many = (
+        score_protocols(*mesh, truth, cameras, [0.03], protocols=["scan"])["scan"]
+        for cameras in (CAMERAS, CAMERAS + crowd)
+    )
+    assert few.precision[0] == pytest.approx(1 / (1 + 1.05**2), abs=0.02)
+    assert many.precision[0] == pytest.approx(few.precision[0], abs=2e-3)
+
+
+def test_a_scan_of_many_pixels_takes_larger_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, cameras = ball(3), CAMERAS[:4]
+    truth = truth_of(mesh, 2000)
+    rays = sum(camera.width * camera.height for camera in cameras)
+    monkeypatch.setattr(surface_scores, "SCAN_RAYS", rays / 4)
+    automatic, coarse, fine = (
+        score_protocols(*mesh, truth, cameras, [0.01], protocols=["scan"], **options)["scan"]
+        for options in ({}, {"step_px": 2.0}, {"step_px": 1.0})
+    )
+    assert automatic == coarse != fine
+
+
+def test_a_scan_asks_only_for_what_cameras_see() -> None:
+    outer, inner = ball(4), (ball(3)[0] * 0.5, ball(3)[1])
+    solid = joined(outer, inner)
+    samples = sample_uniformly(*solid, 10_000, seed=0)
+    hidden = np.linalg.norm(samples.points, axis=1) < 0.6
+    truth = Truth(samples, *solid, seen=np.where(hidden, 1, 5).astype(np.int32))
+    scores = score_protocols(*outer, truth, CAMERAS, [0.06], count=10_000, seed=0)
+    assert scores["scan"].recall == (1.0,)
+    assert scores["scan"].truth_count == (~hidden).sum()
+    assert scores["uniform"].recall[0] == pytest.approx((~hidden).mean(), abs=1e-12)
+    assert scores["uniform"].visible_recall == (1.0,)
+    assert scores["uniform"].visible_count == (~hidden).sum()
+    one_camera = score_surface(samples, outer, truth, [0.06], min_cameras=1)
+    assert one_camera.visible_recall == one_camera.recall
+    with pytest.raises(UsageError, match="seen by 6 cameras"):
+        score_protocols(*outer, truth, CAMERAS, [0.06], protocols=["scan"], min_cameras=6)
+
+
+def test_visibility_may_be_given_as_yes_and_no() -> None:
+    mesh = ball(3)
+    shown = np.arange(2000) < 500
+    score = uniform(halves(mesh)[0], truth_of(mesh, 2000, seen=shown), 0.05, count=500)
+    assert score.visible_count == 500
+    assert score.visible_recall != score.recall
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_flipped_mesh_is_consistent_and_does_not_agree(protocol: str) -> None:
+    vertices, faces = ball(4)
+    truth = truth_of((vertices, faces), 5000)
+    both = [
+        score_protocols(
+            vertices, turned, truth, CAMERAS, [0.06], count=5000, seed=0, protocols=[protocol]
+        )[protocol]
+        for turned in (faces, faces[:, ::-1])
+    ]
+    assert [score.normal_agreement for score in both] == [1.0, 0.0]
+    assert both[0].normal_consistency == pytest.approx(both[1].normal_consistency, abs=1e-9)
+    assert both[1].f1 == (1.0,)
+
+
+def test_tilted_planes_have_the_cosine_of_their_angle() -> None:
+    square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    angle = np.radians(10)
+    tilt = np.array(
+        [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]
+    )
+    score = uniform((square @ tilt.T, faces), truth_of((square, faces), 1000), 1.0, count=1000)
+    assert score.normal_consistency == pytest.approx(np.cos(angle), abs=1e-12)
+    assert score.normal_agreement == 1.0
+
+
+def test_normals_that_nobody_knows_are_left_out() -> None:
+    mesh = ball(3)
+    known = sample_uniformly(*mesh, 1000, seed=0)
+    unknown = dataclasses.replace(known, normals=np.zeros((1000, 3)))
+    truth = Truth(unknown)
+    score = score_surface(known, None, truth, [0.1])
+    assert (score.normal_consistency, score.normal_agreement) == (0.0, 0.0)
+    half = dataclasses.replace(known, normals=known.normals * (np.arange(1000) % 2)[:, None])
+    assert score_surface(known, None, Truth(half), [0.1]).normal_consistency == pytest.approx(1.0)
+
+
+def test_a_missing_wire_costs_thin_recall() -> None:
+    body, wire = ball(4), cylinder([1.5, 0, -1], [1.5, 0, 1], 0.01)
+    whole = joined(body, wire)
+    samples = sample_uniformly(*whole, 20_000, seed=0)
+    thin = samples.points[:, 0] > 1.2
+    hidden = thin & (samples.points[:, 2] < 0)
+    seen = np.where(hidden, 0, 3).astype(np.int32)
+    truth = Truth(samples, *whole, thin=thin, seen=seen)
+    assert thin.sum() > 150
+    complete, without = uniform(whole, truth, 0.05), uniform(body, truth, 0.05, 0.6)
+    assert complete.thin_recall == complete.recall == (1.0,)
+    assert without.thin_count == (thin & ~hidden).sum()
+    assert without.thin_recall is not None
+    assert without.thin_recall[0] == 0.0
+    # Nearest to the sphere, the wire is 0.49 away; at height 1 it is 0.79 away.
+    near = np.linalg.norm(samples.points[thin & ~hidden], axis=1) < 1.6
+    assert without.thin_recall[1] == pytest.approx(near.mean(), abs=0.02)
+    assert without.recall[0] == pytest.approx(1 - thin.mean(), abs=1e-12)
+    assert without.precision[0] == 1.0
+    assert uniform(body, dataclasses.replace(truth, thin=hidden), 0.05).thin_recall is None
+    assert uniform(body, dataclasses.replace(truth, thin=None), 0.05).thin_recall is None
+
+
+def test_the_crop_chooses_what_is_judged_not_what_it_is_measured_against() -> None:
+    mesh = ball(4)
+    upper, lower = halves(mesh)
+    crop = RegionCrop(Region.box("top", [-2, -2, 0.3], [2, 2, 2]))
+    cropped = dataclasses.replace(truth_of(mesh), crop=crop)
+    score = uniform(joined(upper, (lower[0] * 1.4, lower[1])), cropped, 1e-9)
+    assert score.precision == score.recall == (1.0,)
+    # A zone's area goes with its height: 0.7 of 2.
+    assert score.truth_count == pytest.approx(20_000 * 0.35, rel=0.01)
+    assert score.predicted_count == pytest.approx(20_000 * 0.7 / (1 + 1.4**2), rel=0.02)
+    # The surface just beyond the boundary still finds the truth.
+    shifted = uniform((mesh[0] - np.array([0, 0, 0.02]), mesh[1]), cropped, 0.0205)
+    assert shifted.precision == shifted.recall == (1.0,)
+    # Also where the truth is a cloud: no sample inside is farther from it than in the whole.
+    cloud = exact_sphere(5000)
+    guess = exact_sphere(4000)
+    whole = score_surface(guess.kept(guess.points[:, 2] >= 0.3), None, Truth(cloud), [0.1])
+    part = score_surface(guess, None, Truth(cloud, crop=crop), [0.1])
+    assert part.predicted_count == whole.predicted_count < 4000
+    assert part.accuracy_mean == whole.accuracy_mean
+    outside = dataclasses.replace(cropped, crop=RegionCrop(Region.box("off", [5] * 3, [6] * 3)))
+    with pytest.raises(UsageError, match="inside the crop"):
+        uniform(mesh, outside, 0.01)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize(
+    "mesh",
+    [EMPTY, (np.zeros((3, 3)), np.array([[0, 1, 2]])), (ball(1)[0] * 0.1 + 9, ball(1)[1])],
+    ids=["no faces", "no area", "outside of the crop"],
+)
+def test_nothing_scores_nothing_and_never_nan(protocol: str, mesh: Mesh) -> None:
+    crop = RegionCrop(Region.box("around", [0.5] * 3, [2] * 3))
+    labels = {"thin": np.ones(500, bool), "seen": np.full(500, 2, np.int32), "crop": crop}
+    truth = truth_of(ball(3), 500, **labels)
+    score = score_protocols(
+        *mesh, truth, CAMERAS[:2], [0.1, 5.0], count=100, seed=0, protocols=[protocol]
+    )[protocol]
+    assert score.precision == score.recall == score.f1 == (0.0, 0.0)
+    assert score.visible_recall == score.thin_recall == (0.0, 0.0)
+    assert score.chamfer_mean == score.accuracy_median == score.completeness_mean == math.inf
+    assert score.normal_consistency == score.normal_agreement == 0.0
+    values = json.loads(json.dumps(score.to_json(), allow_nan=False))
+    assert values["chamfer_mean"] is None
+    assert values["f1"] == [0.0, 0.0]
+    assert values["predicted_count"] == 0
+    assert values["truth_count"] > 0
+
+
+def test_scores_are_the_same_in_every_frame() -> None:
+    mesh, guess = ball(3), (ball(3)[0] * 1.02 + 0.01, ball(3)[1])
+    cameras = CAMERAS[:4]
+    here = score_protocols(*guess, truth_of(mesh, 5000), cameras, [0.02, 0.05], count=5000)
+    there = score_protocols(
+        guess[0] + OFFSET, guess[1],
+        truth_of((mesh[0] + OFFSET, mesh[1]), 5000),
+        [moved_camera(camera, OFFSET) for camera in cameras],
+        [0.02, 0.05], count=5000, threads=2,
+    )  # fmt: skip
+    assert 0.1 < here["uniform"].f1[0] < 0.9
+    for protocol in PROTOCOLS:
+        one, other = here[protocol].to_json(), there[protocol].to_json()
+        for name, value in one.items():
+            if value is not None and not name.endswith("_count"):
+                assert np.allclose(other[name], value, rtol=0, atol=1e-3), (protocol, name)
+    assert here == score_protocols(
+        *guess, truth_of(mesh, 5000), cameras, [0.02, 0.05], count=5000, threads=3
+    )
+
+
+def test_clouds_are_searched_by_the_threads_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    class Tree(cKDTree):
+        def query(self, points: np.ndarray, workers: int = 1) -> tuple:
+            asked.append(workers)
+            return super().query(points, workers=workers)
+
+    monkeypatch.setattr(surface_distance, "cKDTree", Tree)
+    mesh = ball(2)
+    truth = without_mesh(truth_of(mesh, 500))
+    for protocols in (("legacy",), ("uniform", "scan")):
+        asked.clear()
+        score_protocols(*mesh, truth, CAMERAS[:2], [0.1], count=500, threads=3, protocols=protocols)
+        assert set(asked) == {3}
+    asked.clear()
+    score_clouds(mesh[0], mesh[0], 0.1, voxel=None, threads=2)
+    assert asked == [2, 2]
+    asked.clear()
+    score_protocols(*mesh, truth, [], [0.1], count=500, threads=0, protocols=["legacy"])
+    assert set(asked) == {default_threads()}
+
+
+def test_what_cannot_be_scored_is_refused() -> None:
+    mesh, truth = ball(2), truth_of(ball(2), 100)
+    for thresholds in ([], [0.0], [0.1, -1.0], [np.nan], [np.inf]):
+        with pytest.raises(UsageError, match="Thresholds"):
+            uniform(mesh, truth, *thresholds)
+    with pytest.raises(UsageError, match="unknown"):
+        score_protocols(*mesh, truth, [], [0.1], protocols=["best"])
+    with pytest.raises(UsageError, match="needs cameras"):
+        score_protocols(*mesh, truth, [], [0.1], protocols=["scan"])
+    broken = mesh[0].copy()
+    broken[0] = np.nan
+    for protocol in PROTOCOLS:
+        with pytest.raises(MeshingError, match="not finite"):
+            score_protocols(broken, mesh[1], truth, CAMERAS, [0.1], protocols=[protocol])
+
+
+def test_clouds_are_scored_after_thinning() -> None:
+    points = exact_sphere(20_000).points
+    same = score_clouds(points, points, 0.02, voxel=0.01)
+    assert (same.precision, same.recall, same.f1) == (1.0, 1.0, 1.0)
+    assert same.accuracy_mean == same.completeness_mean == 0.0
+    # A thousandfold heap of errors in one cell counts as one point.
+    heap = np.concatenate([points, np.tile([[3.0, 0, 0]], (20_000, 1))])
+    raw = score_clouds(heap, points, 0.02, voxel=None)
+    assert (raw.precision, raw.recall) == (0.5, 1.0)
+    thinned = score_clouds(heap, points, 0.02, voxel=0.01)
+    assert thinned.predicted_count == pytest.approx(thinned.truth_count + 1, rel=0.01)
+    assert thinned.precision > 0.999
+    half = score_clouds(points[points[:, 2] > 0], points, 1e-6, voxel=None)
+    assert (half.precision, half.recall, half.f1) == (1.0, 0.5, pytest.approx(2 / 3))
+    nothing = score_clouds(np.zeros((0, 3)), points, 0.02, voxel=0.01)
+    assert (nothing.precision, nothing.recall, nothing.f1) == (0.0, 0.0, 0.0)
+    assert nothing.to_json()["accuracy_mean"] is None
+    far = score_clouds(points + OFFSET, points + OFFSET, 0.02, voxel=0.01)
+    assert (far.f1, far.accuracy_mean) == (1.0, 0.0)
+    for guess, true, limit, voxel in (
+        (points, points[:0], 0.02, 0.01),
+        (points, points, 0.0, 0.01),
+        (points, points, 0.02, 0.0),
+        (points * np.nan, points, 0.02, None),
+    ):
+        with pytest.raises(UsageError):
+            score_clouds(guess, true, limit, voxel=voxel)
+
+
+def arrays() -> dict[str, np.ndarray]:
+    vertices, faces = ball(2)
+    samples = sample_uniformly(vertices, faces, 300, seed=0)
+    return {
+        "vertices": vertices,
+        "faces": faces.astype(np.int32),
+        "points": samples.points.astype(np.float32),
+        "normals": samples.normals,
+        "thin": samples.points[:, 2] > 0.5,
+        "seen": (np.arange(300) % 4).astype(np.int32),
+    }
+
+
+def write(folder: Path, values: dict[str, np.ndarray]) -> None:
+    np.savez(folder / "truth.npz", **values)
+    write_region(folder / "crop.json", Region.box("crop", [-2, -2, 0], [2, 2, 2]))
+
+
+def test_a_folder_is_read_as_written(tmp_path: Path) -> None:
+    values = arrays()
+    write(tmp_path, values)
+    truth = read_truth(tmp_path)
+    assert truth.mesh is not None
+    assert (truth.mesh[0] == values["vertices"]).all()
+    assert (truth.mesh[1] == values["faces"]).all()
+    assert (truth.samples.points == values["points"]).all()
+    assert truth.samples.points.dtype == truth.samples.normals.dtype == np.float64
+    assert truth.thin is not None
+    assert truth.seen is not None
+    assert (truth.judged() == (values["points"][:, 2] >= 0)).all()
+    assert (truth.visible() == (values["seen"] >= 2)).all()
+    assert (truth.visible(1) == (values["seen"] >= 1)).all()
+    part = truth.kept(truth.thin)
+    assert len(part.samples) == values["thin"].sum()
+    assert part.seen is not None
+    assert (part.seen == values["seen"][values["thin"]]).all()
+
+
+def changed(name: str, value: np.ndarray | None) -> dict[str, np.ndarray]:
+    values = arrays()
+    if value is None:
+        del values[name]
+    else:
+        values[name] = value
+    return values
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("thin", None),
+        ("vertices", None),
+        ("points", np.zeros((300, 2))),
+        ("points", np.full((300, 3), np.nan)),
+        ("points", np.zeros((0, 3))),
+        ("normals", np.zeros((299, 3))),
+        ("faces", np.full((1, 3), 10_000)),
+        ("faces", np.full((1, 3), -1)),
+        ("faces", np.zeros((1, 3))),
+        ("thin", np.zeros(300)),
+        ("seen", np.zeros(299, np.int32)),
+        ("vertices", np.full((3, 3), "a")),
+    ],
+)
+def test_a_wrong_entry_is_named(tmp_path: Path, name: str, value: np.ndarray | None) -> None:
+    write(tmp_path, changed(name, value))
+    with pytest.raises(ParseError) as caught:
+        read_truth(tmp_path)
+    assert caught.value.path.name == "truth.npz"
+    assert name in f"{caught.value.location} {caught.value.message}" or "ground truth" in str(
+        caught.value
+    )
+    assert caught.value.hint
+
+
+def test_broken_and_missing_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ParseError, match=r"truth\.npz"):
+        read_truth(tmp_path)
+    write(tmp_path, arrays())
+    (tmp_path / "crop.json").unlink()
+    with pytest.raises(ParseError, match=r"crop\.json"):
+        read_truth(tmp_path)
+    whole = (tmp_path / "truth.npz").read_bytes()
+    for broken in (
+        b"",
+        b"text",
+        whole[: len(whole) // 2],
+        whole[:300] + bytes(2000) + whole[2300:],
+    ):
+        (tmp_path / "truth.npz").write_bytes(broken)
+        with pytest.raises(ParseError, match=r"truth\.npz"):
+            read_truth(tmp_path)
+    np.savez(tmp_path / "truth.npz", **{**arrays(), "thin": np.array([{}] * 300, object)})
+    with pytest.raises(ParseError, match=r"truth\.npz"):
+        read_truth(tmp_path)
+
+
+def test_a_truth_must_be_whole() -> None:
+    samples = SurfaceSamples(np.zeros((4, 3)), np.zeros((4, 3)))
+    with pytest.raises(DatasetError, match="not both"):
+        Truth(samples, np.zeros((3, 3)))
+    with pytest.raises(DatasetError, match="no samples"):
+        Truth(SurfaceSamples.empty())
+    with pytest.raises(DatasetError, match="seen"):
+        Truth(samples, seen=np.zeros(3, bool))
+    assert Truth(samples).judged().all()
+    assert Truth(samples).visible().all()
