@@ -129,15 +129,18 @@ def test_tests_are_spread_over_files_fastest_first() -> None:
 def test_the_tests_that_execute_a_line_are_taken(tree: Path, tmp_path: Path) -> None:
     coverage = pytest.importorskip("coverage")
     data = coverage.CoverageData(str(tmp_path / "covered"))
-    for test, line in (("tests/a.py::test_far|run", 3), ("tests/a.py::test_near[1]|setup", 2)):
+    for test, line in (("tests/gone.py::test_far|run", 2), ("tests/old.py::test_check[1]|run", 2)):
         data.set_context(test)
         data.add_lines({"/elsewhere/gaussian_wrapping_addon/core/shapes.py": [line]})
     data.write()
-    select = mutations.Selection(tree, tmp_path / "covered", {}, 9)
-    site = mutations.Site("gaussian_wrapping_addon/core/shapes.py", "check", 2, 0, 1, "", False)
-    assert select.tests(site) == (["tests/a.py::test_near[1]"], "coverage")
-    elsewhere = mutations.Site(site.path, "check", 1, 0, 1, "", False)
-    assert select.tests(elsewhere) == (["tests/test_shapes.py"], "names")
+    found = mutations.sites(tree)
+    measured = [mutations.Measured(tree, tmp_path / "covered")]
+    renamed = {"tests/old.py": "tests/test_shapes.py"}
+    select = mutations.Selection(tree, measured, renamed, {}, 9)
+    key = next(key for key in found if key[0] == "check")
+    assert select.tests(key, found[key]) == (["tests/test_shapes.py::test_check[1]"], "coverage")
+    unmeasured = (*key[:1], "another line", *key[2:])
+    assert select.tests(unmeasured, found[key]) == (["tests/test_shapes.py"], "names")
 
 
 def test_two_trees_are_compared_by_the_same_faults(

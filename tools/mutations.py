@@ -3,16 +3,17 @@
 """Compare how many seeded faults the tests of two versions of the repository notice.
 
     python tools/mutations.py --old DIR --new DIR --out RESULTS.json [--count N] [--seed N]
-        [--jobs N] [--old-coverage FILE] [--new-coverage FILE] [--durations LOG ...]
+        [--jobs N] [--coverage TREE FILE]... [--renamed FILE] [--durations LOG ...]
 
 A mutation flips a sign, negates a comparison, moves its limit, changes a number or drops a call. It
 is made in a line of ``core`` or ``ops`` that stands with the same text in a function of the same
 name once in each of the two trees, so both versions get the same faults wherever the line has
 moved. Messages, calls of loggers and annotations are left alone.
 
-The tests of a mutation are those that execute its line, if a coverage file recorded with
-``--cov-context=test`` is given, fastest first by ``--durations`` (a log of ``pytest
---durations=0``); otherwise those whose files import or are named after its module. Coverage sees no
+The tests of a mutation are those that execute its line by coverage recorded with
+``--cov-context=test`` in any tree that has the line, fastest first by ``--durations`` (a log of
+``pytest --durations=0``); ``--renamed`` tells where test files are now (JSON, old path to new one).
+Without coverage they are those whose files import or are named after its module. Coverage sees no
 lines of compiled functions: there the lines count that call them, through other compiled functions
 too. Tests that fail without the mutation are left out. Results are written after each mutation; the
 same command continues where it was stopped.
@@ -220,42 +221,60 @@ def lines_to_cover(root: Path, site: Site) -> set[tuple[str, int]]:
     return found
 
 
+class Measured:
+    """A tree with coverage of its tests."""
+
+    def __init__(self, root: Path, coverage_file: Path) -> None:
+        from coverage import CoverageData
+
+        self._root, self._sites = root, sites(root)
+        self._data = CoverageData(str(coverage_file))
+        self._data.read()
+        self._files: dict[str, str] = {}
+        for name in self._data.measured_files():
+            _, found, below = name.replace(os.sep, "/").rpartition(f"{PACKAGE}/")
+            if found:
+                self._files[found + below] = name
+
+    def tests(self, key: Key) -> set[str]:
+        """Return the tests that execute the line of a mutation."""
+        found: set[str] = set()
+        if key in self._sites:
+            for path, line in lines_to_cover(self._root, self._sites[key]):
+                if path in self._files:
+                    contexts = self._data.contexts_by_lineno(self._files[path])
+                    found.update(context.rpartition("|")[0] for context in contexts.get(line, ()))
+        return {test for test in found if "::" in test}
+
+
 class Selection:
     """Which tests of a tree run for a mutation."""
 
     def __init__(
-        self, root: Path, coverage_file: Path | None, seconds: dict[str, float], most: int
-    ) -> None:
+        self, root: Path, measured: list[Measured], renamed: dict[str, str],
+        seconds: dict[str, float], most: int,
+    ) -> None:  # fmt: skip
         self.root = root
         self.most = most
-        self._seconds = seconds
-        self._data: Any = None
-        self._measured: dict[str, str] = {}
-        if coverage_file is not None:
-            from coverage import CoverageData
-
-            self._data = CoverageData(str(coverage_file))
-            self._data.read()
-            for name in self._data.measured_files():
-                _, found, below = name.replace(os.sep, "/").rpartition(f"{PACKAGE}/")
-                if found:
-                    self._measured[found + below] = name
+        self._measured, self._renamed, self._seconds = measured, renamed, seconds
         self._tests = {
             path.relative_to(root).as_posix(): path.read_text(encoding="utf-8")
             for path in sorted((root / "tests").rglob("test_*.py"))
         }
 
-    def tests(self, site: Site) -> tuple[list[str], str]:
+    def tests(self, key: Key, site: Site) -> tuple[list[str], str]:
         """Return the tests and how they were found, ``"coverage"`` or ``"names"``."""
-        if self._data is not None:
-            found: set[str] = set()
-            for path, line in lines_to_cover(self.root, site):
-                if path in self._measured:
-                    contexts = self._data.contexts_by_lineno(self._measured[path])
-                    found.update(context.rpartition("|")[0] for context in contexts.get(line, ()))
-            if tests := spread((t for t in found if "::" in t), self._seconds, self.most):
-                return tests, "coverage"
+        covering = {here for m in self._measured for t in m.tests(key) if (here := self._here(t))}
+        if tests := spread(covering, self._seconds, self.most):
+            return tests, "coverage"
         return self._by_name(site), "names"
+
+    def _here(self, test: str) -> str | None:
+        """Return the name that a test has in this tree, None if it is gone."""
+        file, _, name = test.partition("::")
+        file = file if file in self._tests else self._renamed.get(file, file)
+        function = name.partition("[")[0].rpartition("::")[2]
+        return f"{file}::{name}" if f"def {function}(" in self._tests.get(file, "") else None
 
     def _by_name(self, site: Site) -> list[str]:
         module = Path(site.path).stem
@@ -393,8 +412,9 @@ def compare(options: argparse.Namespace) -> dict[str, Any]:
     if options.out.exists():
         results = json.loads(options.out.read_text(encoding="utf-8"))
     seconds = read_seconds(options.durations)
-    covered = {"old": options.old_coverage, "new": options.new_coverage}
-    select = {s: Selection(trees[s], covered[s], seconds, options.most_tests) for s in trees}
+    measured = [Measured(Path(tree).resolve(), Path(file)) for tree, file in options.coverage]
+    renamed = json.loads(options.renamed.read_text(encoding="utf-8")) if options.renamed else {}
+    select = {s: Selection(trees[s], measured, renamed, seconds, options.most_tests) for s in trees}
     work = (options.work or options.out.with_suffix(".work")).resolve()
     copies: queue.Queue[dict[str, Copy]] = queue.Queue()
     for job in range(options.jobs):
@@ -408,7 +428,7 @@ def compare(options: argparse.Namespace) -> dict[str, Any]:
             for side in trees:
                 site = places[side][key]
                 with reading:
-                    tests, how = select[side].tests(site)
+                    tests, how = select[side].tests(key, site)
                 limit_s = options.timeout
                 found[side] = {**pair[side].run(site, tests, limit_s), "found_by": how}
         finally:
@@ -435,8 +455,10 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=100, help="mutations")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--old-coverage", type=Path, metavar="FILE")
-    parser.add_argument("--new-coverage", type=Path, metavar="FILE")
+    parser.add_argument(
+        "--coverage", nargs=2, action="append", default=[], metavar=("TREE", "FILE")
+    )
+    parser.add_argument("--renamed", type=Path, metavar="FILE")
     parser.add_argument("--durations", type=Path, nargs="*", default=[], metavar="LOG")
     parser.add_argument("--most-tests", type=int, default=40, help="of a mutation")
     parser.add_argument("--timeout", type=float, default=300.0, metavar="SECONDS")
