@@ -59,10 +59,7 @@ class CpuBackend(Backend):
         """Return a photo and its mask, whole or a window; see :class:`Backend`."""
         photo, mask = photos.photo(view, divisor), photos.mask(view, divisor)
         if window is not None:
-            rows = slice(window.top, window.top + window.height)
-            columns = slice(window.left, window.left + window.width)
-            photo = np.ascontiguousarray(photo[rows, columns])
-            mask = None if mask is None else np.ascontiguousarray(mask[rows, columns])
+            photo, mask = window.of(photo), None if mask is None else window.of(mask)
         return Shown(photo, mask, *counts_of(mask, *photo.shape[:2]))
 
     def render(self, adam: Adam, camera: Camera, options: RenderOptions) -> ViewPass:
@@ -88,7 +85,7 @@ class CpuBackend(Backend):
         if background is not None:
             color, photo = composited(color, image.alpha, photo, mask, background, store=self.store)
             mask = None
-        value, by_color, figures = color_loss(
+        value, by_color, mean_squared = color_loss(
             color, photo, mask, lambda_dssim=lambda_dssim, threads=threads, store=self.store
         )
         by_alpha = None if background is None else background_gradient(by_color, background)
@@ -98,7 +95,7 @@ class CpuBackend(Backend):
             )
             if by_alpha is not None and more is not None:
                 by_alpha += more
-        return value, ImageGradients(color=by_color, alpha=by_alpha), figures.mean_squared
+        return value, ImageGradients(color=by_color, alpha=by_alpha), mean_squared
 
     def normal_losses(
         self,
@@ -110,19 +107,11 @@ class CpuBackend(Backend):
         lambda_normal: float,
     ) -> tuple[float, ImageGradients]:
         """Return the normal losses and their gradients on the images."""
-        value, gradients, _ = normal_losses(
-            image.depth,
-            image.geometric_normal,
-            image.normal,
-            image.alpha,
-            camera,
-            shown.mask,
-            lambda_depth_normal=lambda_depth_normal,
-            lambda_normal=lambda_normal,
-            threads=self.threads,
-            store=self.store,
-        )
-        return value, gradients
+        return normal_losses(
+            image.depth, image.geometric_normal, image.normal, image.alpha, camera, shown.mask,
+            lambda_depth_normal=lambda_depth_normal, lambda_normal=lambda_normal,
+            threads=self.threads, store=self.store,
+        )  # fmt: skip
 
     def prior_loss(
         self, image: ViewPass, camera: Camera, prior: DepthPrior, shown: Shown, weight: float
@@ -146,15 +135,10 @@ class CpuBackend(Backend):
     ) -> tuple[float, ImageGradients, VisibleGradients | None]:
         """Return the multi-view losses and their gradients."""
         found = multi_view_losses(
-            image,
-            image.gaussians,
-            PhotoView(camera, shown.photo, shown.mask),
-            PhotoView(other_camera, other.photo, other.mask),
-            options,
-            random,
-            threads=self.threads,
-            store=self.store,
-        )
+            image, image.gaussians, PhotoView(camera, shown.photo, shown.mask),
+            PhotoView(other_camera, other.photo, other.mask), options, random,
+            threads=self.threads, store=self.store,
+        )  # fmt: skip
         return found.value, found.gradients, found.other
 
     def backward(self, image: ViewPass, gradients: ImageGradients) -> VisibleGradients:

@@ -300,10 +300,7 @@ class DeviceBackend(Backend):
             options,
             random,
         )
-        gradients = ImageGradients(
-            depth=found.gradients.depth, geometric_normal=found.gradients.geometric_normal
-        )
-        return found.value, gradients, found.other
+        return found.value, found.gradients, found.other
 
     def backward(self, image: DeviceView, gradients: ImageGradients) -> Gradients:
         """Return the gradients on all Gaussians, 0 for those not seen."""

@@ -5,15 +5,12 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
-from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .. import limits
-from ..errors import UsageError
 from ..gaussians.model import OrientedGaussians
 from ..render.cuda.device_query import (
     add_query_gradients,
@@ -21,13 +18,21 @@ from ..render.cuda.device_query import (
     query_view,
     solve_depths,
 )
-from ..render.cuda.device_view import WARPS
+from ..render.cuda.device_view import WARPS, DeviceView
 from ..render.cuda.kernels import THREADS_PER_BLOCK, CameraValues, Kernels
 from ..render.projection import pack_camera
 from ..render.types import ImageGradients, RenderOptions
 from ..resampling import LUMA
 from ..scene.camera import Camera
-from .multi_view import BLOCK_PX, BORDER_PX, MultiViewOptions, PhotoView
+from .losses import lens_of
+from .multi_view import (
+    BLOCK_PX,
+    BORDER_PX,
+    MultiViewLoss,
+    MultiViewMetrics,
+    MultiViewOptions,
+    PhotoView,
+)
 from .multi_view_kernels import KEPT, SAMPLES
 
 # -- Losses on images of a device: those of :mod:`.losses` and :mod:`.losses` as kernels
@@ -115,7 +120,7 @@ def device_normal_losses(
     """
     height, width = depth.shape
     count = height * width
-    packed = np.concatenate([camera.rotation.reshape(-1), _lens(camera)])
+    packed = np.concatenate([camera.rotation.reshape(-1), lens_of(camera)])
     blocks = -(-count // THREADS_PER_BLOCK)
     by_geometric, by_learned = torch.empty_like(geometric_normal), torch.empty_like(normal)
     by_alpha, by_depth = torch.empty_like(alpha), torch.empty_like(depth)
@@ -182,16 +187,12 @@ def device_prior_loss(
         int(confirmed.shape[0]),
         mask if mask is not None else depth.new_empty(0, dtype=torch.bool),
         int(mask is not None),
-        _packed(np.concatenate([_lens(camera), _lens(prior_camera)])),
+        _packed(np.concatenate([lens_of(camera), lens_of(prior_camera)])),
         weight / max(1, pixels),
         by_depth,
         sums,
     )
     return sums.sum(), ImageGradients(depth=by_depth)
-
-
-def _lens(camera: Camera) -> np.ndarray:
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
 def _packed(values: np.ndarray) -> CameraValues:
@@ -206,63 +207,15 @@ def _packed(values: np.ndarray) -> CameraValues:
 # number that the host waits for is that of the tile intersections of the depth query.
 
 
-class DeviceImages(Protocol):
-    """What the terms read of a rendered view; contiguous float32 tensors."""
-
-    @property
-    def depth(self) -> Tensor:
-        """(h, w)."""
-
-    @property
-    def geometric_normal(self) -> Tensor:
-        """(h, w, 3) blended, scene frame."""
-
-    @property
-    def alpha(self) -> Tensor:
-        """(h, w)."""
-
-
-@dataclass(frozen=True)
-class DeviceImageGradients:
-    """Gradient of the terms with respect to the images of the rendered view."""
-
-    depth: Tensor  # (h, w) float32
-    geometric_normal: Tensor  # (h, w, 3) float32
-
-
-@dataclass(frozen=True)
-class DeviceMultiViewLoss:
-    """The weighted sum of both terms and its gradients; all on the device."""
-
-    value: Tensor
-    """() float64."""
-    gradients: DeviceImageGradients
-    other: dict[str, Tensor] | None
-    """On means, log_scales, quats and opacity_logits of all Gaussians, through the other view's
-    depth; ``None`` where the geometric term has no weight."""
-    figures: DeviceMultiViewMetrics
-
-
-@dataclass(frozen=True)
-class DeviceMultiViewMetrics:
-    """Values of the terms and pixel counts, () tensors; see ``MultiViewMetrics``."""
-
-    photometric: Tensor
-    geometric: Tensor
-    chosen: Tensor
-    valid: Tensor
-    kept: Tensor
-
-
 def device_multi_view_losses(
     kernels: Kernels,
-    images: DeviceImages,
+    images: DeviceView,
     gaussians: OrientedGaussians,
     shown: PhotoView,
     other: PhotoView,
     settings: MultiViewOptions,
     random: np.random.Generator,
-) -> DeviceMultiViewLoss:
+) -> MultiViewLoss:
     """Compare a rendered view with the photo and the depth of another view.
 
     The definition, the sampled pixels and the numbers drawn are those of
@@ -272,7 +225,7 @@ def device_multi_view_losses(
     ----------
     kernels : Kernels
         Of the tensors' device.
-    images : DeviceImages
+    images : DeviceView
         Rendered with depth.
     gaussians : OrientedGaussians
         Rendered Gaussians, scene frame.
@@ -284,13 +237,9 @@ def device_multi_view_losses(
 
     Raises
     ------
-    UsageError
-        If the size of a photo or mask differs from its camera's, or a photo is not uint8.
     ResourceError
         If the tile lists are too long to be indexed.
     """
-    _check(shown.camera, shown.photo, shown.mask, images.depth)
-    _check(other.camera, other.photo, other.mask)
     options = RenderOptions(sh_degree=0)
     grey, other_grey = (grey_on_device(kernels, view.photo) for view in (shown, other))
     # A null pointer is no mask.
@@ -329,7 +278,9 @@ def device_multi_view_losses(
         on_other = project_query_gradients(view, depths, grad_params)
     else:
         on_positions = torch.zeros_like(positions)
-    gradients = DeviceImageGradients(torch.zeros_like(depth), torch.zeros_like(normals))
+    gradients = ImageGradients(
+        depth=torch.zeros_like(depth), geometric_normal=torch.zeros_like(normals)
+    )
     kernels.launch_each(
         "finish_pixels",
         len(pixels),
@@ -346,9 +297,9 @@ def device_multi_view_losses(
         gradients.depth,
         gradients.geometric_normal,
     )
-    figures = DeviceMultiViewMetrics(means[0], means[1], (pixels >= 0).sum(), counts[1], counts[0])
+    figures = MultiViewMetrics(means[0], means[1], (pixels >= 0).sum(), counts[1], counts[0])
     value = factors[0] * means[0] + factors[1] * means[1]
-    return DeviceMultiViewLoss(value, gradients, on_other, figures)
+    return MultiViewLoss(value, gradients, on_other, figures)
 
 
 def grey_on_device(kernels: Kernels, photo: Tensor) -> Tensor:
@@ -505,16 +456,3 @@ class _Pair:
             by_normals,
         )
         return states, errors, by_depth, by_normals
-
-
-def _check(camera: Camera, photo: Tensor, mask: Tensor | None, depth: Tensor | None = None) -> None:
-    for name, image in (("photo", photo), ("mask", mask), ("image", depth)):
-        if image is not None and tuple(image.shape[:2]) != (camera.height, camera.width):
-            height, width = image.shape[:2]
-            raise UsageError(
-                f"The {name} is {width} x {height} px, the camera {camera.width} x "
-                f"{camera.height}.",
-                "Use the camera of the same level.",
-            )
-    if photo.dtype != torch.uint8:
-        raise UsageError(f"The photo is {photo.dtype}.", "Give uint8.")

@@ -30,7 +30,7 @@ from ..scene.camera import Camera
 from ..settings import TrainingSettings
 from ..stereo.depth_maps import least_divisor
 from .adam import adam_rows
-from .block_plan import BlockSettings
+from .block_plan import POLISH_ITERATIONS, coarse_settings
 from .schedule import Schedule
 from .start import start_budget
 
@@ -596,12 +596,11 @@ def block_estimates(
     facts: SceneFacts, settings: TrainingSettings, machine: Machine
 ) -> tuple[Estimate, Estimate, Estimate]:
     """Return the estimates of the coarse training, of one block, and of joining all."""
-    blocks = BlockSettings.of(settings)
-    share = min(1.0, PHOTOS_OVERLAP / blocks.blocks)
+    share = min(1.0, PHOTOS_OVERLAP / settings.blocks)
     photos = dataclasses.replace(
         facts,
         photos=max(1, math.ceil(share * facts.photos)),
-        points=math.ceil(facts.points / blocks.blocks),
+        points=math.ceil(facts.points / settings.blocks),
     )
     of_block = dataclasses.replace(
         settings,
@@ -610,21 +609,13 @@ def block_estimates(
         max_gaussians=gaussians_of_block(settings),
         dense_start="off",
     )
-    further = settings.extra_iterations + round(blocks.polish_iterations * settings.iterations)
+    further = settings.extra_iterations + round(POLISH_ITERATIONS * settings.iterations)
     joined = estimate(
         facts, dataclasses.replace(settings, extra_iterations=further, dense_start="off"), machine,
         first=settings.iterations,
     )  # fmt: skip
-    return (
-        estimate(facts, blocks.coarse(settings), machine),
-        estimate(photos, of_block, machine),
-        joined,
-    )
-
-
-def coarse_gaussians(settings: TrainingSettings) -> int:
-    """Return the largest number of Gaussians of the coarse training."""
-    return BlockSettings.of(settings).coarse(settings).max_gaussians
+    coarse = estimate(facts, coarse_settings(settings), machine)
+    return coarse, estimate(photos, of_block, machine), joined
 
 
 def gaussians_of_block(settings: TrainingSettings) -> int:

@@ -4,13 +4,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..compiled import inline, kernel, part
-from ..errors import UsageError
 from ..image_metrics import compare, has_windows
 from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
 from ..render.types import ImageGradients, VisibleGradients
@@ -126,7 +124,12 @@ TOLERANCE_SHARE = 0.01
 OUTLIER_SHARE = 0.03
 """Relative difference from which the photos are believed: stereo misses what is thin."""
 
-_NO_MASK = np.zeros((0, 0), np.bool_)
+NO_MASK = np.zeros((0, 0), np.bool_)
+
+
+def kernel_mask(mask: np.ndarray | None) -> np.ndarray:
+    """Return a mask as kernels take it: contiguous (h, w) bool, or (0, 0) for none."""
+    return NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
 
 
 @kernel(fast=False, fused=True)
@@ -198,17 +201,13 @@ def depth_prior_loss(
     gradients : ImageGradients
         On the depth alone.
     """
-    threads = threads or default_threads()
+    threads, store = threads or default_threads(), store or ArrayStore()
     depth = np.ascontiguousarray(depth)
-    by_depth = (
-        np.empty_like(depth)
-        if store is None
-        else store.take("by depth of the prior", depth.shape, depth.dtype)
-    )
-    flat_mask = _NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
+    by_depth = store.take("by depth of the prior", depth.shape, depth.dtype)
+    flat_mask = kernel_mask(mask)
     pixels = max(1, depth.size if mask is None else int(np.count_nonzero(flat_mask)))
     sums = np.zeros(len(depth))
-    lens, prior_lens = _lens(camera), _lens(prior.camera)
+    lens, prior_lens = lens_of(camera), lens_of(prior.camera)
 
     def run(begin: int, end: int) -> None:
         _prior_rows(
@@ -220,7 +219,8 @@ def depth_prior_loss(
     return float(sums.sum()), ImageGradients(depth=by_depth)
 
 
-def _lens(camera: Camera) -> np.ndarray:
+def lens_of(camera: Camera) -> np.ndarray:
+    """Return fx, fy, cx, cy of a camera, (4,) float64."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
@@ -531,25 +531,6 @@ def agreement_rows(  # type: ignore[no-untyped-def]
 # See docs/method.md, section 3.
 
 
-@dataclass
-class ColorMetrics:
-    """Image metrics from the colour loss, over unmasked values."""
-
-    l1: float
-    mean_squared: float
-    ssim: float
-
-
-@dataclass
-class NormalMetrics:
-    """Terms of the normal losses: means of ``1 - cos`` over all pixels."""
-
-    depth_normal: float
-    normal: float
-    valid_share: float
-    """Share of the pixels where the depth has a normal."""
-
-
 def color_loss(
     image: np.ndarray,
     photo: np.ndarray,
@@ -558,8 +539,8 @@ def color_loss(
     lambda_dssim: float = 0.2,
     threads: int = 0,
     store: ArrayStore | None = None,
-) -> tuple[float, np.ndarray, ColorMetrics]:
-    """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and metrics.
+) -> tuple[float, np.ndarray, float]:
+    """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and the mean squared error.
 
     See docs/method.md, section 3.1.
 
@@ -580,22 +561,22 @@ def color_loss(
     loss : float
         0 if the mask leaves no pixel.
     gradient : (h, w, 3), of the image's type
-    figures : ColorMetrics
+    mean_squared : float
 
     Raises
     ------
     UsageError
         If the shapes differ.
     """
-    threads = threads or default_threads()
+    threads, store = threads or default_threads(), store or ArrayStore()
     if not has_windows(image.shape, mask):
         lambda_dssim = 0.0
     weights = (1.0 - lambda_dssim, -lambda_dssim)
-    out = _take(store, "by color", image)
+    out = store.take("by color", image.shape, image.dtype)
     found = compare(image, photo, mask, weights=weights, threads=threads, out=out)
     assert found.gradient is not None
     value = (1.0 - lambda_dssim) * found.absolute + lambda_dssim * (1.0 - found.similarity)
-    return value, found.gradient, ColorMetrics(found.absolute, found.squared, found.similarity)
+    return value, found.gradient, found.squared
 
 
 def normals_from_depth(
@@ -622,14 +603,13 @@ def normals_from_depth(
         The pixel is not on the border and all five pixels of the cross have depth.
     """
     threads = threads or default_threads()
-    _check_size(depth, camera)
     depth = np.ascontiguousarray(depth)
     local = np.empty((*depth.shape, 3), depth.dtype)  # camera frame
     valid = np.empty(depth.shape, np.bool_)
-    packed = _pack(camera)
+    lens = lens_of(camera)
 
     def run(begin: int, end: int) -> None:
-        normal_rows(begin, end, depth, packed, max_jump, local, valid)
+        normal_rows(begin, end, depth, lens, max_jump, local, valid)
 
     run_chunks(run, even_bounds(len(depth), threads, 2), threads)
     return local @ camera.rotation.astype(local.dtype), valid
@@ -648,8 +628,8 @@ def normal_losses(
     max_jump: float = 0.0,
     threads: int = 0,
     store: ArrayStore | None = None,
-) -> tuple[float, ImageGradients, NormalMetrics]:
-    """Return ``lambda_DN L_DN + lambda_N L_N``, its gradients and both means.
+) -> tuple[float, ImageGradients]:
+    """Return ``lambda_DN L_DN + lambda_N L_N`` and its gradients.
 
     See docs/method.md, sections 3.2 and 3.3.
 
@@ -675,61 +655,33 @@ def normal_losses(
     loss : float
     gradients : ImageGradients
         On all four images; none on the colour.
-    figures : NormalMetrics
-
-    Raises
-    ------
-    UsageError
-        If the camera's size is not the image's.
     """
-    threads = threads or default_threads()
-    _check_size(depth, camera)
+    threads, store = threads or default_threads(), store or ArrayStore()
     height, width = depth.shape
     z, cover = np.ascontiguousarray(depth), np.ascontiguousarray(alpha)
     geometric = np.ascontiguousarray(geometric_normal).reshape(height, -1)  # (h, 3 w)
     learned = np.ascontiguousarray(normal).reshape(height, -1)
-    flat_mask = _NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
+    flat_mask = kernel_mask(mask)
     pixels = max(1, height * width if mask is None else int(np.count_nonzero(flat_mask)))
     sums = np.empty((height, 3))
     by_geometric, by_learned = (
-        _take(store, name, geometric) for name in ("by geometric normal", "by normal")
+        store.take(name, geometric.shape, geometric.dtype)
+        for name in ("by geometric normal", "by normal")
     )
-    by_depth, by_alpha = (_take(store, name, z) for name in ("by depth", "by alpha"))
-    packed, rotation = _pack(camera), np.ascontiguousarray(camera.rotation)
+    by_depth, by_alpha = (store.take(name, z.shape, z.dtype) for name in ("by depth", "by alpha"))
+    lens, rotation = lens_of(camera), np.ascontiguousarray(camera.rotation)
 
     def run(begin: int, end: int) -> None:
         agreement_rows(
-            begin, end, z, packed, rotation, flat_mask, geometric, learned, cover, max_jump,
+            begin, end, z, lens, rotation, flat_mask, geometric, learned, cover, max_jump,
             lambda_depth_normal / pixels, lambda_normal / pixels, sums,
             by_depth, by_geometric, by_learned, by_alpha,
         )  # fmt: skip
 
     run_chunks(run, even_bounds(height, threads, 1), threads)
-    depth_normal, oriented, share = (sums.sum(0) / pixels).tolist()
+    depth_normal, oriented, _ = (sums.sum(0) / pixels).tolist()
     value = lambda_depth_normal * depth_normal + lambda_normal * oriented
-    gradients = ImageGradients(
+    return value, ImageGradients(
         normal=by_learned.reshape(height, width, 3),
-        geometric_normal=by_geometric.reshape(height, width, 3),
-        alpha=by_alpha,
-        depth=by_depth,
-    )
-    return value, gradients, NormalMetrics(depth_normal, oriented, share)
-
-
-def _take(store: ArrayStore | None, name: str, like: np.ndarray) -> np.ndarray:
-    if store is None:
-        return np.empty(like.shape, like.dtype)
-    return store.take(name, like.shape, like.dtype)
-
-
-def _check_size(depth: np.ndarray, camera: Camera) -> None:
-    height, width = depth.shape
-    if (height, width) != (camera.height, camera.width):
-        raise UsageError(
-            f"The depth map is {width} x {height} px, the camera {camera.width} x {camera.height}.",
-            "Use the camera that rendered it.",
-        )
-
-
-def _pack(camera: Camera) -> np.ndarray:
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        geometric_normal=by_geometric.reshape(height, width, 3), alpha=by_alpha, depth=by_depth,
+    )  # fmt: skip

@@ -70,9 +70,7 @@ def transform_gaussians(
     )
 
 
-def within_reach(
-    gaussians: OrientedGaussians,
-) -> tuple[OrientedGaussians, list[ReportWarning]]:
+def within_reach(gaussians: OrientedGaussians) -> tuple[OrientedGaussians, list[ReportWarning]]:
     """Leave out Gaussians of the scene frame that are too far away to be trained.
 
     Raises

@@ -43,7 +43,7 @@ from .growth_selection import photo_detail, select_image_size
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import Correction, LiveView, divisor_for, held_out_metrics, measure_held_out
 from .model_selection import Decision, start_poses
-from .multi_view import NeighbourLimits, find_neighbours
+from .multi_view import find_neighbours
 from .rounds import Inside, Rounds
 from .schedule import SMALLEST_SIDE_PX, Schedule
 from .splat_start import start_from_splat, wrapping_settings
@@ -382,8 +382,7 @@ class _Trainer:
             raise DatasetError("No photo is left to train on.", "Add photos or check the masks.")
         sizes = [photos.camera(i, 1) for i in self.views]
         side_px = max(max(c.width, c.height) for c in sizes)
-        limits = NeighbourLimits.of_settings(settings)
-        found = find_neighbours(sizes, limits, points=scene.points)
+        found = find_neighbours(sizes, settings, points=scene.points)
         numbers = np.array(self.views)
         self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
         self.image_decision, finest = self._image_size(side_px)

@@ -12,7 +12,7 @@ import pytest
 from gaussian_wrapping_addon.core.errors import ResourceError, UsageError
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.stereo.depth_maps import least_divisor
-from gaussian_wrapping_addon.core.training.block_plan import BlockSettings
+from gaussian_wrapping_addon.core.training.block_plan import coarse_settings
 from gaussian_wrapping_addon.core.training.estimate import (
     MATCHING_PIXEL_BYTES,
     MATCHING_PIXEL_S,
@@ -199,7 +199,10 @@ def test_more_blocks_make_smaller_processes() -> None:
     assert block == sorted(block, reverse=True)
     assert block[3] < 0.2 * block[0]
     assert coarse == sorted(coarse, reverse=True)
-    assert [BlockSettings(n).coarse_share for n in (2, 4, 8, 16)] == [0.5, 0.5, 0.25, 0.125]
+    assert [
+        coarse_settings(replace(LARGE, blocks=n)).max_gaussians / LARGE.max_gaussians
+        for n in (2, 4, 8, 16)
+    ] == [0.5, 0.5, 0.25, 0.125]
 
 
 def test_more_blocks_than_photos_are_refused_before_anything_is_trained() -> None:
