@@ -71,7 +71,6 @@ def check_kernels(kernels: Kernels, device: torch.device) -> str:
 
     Parameters
     ----------
-    kernels : Kernels
     device : torch.device
         Where their tensors are.
     """

@@ -42,13 +42,9 @@ EPSILON = 1e-20
 def pose_rate_px(iteration: int, iterations: int, photos: int) -> float:
     """Return the learning rate of an iteration: how far a step moves the image, in pixels."""
     return photo_rate(
-        iteration,
-        iterations,
-        photos,
-        travel=TRAVEL_PX,
-        bounds=(SMALLEST_RATE_PX, LARGEST_RATE_PX),
-        last_share=LAST_SHARE,
-    )
+        iteration, iterations, photos,
+        travel=TRAVEL_PX, bounds=(SMALLEST_RATE_PX, LARGEST_RATE_PX), last_share=LAST_SHARE,
+    )  # fmt: skip
 
 
 class CameraPoses:

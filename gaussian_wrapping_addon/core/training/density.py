@@ -259,7 +259,6 @@ class DeviceDensityStatistics(DensityStatistics):
     ----------
     statistics : DensityStatistics
         Sums so far.
-    device : torch.device
     """
 
     def __init__(self, statistics: DensityStatistics, device: torch.device) -> None:

@@ -29,7 +29,6 @@ class DeviceAdam(Adam):
         Its values, moments and steps are copied to the device.
     kernels : Kernels
         Of the device.
-    device : torch.device
     """
 
     def __init__(self, adam: Adam, kernels: Kernels, device: torch.device) -> None:

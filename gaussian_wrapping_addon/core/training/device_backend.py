@@ -45,7 +45,6 @@ class DevicePhotos:
 
     Parameters
     ----------
-    device : torch.device
     limit_bytes : int
         Device memory; the photo in use is kept whatever its size.
     """
@@ -122,8 +121,6 @@ class DeviceBackend(Backend):
     ----------
     name : str
         Such as "cuda:0".
-    kernels : Kernels
-    device : torch.device
     free_bytes : callable
         Returns the device memory that tile intersections may take now.
     photo_bytes : int

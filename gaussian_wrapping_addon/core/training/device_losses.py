@@ -231,7 +231,6 @@ def device_multi_view_losses(
         Rendered Gaussians, scene frame.
     shown, other : PhotoView
         The rendered view's and another; sizes may differ.
-    settings : MultiViewOptions
     random : numpy Generator
         ``settings.pixels`` numbers are drawn, none where all pixels are taken.
 

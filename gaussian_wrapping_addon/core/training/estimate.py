@@ -397,38 +397,23 @@ def _trained_pixels(facts: SceneFacts, settings: TrainingSettings) -> float:
 
 
 def _seconds(
-    facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray, first: int = 0
+    facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray, first: int, on_gpu: bool
 ) -> float:
-    """Return the modelled time on the reference machine, from iteration ``first`` on."""
+    """Return the modelled time on the reference machine or GPU, from iteration ``first`` on."""
     schedule, pixels = _schedule(facts, settings), _trained_pixels(facts, settings)
-    last = settings.iterations - 1
+    compares = settings.multi_view != "off" and facts.photos > 1
     total_s = 0.0
-    for iteration, count in enumerate(counts.tolist()):
-        if iteration < first:
-            continue
-        planned = min(iteration, last)
+    for iteration, count in enumerate(counts[first:].tolist(), first):
+        planned = min(iteration, settings.iterations - 1)
         size = _window(pixels / schedule.divisor(planned) ** 2, settings.pixels_per_iteration)
+        if on_gpu:
+            total_s += GPU_ITERATION_S + size * GPU_PIXEL_S + count * GPU_GAUSSIAN_S
+            continue
         depth = schedule.uses_depth(planned)
         spent_s = size * PIXEL_S * (1.0 if depth else WITHOUT_DEPTH) + count * GAUSSIAN_S
-        compares = settings.multi_view != "off" and facts.photos > 1
         if compares and schedule.compares_views(planned):
             spent_s *= 1.0 + MULTI_VIEW_SHARE
         total_s += ITERATION_S + spent_s
-    return total_s
-
-
-def _gpu_seconds(
-    facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray, first: int
-) -> float:
-    """Return the modelled time on the reference GPU, from iteration ``first`` on."""
-    schedule, pixels = _schedule(facts, settings), _trained_pixels(facts, settings)
-    total_s = 0.0
-    for iteration, count in enumerate(counts.tolist()):
-        if iteration < first:
-            continue
-        divisor = schedule.divisor(min(iteration, settings.iterations - 1))
-        size = _window(pixels / divisor**2, settings.pixels_per_iteration)
-        total_s += GPU_ITERATION_S + size * GPU_PIXEL_S + count * GPU_GAUSSIAN_S
     return total_s
 
 
@@ -456,9 +441,6 @@ def estimate(
 
     Parameters
     ----------
-    scene_facts : SceneFacts
-    settings : TrainingSettings
-    machine : Machine
     first : int
         Iterations already done by a checkpoint.
 
@@ -475,12 +457,14 @@ def estimate(
     matched = _matched_pixels(scene_facts, settings)
     matching_s = MATCHING_PIXEL_S * matched if first == 0 else 0.0
     if machine.gpu_speed:
-        iterating = [_gpu_seconds(scene_facts, settings, c, first) for c in (least, most)]
+        iterating = [_seconds(scene_facts, settings, c, first, True) for c in (least, most)]
         low_s = LOW * (iterating[0] / machine.gpu_speed + matching_s / machine.speed)
         high_s = HIGH * (iterating[1] / machine.gpu_speed + matching_s / machine.speed)
     else:
-        low_s = LOW * (_seconds(scene_facts, cheap, least, first) + matching_s) / machine.speed
-        high_s = HIGH * (_seconds(scene_facts, settings, most, first) + matching_s) / machine.speed
+        low_s = _seconds(scene_facts, cheap, least, first, False)
+        high_s = _seconds(scene_facts, settings, most, first, False)
+        low_s = LOW * (low_s + matching_s) / machine.speed
+        high_s = HIGH * (high_s + matching_s) / machine.speed
     count = math.ceil(float(most.max()))
     value_bytes = gaussian_bytes(settings)
     state_bytes = 3 * value_bytes + 20  # with both moments, filter, steps, statistics

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ..compiled import kernel
-from ..errors import UsageError
 from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
 
 # -- Adam for values of single photos: exposures, camera poses ------------------------------------
@@ -209,13 +208,9 @@ def exposure_rate(iteration: int, iterations: int, photos: int) -> float:
     to :data:`LAST_SHARE` of that.
     """
     return photo_rate(
-        iteration,
-        iterations,
-        photos,
-        travel=TRAVEL,
-        bounds=(REFERENCE_RATE, LARGEST_RATE),
-        last_share=LAST_SHARE,
-    )
+        iteration, iterations, photos,
+        travel=TRAVEL, bounds=(REFERENCE_RATE, LARGEST_RATE), last_share=LAST_SHARE,
+    )  # fmt: skip
 
 
 class Exposure:
@@ -231,22 +226,12 @@ class Exposure:
         Initial log gains of display values plus :data:`SRGB_PEDESTAL`, as estimated by
         :mod:`.exposure_selection`; a short run then only refines them. Non-finite
         values count as 0.
-
-    Raises
-    ------
-    UsageError
-        A trained view does not exist, or the gains have the wrong shape.
     """
 
     def __init__(
         self, count: int, trained: Sequence[int], log_gains: np.ndarray | None = None
     ) -> None:
         self.trained = np.unique(np.asarray(trained, np.int64))
-        if len(self.trained) and (self.trained[0] < 0 or self.trained[-1] >= count):
-            raise UsageError(
-                f"Exposures of {count} views cannot hold view {int(self.trained[-1])}.",
-                "Number the views of the scene from 0.",
-            )
         self.values = np.zeros((count, 6), np.float32)
         """Log gains of red, green, blue, then offsets at :data:`PIVOT`; display values."""
         self.adam = PhotoAdam(count, 6, np.float32, EPSILON)
@@ -256,12 +241,7 @@ class Exposure:
         self.active = True
         """Whether steps change exposures."""
         if log_gains is not None:
-            start = np.asarray(log_gains, np.float64)
-            if start.shape != (count, 3):
-                raise UsageError(
-                    f"Gains to start from have the shape {start.shape}.", f"Give ({count}, 3)."
-                )
-            start = np.where(np.isfinite(start), start, 0.0)[self.trained]
+            start = np.where(np.isfinite(log_gains), log_gains, 0.0)[self.trained]
             self.values[self.trained, :3] = start
             self.values[self.trained, 3:] = (SRGB_PEDESTAL + PIVOT) * np.expm1(start)
         self.pin()
@@ -273,7 +253,6 @@ class Exposure:
 
         Parameters
         ----------
-        view : int
         color : (h, w, 3) float32 or float64
         alpha : (h, w), the same type, optional
             The offset is then ``b alpha``, as for a colour blended over emptiness. For images that
@@ -322,11 +301,6 @@ class Exposure:
         """
         color, cover = self._arrays(color, alpha)
         by_out = np.ascontiguousarray(by_corrected, color.dtype)
-        if by_out.shape != color.shape:
-            raise UsageError(
-                f"Image {color.shape} and gradient {by_out.shape} differ in size.",
-                "Pass the gradient of the corrected image.",
-            )
         by_color = self._store.take(f"by color {color.dtype}", color.shape, color.dtype)
         by_alpha = self._store.take(f"by alpha {color.dtype}", cover.shape, color.dtype)
         gains, offsets = self.factors(view, color.dtype)
@@ -407,19 +381,9 @@ class Exposure:
     @staticmethod
     def _arrays(color: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         color = np.ascontiguousarray(color)
-        if color.ndim != 3 or color.shape[2] != 3 or color.dtype not in _NO_ALPHA:
-            raise UsageError(
-                f"An image is {color.dtype} {color.shape}.", "Give (height, width, 3) floats."
-            )
         if alpha is None:
             return color, _NO_ALPHA[color.dtype]
-        cover = np.ascontiguousarray(alpha, color.dtype)
-        if cover.shape != color.shape[:2]:
-            raise UsageError(
-                f"Image {color.shape} and alpha {cover.shape} differ in size.",
-                "Pass the alpha of the same render.",
-            )
-        return color, cover
+        return color, np.ascontiguousarray(alpha, color.dtype)
 
 
 FIT_ROUNDS = 8
@@ -454,19 +418,9 @@ def fit_exposure(
     gain, offset : (3,) float64
         ``photo ~ gain render + offset``; 1 and 0 for a channel with fewer than
         :data:`MIN_FIT_PIXELS` usable pixels.
-
-    Raises
-    ------
-    UsageError
-        If the shapes differ.
     """
     x, y = np.asarray(render, np.float64), np.asarray(photo)
     y = y / 255.0 if y.dtype == np.uint8 else y.astype(np.float64)
-    if x.shape != y.shape or (mask is not None and np.shape(mask) != x.shape[:2]):
-        raise UsageError(
-            f"Render {x.shape}, photo {y.shape} and mask differ in size.",
-            "Compare images of one camera.",
-        )
     gain, offset = np.ones(3), np.zeros(3)
     for channel in range(3):
         value = y[..., channel]

@@ -277,7 +277,6 @@ class ErrorHistory:
 
         Parameters
         ----------
-        iteration, view, gaussians : int
         mean_squared : float
             Mean squared colour error of the photo, before the step.
         divisor : int

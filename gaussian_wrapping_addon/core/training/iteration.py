@@ -54,15 +54,12 @@ class Stepper:
 
     Parameters
     ----------
-    photos : PhotoStore
-    schedule : Schedule
     views : sequence of int
         Training views.
     neighbours : dict of int to (k,) array
         For each training view, the views that the multi-view terms compare it with.
     backend : Backend
         Computes; the samples drawn do not depend on it.
-    threads : int
     """
 
     def __init__(

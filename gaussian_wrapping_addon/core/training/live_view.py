@@ -75,7 +75,6 @@ def measure_held_out(
     ----------
     gaussians : OrientedGaussians
         The tensors in training; neither copied nor changed.
-    photos : PhotoStore
     held_out : sequence of int
         Held-out views; :data:`MEASURED_VIEWS` of them, evenly spread, are measured.
     threads : int
@@ -138,7 +137,6 @@ class LiveView:
         :data:`~.preview_points.POINTS_FILE`, each replaced atomically.
     settings : TrainingSettings
         ``preview_every_s`` is the time between two updates; 0 disables them.
-    threads : int
     renderer : Renderer, optional
         By default one on the processor.
     otherwise : int

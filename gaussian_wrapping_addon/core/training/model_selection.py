@@ -155,7 +155,6 @@ def select_multi_view(neighbours: Sequence[np.ndarray], setting: str = "auto") -
     ----------
     neighbours : sequence of (k,) int arrays
         Neighbours of each training view.
-    setting : str
     """
     count = len(neighbours)
     paired = sum(len(of_view) > 0 for of_view in neighbours)

@@ -378,7 +378,6 @@ def multi_view_losses(
         Rendered Gaussians, scene frame.
     shown, other : PhotoView
         The rendered view's and another; sizes may differ.
-    settings : MultiViewOptions
     random : numpy Generator
         ``settings.pixels`` numbers are drawn, none where all pixels are taken.
     threads : int

@@ -41,7 +41,6 @@ class Rounds:
 
     Parameters
     ----------
-    stepper : Stepper
     inside : callable, optional
         Tells which points lie in the regions that density control favours.
     progress : Progress

@@ -6,10 +6,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +25,7 @@ from ..render.types import RenderOptions
 from ..scene.camera import Camera, Similarity, quaternion_from_rotation
 from ..scene.scene import PhotoSource, Scene, evenly_spaced, usable_points
 from ..settings import TrainingSettings
+from .state import cancellable
 from .wrapping import orient
 
 # -- Similarity transforms of Gaussians: means, shapes, orientations and harmonics ----------------
@@ -47,7 +46,6 @@ def transform_gaussians(
     ----------
     gaussians : OrientedGaussians
         Source frame; lengths (``filter_3d`` too) in its units.
-    target_from_source : Similarity
 
     Returns
     -------
@@ -173,16 +171,6 @@ CLEAR_DB = 20.0
 _SMALL_DIVISOR = 4
 
 
-@dataclass(frozen=True)
-class SplatStart:
-    """Initial state of a training from a splat."""
-
-    gaussians: OrientedGaussians
-    """float32, scene frame; ``filter_3d`` of the training cameras at full size."""
-    warnings: tuple[ReportWarning, ...] = ()
-    facts: dict[str, Any] = field(default_factory=dict)
-
-
 def wrapping_settings(settings: TrainingSettings) -> TrainingSettings:
     """Return the settings of a short training from a splat.
 
@@ -214,7 +202,7 @@ def start_from_splat(
     progress: Progress,
     *,
     threads: int = 0,
-) -> SplatStart:
+) -> tuple[OrientedGaussians, list[ReportWarning]]:
     """Read a splat in the world frame of the photos' cameras and prepare it for training.
 
     Parameters
@@ -223,7 +211,6 @@ def start_from_splat(
         3D Gaussian splatting PLY of any program.
     scene : Scene
         Scene of the photos.
-    photos : PhotoStore
     view_indices : sequence of int
         Training views.
     settings : TrainingSettings
@@ -233,7 +220,9 @@ def start_from_splat(
 
     Returns
     -------
-    SplatStart
+    gaussians : OrientedGaussians
+        float32, scene frame; ``filter_3d`` of the training cameras at full size.
+    warnings : list of ReportWarning
 
     Raises
     ------
@@ -249,7 +238,7 @@ def start_from_splat(
     moved, far = within_reach(transform_gaussians(wanted, scene.world_from_scene.inverse()))
     cameras = [photos.camera(i, 1) for i in view_indices]
     gaussians = fit_filter(moved, cameras, variance_px=settings.filter_variance, threads=threads)
-    warnings, facts = [*splat.warnings, *far], dict(splat.facts)
+    warnings = [*splat.warnings, *far]
     if len(gaussians) > settings.max_gaussians:
         text = (
             f"The splat has {len(gaussians)} Gaussians; the {settings.max_gaussians} with the "
@@ -261,11 +250,9 @@ def start_from_splat(
         # A stable order makes ties depend on the file alone.
         kept = np.sort(np.argsort(-weights, kind="stable")[: settings.max_gaussians])
         gaussians = gaussians.select(torch.from_numpy(kept))
-    facts["splat_kept"] = len(gaussians)
     matched, unlike = _compare_with_photos(
         gaussians, photos, view_indices, progress, threads=threads
     )
-    facts["splat_psnr"] = round(matched, 2)
     if unlike:
         raise DatasetError(
             f"The splat {path.name} does not match the photos (PSNR {matched:.1f} dB): its "
@@ -274,8 +261,9 @@ def start_from_splat(
             "splat alone, without photos.",
         )
     if not splat.oriented:
-        gaussians = orient(gaussians, _voters(photos, view_indices, progress), threads=threads)
-    return SplatStart(gaussians, tuple(warnings), facts)
+        voters = (photos.camera(i, _divisor(photos, i)) for i in view_indices)
+        gaussians = orient(gaussians, cancellable(voters, progress), threads=threads)
+    return gaussians, warnings
 
 
 def baked(gaussians: OrientedGaussians) -> OrientedGaussians:
@@ -341,15 +329,6 @@ def _divisor(photos: PhotoSource, index: int) -> int:
     """Return the divisor of a small image that still has a few tiles."""
     camera = photos.camera(index, 1)
     return _SMALL_DIVISOR if min(camera.width, camera.height) >= 32 * _SMALL_DIVISOR else 1
-
-
-def _voters(
-    photos: PhotoSource, view_indices: Sequence[int], progress: Progress
-) -> Iterator[Camera]:
-    """Yield small cameras of all views, checking for cancellation before each."""
-    for index in view_indices:
-        progress.check()
-        yield photos.camera(index, _divisor(photos, index))
 
 
 def _mean_weights(

@@ -95,7 +95,6 @@ def far_shell(
 
     Parameters
     ----------
-    depth_maps : sequence of DepthMap
     points : (n, 3) float64
         Points known so far, scene frame; they cover the cells that they project into.
     wanted : int
@@ -230,13 +229,10 @@ def dense_start(
 
     Parameters
     ----------
-    scene : Scene
-    photos : PhotoSource
     views : sequence of int
         Training views.
     setting : str
         ``"auto"`` needs :data:`LEAST_CONFIRMED` of the pixels; ``"on"`` takes what there is.
-    progress : Progress
     side_px : int
         Longest side at which photos are matched.
     max_gaussians : int

@@ -105,12 +105,10 @@ def with_backdrop(
     ----------
     gaussians : OrientedGaussians
         Trained, scene frame.
-    photos : PhotoSource
     views : sequence of int
         Training views.
     renderer : Renderer, optional
         Overwrites its last view; by default one on the processor.
-    threads : int
     check : callable, optional
         Called before each view; an exception ends the work.
     """
@@ -296,10 +294,8 @@ def train(
 
     Parameters
     ----------
-    scene : Scene
     photos : PhotoStore
         Photos, masks and cameras of the scene's views.
-    settings : TrainingSettings
     folder : Path
         Receives checkpoints and preview pictures.
     progress : Progress
@@ -317,10 +313,6 @@ def train(
     handover : Handover, optional
         What another training of the scene has found; nothing is started or decided then. The
         result's ``poses`` are ``None``.
-
-    Returns
-    -------
-    TrainingResult
 
     Raises
     ------
@@ -534,12 +526,11 @@ class _Trainer:
         if self.start_splat is None:
             gaussians, decision, self.stepper.priors = self._point_start().gaussians(key, progress)
         else:
-            start = start_from_splat(
+            gaussians, of_splat = start_from_splat(
                 self.start_splat, self.scene, self.photos, self.views, self.settings, progress,
                 threads=self.threads,
             )  # fmt: skip
-            gaussians = start.gaussians
-            warnings += start.warnings
+            warnings += of_splat
         state = TrainingState.start(gaussians, self.seed)
         state.warnings = warnings
         if self.start_splat is not None:
