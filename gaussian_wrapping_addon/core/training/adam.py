@@ -27,13 +27,9 @@ _TENSORS = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation
 
 
 def merge_gradients(
-    first: VisibleGradients,
-    second: VisibleGradients,
-    count: int,
-    *,
-    threads: int = 0,
+    first: VisibleGradients, second: VisibleGradients, count: int, *, threads: int = 0,
     store: ArrayStore | None = None,
-) -> VisibleGradients:
+) -> VisibleGradients:  # fmt: skip
     """Return the sum of two gradients, Gaussian by Gaussian.
 
     Parameters
@@ -78,13 +74,9 @@ def merge_gradients(
 
 
 def _add_rows_everywhere(
-    first_rows: np.ndarray,
-    second_rows: np.ndarray,
-    first: np.ndarray,
-    second: np.ndarray,
-    out: np.ndarray,
-    threads: int,
-) -> None:
+    first_rows: np.ndarray, second_rows: np.ndarray, first: np.ndarray, second: np.ndarray,
+    out: np.ndarray, threads: int,
+) -> None:  # fmt: skip
     def run(begin: int, end: int) -> None:
         _add_rows(begin, end, first_rows, second_rows, first, second, out)
 
@@ -104,14 +96,9 @@ def add_image_gradients(first: ImageGradients, second: ImageGradients) -> ImageG
 
 @kernel(fast=False)
 def _add_rows(
-    begin: int,
-    end: int,
-    first_rows: np.ndarray,
-    second_rows: np.ndarray,
-    first: np.ndarray,
-    second: np.ndarray,
-    out: np.ndarray,
-) -> None:
+    begin: int, end: int, first_rows: np.ndarray, second_rows: np.ndarray, first: np.ndarray,
+    second: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
     """Sum the rows of both (-1: none) into rows [begin, end) of ``out``."""
     for k in range(begin, end):
         one, two = first_rows[k], second_rows[k]
@@ -473,13 +460,9 @@ class Adam:
         return twin
 
     def step_rows(
-        self,
-        gradients: VisibleGradients,
-        rates: Mapping[str, np.ndarray],
-        *,
-        sh_degree: int | None = None,
-        threads: int = 0,
-    ) -> None:
+        self, gradients: VisibleGradients, rates: Mapping[str, np.ndarray], *,
+        sh_degree: int | None = None, threads: int = 0,
+    ) -> None:  # fmt: skip
         """Step the Gaussians that a view has seen, in place.
 
         A Gaussian counts as seen if any of its gradients is not 0. Listed Gaussians that are hidden

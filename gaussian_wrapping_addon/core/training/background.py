@@ -26,14 +26,9 @@ def draw_background(random: np.random.Generator) -> np.ndarray:
 
 
 def composited(
-    color: np.ndarray,
-    alpha: np.ndarray,
-    photo: np.ndarray,
-    mask: np.ndarray | None,
-    background: np.ndarray,
-    *,
-    store: ArrayStore | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+    color: np.ndarray, alpha: np.ndarray, photo: np.ndarray, mask: np.ndarray | None,
+    background: np.ndarray, *, store: ArrayStore | None = None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Composite render and photo over a background colour, to be compared without a mask.
 
     Parameters

@@ -109,17 +109,10 @@ class CoarseTraining:
 
 
 def train_coarse(
-    scene: Scene,
-    photos: PhotoSource,
-    settings: TrainingSettings,
-    folder: Path,
-    progress: Progress,
-    *,
-    seed: int = 0,
-    threads: int = 0,
-    inside: Inside | None = None,
+    scene: Scene, photos: PhotoSource, settings: TrainingSettings, folder: Path, progress: Progress,
+    *, seed: int = 0, threads: int = 0, inside: Inside | None = None,
     backend: Backend | None = None,
-) -> CoarseTraining:
+) -> CoarseTraining:  # fmt: skip
     """Train the whole scene coarsely, or read a finished such training of the same folder.
 
     Parameters
@@ -147,13 +140,9 @@ def train_coarse(
 
 
 def confirmed_depths(
-    coarse: CoarseTraining,
-    folder: Path,
-    photos: PhotoSource,
-    settings: TrainingSettings,
-    all_views: Sequence[int],
-    views: Sequence[int],
-) -> dict[int, DepthPrior]:
+    coarse: CoarseTraining, folder: Path, photos: PhotoSource, settings: TrainingSettings,
+    all_views: Sequence[int], views: Sequence[int],
+) -> dict[int, DepthPrior]:  # fmt: skip
     """Read the depths that a dense start of the coarse training confirmed for some views.
 
     Parameters
@@ -293,13 +282,9 @@ class Visibility:
     """Renders what each photo shows of some Gaussians, small, in the renderer's last view."""
 
     def __init__(
-        self,
-        gaussians: OrientedGaussians,
-        photos: PhotoSource,
-        views: Sequence[int],
-        renderer: Renderer,
-        threads: int,
-    ) -> None:
+        self, gaussians: OrientedGaussians, photos: PhotoSource, views: Sequence[int],
+        renderer: Renderer, threads: int,
+    ) -> None:  # fmt: skip
         self._raw, self._photos, self._views = RawArrays.from_gaussians(gaussians), photos, views
         self._renderer = renderer
         self._options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
@@ -502,15 +487,9 @@ photos. Others stand still: as the block's photos hardly show them, it would onl
 
 
 def plan_blocks(
-    coarse: CoarseTraining,
-    scene: Scene,
-    photos: PhotoSource,
-    settings: TrainingSettings,
-    progress: Progress,
-    *,
-    renderer: Renderer | None = None,
-    threads: int = 0,
-) -> BlockPlan:
+    coarse: CoarseTraining, scene: Scene, photos: PhotoSource, settings: TrainingSettings,
+    progress: Progress, *, renderer: Renderer | None = None, threads: int = 0,
+) -> BlockPlan:  # fmt: skip
     """Divide a training into blocks. The plan depends on the inputs alone.
 
     Parameters
@@ -601,13 +580,9 @@ def _is_near(camera: Camera, means: np.ndarray, weights: np.ndarray) -> np.ndarr
 
 
 def _balanced(
-    means: np.ndarray,
-    near: np.ndarray,
-    sizes: np.ndarray,
-    cells: int,
-    seen: Visibility,
+    means: np.ndarray, near: np.ndarray, sizes: np.ndarray, cells: int, seen: Visibility,
     progress: Progress,
-) -> tuple[Tiling, np.ndarray]:
+) -> tuple[Tiling, np.ndarray]:  # fmt: skip
     """Return the cells, and the photos of each, (photos, cells) bool, of least largest cost."""
     low, high = _extent(means, near)
     costs = np.where(((means >= low) & (means <= high)).all(1), near, 0.0)

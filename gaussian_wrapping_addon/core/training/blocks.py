@@ -105,16 +105,10 @@ rates, whichever way the gradients point."""
 
 
 def joint_training(
-    plan: BlockPlan,
-    parts: Iterable[OrientedGaussians],
-    photos: PhotoSource,
-    settings: TrainingSettings,
-    progress: Progress,
-    renderer: Renderer,
-    *,
-    threads: int = 0,
+    plan: BlockPlan, parts: Iterable[OrientedGaussians], photos: PhotoSource,
+    settings: TrainingSettings, progress: Progress, renderer: Renderer, *, threads: int = 0,
     priors: Mapping[int, DepthPrior] | None = None,
-) -> tuple[TrainingSettings, Handover]:
+) -> tuple[TrainingSettings, Handover]:  # fmt: skip
     """Join the Gaussians of all blocks; return settings and handover to train them together.
 
     The last iterations are those of a training that is continued: on all photos, at the last

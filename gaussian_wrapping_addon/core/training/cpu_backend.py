@@ -67,15 +67,9 @@ class CpuBackend(Backend):
         return self.renderer.render(RawArrays.from_gaussians(adam.gaussians()), camera, options)
 
     def compare_colors(
-        self,
-        image: ViewPass,
-        shown: Shown,
-        lambda_dssim: float,
-        *,
-        exposure: tuple[Exposure, int] | None,
-        background: np.ndarray | None,
-        over_emptiness: bool,
-    ) -> tuple[float, ImageGradients, float]:
+        self, image: ViewPass, shown: Shown, lambda_dssim: float, *,
+        exposure: tuple[Exposure, int] | None, background: np.ndarray | None, over_emptiness: bool,
+    ) -> tuple[float, ImageGradients, float]:  # fmt: skip
         """Return the colour loss, its gradients and the mean squared error."""
         alpha = image.alpha if over_emptiness else None
         color, threads = image.color, self.threads
@@ -98,14 +92,9 @@ class CpuBackend(Backend):
         return value, ImageGradients(color=by_color, alpha=by_alpha), mean_squared
 
     def normal_losses(
-        self,
-        image: ViewPass,
-        camera: Camera,
-        shown: Shown,
-        *,
-        lambda_depth_normal: float,
+        self, image: ViewPass, camera: Camera, shown: Shown, *, lambda_depth_normal: float,
         lambda_normal: float,
-    ) -> tuple[float, ImageGradients]:
+    ) -> tuple[float, ImageGradients]:  # fmt: skip
         """Return the normal losses and their gradients on the images."""
         return normal_losses(
             image.depth, image.geometric_normal, image.normal, image.alpha, camera, shown.mask,
@@ -123,16 +112,9 @@ class CpuBackend(Backend):
         )  # fmt: skip
 
     def compare_views(
-        self,
-        image: ViewPass,
-        adam: Adam,
-        camera: Camera,
-        shown: Shown,
-        other_camera: Camera,
-        other: Shown,
-        options: MultiViewOptions,
-        random: np.random.Generator,
-    ) -> tuple[float, ImageGradients, VisibleGradients | None]:
+        self, image: ViewPass, adam: Adam, camera: Camera, shown: Shown, other_camera: Camera,
+        other: Shown, options: MultiViewOptions, random: np.random.Generator,
+    ) -> tuple[float, ImageGradients, VisibleGradients | None]:  # fmt: skip
         """Return the multi-view losses and their gradients."""
         found = multi_view_losses(
             image, image.gaussians, PhotoView(camera, shown.photo, shown.mask),
@@ -146,13 +128,9 @@ class CpuBackend(Backend):
         return image.backward(gradients)
 
     def add_priors(
-        self,
-        image: ViewPass,
-        gradients: VisibleGradients,
-        adam: Adam,
-        price: float,
+        self, image: ViewPass, gradients: VisibleGradients, adam: Adam, price: float,
         opacity_weight: float,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Add the gradients of footprint regulariser and opacity prior."""
         if price <= 0.0 and opacity_weight <= 0.0:
             return

@@ -139,15 +139,10 @@ class DensityChange:
 
 
 def densify_and_prune(
-    adam: Adam,
-    statistics: DensityStatistics,
-    limit: int,
-    random: np.random.Generator,
-    weights: np.ndarray | None = None,
-    *,
-    least_score: float = LOWEST_SCORE,
+    adam: Adam, statistics: DensityStatistics, limit: int, random: np.random.Generator,
+    weights: np.ndarray | None = None, *, least_score: float = LOWEST_SCORE,
     min_opacity: float = MIN_OPACITY,
-) -> DensityChange:
+) -> DensityChange:  # fmt: skip
     """Clone small and split large Gaussians with high gradients; prune transparent ones.
 
     A Gaussian is a candidate by its average gradient, or by an average absolute gradient above the
@@ -321,14 +316,9 @@ def largest_contributors(weights: np.ndarray, share: float) -> np.ndarray:
 
 
 def needed_by_a_view(
-    gaussians: OrientedGaussians,
-    views: Iterable[WrapView],
-    renderer: Renderer,
-    share: float,
-    weights: np.ndarray | None = None,
-    *,
-    threads: int = 0,
-) -> np.ndarray:
+    gaussians: OrientedGaussians, views: Iterable[WrapView], renderer: Renderer, share: float,
+    weights: np.ndarray | None = None, *, threads: int = 0,
+) -> np.ndarray:  # fmt: skip
     """Tell which Gaussians any view needs (docs/method.md, section 4.3).
 
     A view does not need its least contributors, which together make up ``share`` of its blending

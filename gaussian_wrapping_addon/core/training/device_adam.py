@@ -154,20 +154,11 @@ class DeviceAdam(Adam):
         names = ("quats", "orientation", "means", "opacity_logits", "log_scales", "sh")
         first = self.frozen
         self.kernels.launch(
-            "adam_rows",
-            -(-(len(self) - first) // _WARPS),
-            len(self) - first,
-            columns,
-            SH_COLUMN + 3 * used,
-            3 * coefficients,
-            *(self.tensors[name][first:] for name in names),
-            *(gradients[name][first:] for name in names),
-            self.device_moments[first:],
-            self.device_steps[first:],
-            self._corrections,
-            len(self._corrections) - 1,
-            packed,
-        )
+            "adam_rows", -(-(len(self) - first) // _WARPS), len(self) - first, columns,
+            SH_COLUMN + 3 * used, 3 * coefficients, *(self.tensors[name][first:] for name in names),
+            *(gradients[name][first:] for name in names), self.device_moments[first:],
+            self.device_steps[first:], self._corrections, len(self._corrections) - 1, packed,
+        )  # fmt: skip
 
     def rebuild(
         self, parents: np.ndarray, fresh: np.ndarray, changes: Mapping[str, np.ndarray]

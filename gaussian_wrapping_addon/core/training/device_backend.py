@@ -128,13 +128,9 @@ class DeviceBackend(Backend):
     """
 
     def __init__(
-        self,
-        name: str,
-        kernels: Kernels,
-        device: torch.device,
-        free_bytes: Callable[[], int],
+        self, name: str, kernels: Kernels, device: torch.device, free_bytes: Callable[[], int],
         photo_bytes: int,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.name, self.kernels, self.device = name, kernels, device
         self._free_bytes, self._budget, self._renders = free_bytes, 0, 0
         self.budget_share = 1.0
@@ -190,15 +186,9 @@ class DeviceBackend(Backend):
         return DeviceView(self.kernels, adam.on_device(), camera, options, self._budget_bytes())
 
     def compare_colors(
-        self,
-        image: DeviceView,
-        shown: Shown,
-        lambda_dssim: float,
-        *,
-        exposure: tuple[Exposure, int] | None,
-        background: np.ndarray | None,
-        over_emptiness: bool,
-    ) -> tuple[Tensor, ImageGradients, Tensor]:
+        self, image: DeviceView, shown: Shown, lambda_dssim: float, *,
+        exposure: tuple[Exposure, int] | None, background: np.ndarray | None, over_emptiness: bool,
+    ) -> tuple[Tensor, ImageGradients, Tensor]:  # fmt: skip
         """Return the colour loss, its gradients and the mean squared error."""
         color, photo, mask = (
             image.color,
@@ -233,27 +223,15 @@ class DeviceBackend(Backend):
         return value, ImageGradients(color=by_color, alpha=by_alpha), squared
 
     def normal_losses(
-        self,
-        image: DeviceView,
-        camera: Camera,
-        shown: Shown,
-        *,
-        lambda_depth_normal: float,
+        self, image: DeviceView, camera: Camera, shown: Shown, *, lambda_depth_normal: float,
         lambda_normal: float,
-    ) -> tuple[Tensor, ImageGradients]:
+    ) -> tuple[Tensor, ImageGradients]:  # fmt: skip
         """Return the normal losses and their gradients on the images."""
         return device_normal_losses(
-            self.kernels,
-            image.depth,
-            image.geometric_normal,
-            image.normal,
-            image.alpha,
-            camera,
-            shown.mask,
-            lambda_depth_normal=lambda_depth_normal,
-            lambda_normal=lambda_normal,
+            self.kernels, image.depth, image.geometric_normal, image.normal, image.alpha, camera,
+            shown.mask, lambda_depth_normal=lambda_depth_normal, lambda_normal=lambda_normal,
             pixels=shown.pixels,
-        )
+        )  # fmt: skip
 
     def prior_loss(
         self, image: DeviceView, camera: Camera, prior: DepthPrior, shown: Shown, weight: float
@@ -276,27 +254,15 @@ class DeviceBackend(Backend):
         self._priors[id(held[0])] = held
 
     def compare_views(
-        self,
-        image: DeviceView,
-        adam: Adam,
-        camera: Camera,
-        shown: Shown,
-        other_camera: Camera,
-        other: Shown,
-        options: MultiViewOptions,
-        random: np.random.Generator,
-    ) -> tuple[Tensor, ImageGradients, Gradients | None]:
+        self, image: DeviceView, adam: Adam, camera: Camera, shown: Shown, other_camera: Camera,
+        other: Shown, options: MultiViewOptions, random: np.random.Generator,
+    ) -> tuple[Tensor, ImageGradients, Gradients | None]:  # fmt: skip
         """Return the multi-view losses and their gradients."""
         assert isinstance(adam, DeviceAdam)
         found = device_multi_view_losses(
-            self.kernels,
-            image,
-            adam.on_device(),
-            PhotoView(camera, shown.photo, shown.mask),
-            PhotoView(other_camera, other.photo, other.mask),
-            options,
-            random,
-        )
+            self.kernels, image, adam.on_device(), PhotoView(camera, shown.photo, shown.mask),
+            PhotoView(other_camera, other.photo, other.mask), options, random,
+        )  # fmt: skip
         return found.value, found.gradients, found.other
 
     def backward(self, image: DeviceView, gradients: ImageGradients) -> Gradients:

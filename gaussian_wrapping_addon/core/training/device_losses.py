@@ -44,14 +44,9 @@ _CAMERA_VALUES = 22
 
 
 def device_color_loss(
-    kernels: Kernels,
-    image: Tensor,
-    photo: Tensor,
-    mask: Tensor | None,
-    *,
-    lambda_dssim: float,
+    kernels: Kernels, image: Tensor, photo: Tensor, mask: Tensor | None, *, lambda_dssim: float,
     counts: tuple[int, int],
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Return loss, gradient on the image and mean squared error; see :func:`~.losses.color_loss`.
 
     Parameters
@@ -85,35 +80,18 @@ def device_color_loss(
     gradient, sums = torch.empty_like(image), image.new_empty((tiles, 2))
     values = 3 * max(1, pixels)
     kernels.launch(
-        "color_gradient",
-        tiles,
-        image,
-        photo,
-        *size,
-        maps,
-        int(similar),
-        (1.0 - lambda_dssim) / values,
-        -lambda_dssim / max(1, 3 * windows),
-        gradient,
-        sums,
-    )
+        "color_gradient", tiles, image, photo, *size, maps, int(similar),
+        (1.0 - lambda_dssim) / values, -lambda_dssim / max(1, 3 * windows), gradient, sums,
+    )  # fmt: skip
     absolute, squared = (sums.sum(0) / values).unbind()
     return (1.0 - lambda_dssim) * absolute + lambda_dssim * (1.0 - ssim), gradient, squared
 
 
 def device_normal_losses(
-    kernels: Kernels,
-    depth: Tensor,
-    geometric_normal: Tensor,
-    normal: Tensor,
-    alpha: Tensor,
-    camera: Camera,
-    mask: Tensor | None,
-    *,
-    lambda_depth_normal: float,
-    lambda_normal: float,
+    kernels: Kernels, depth: Tensor, geometric_normal: Tensor, normal: Tensor, alpha: Tensor,
+    camera: Camera, mask: Tensor | None, *, lambda_depth_normal: float, lambda_normal: float,
     pixels: int,
-) -> tuple[Tensor, ImageGradients]:
+) -> tuple[Tensor, ImageGradients]:  # fmt: skip
     """Return the weighted sum of both normal losses and its gradients on the four images.
 
     See :func:`~.losses.normal_losses`; ``pixels`` is the number that the mask leaves.
@@ -126,25 +104,11 @@ def device_normal_losses(
     by_alpha, by_depth = torch.empty_like(alpha), torch.empty_like(depth)
     spread, sums = depth.new_empty((4, height, width)), depth.new_empty((blocks, 3))
     kernels.launch_each(
-        "agree_normals",
-        count,
-        width,
-        height,
-        depth,
-        alpha,
-        geometric_normal,
-        normal,
-        mask if mask is not None else depth.new_empty(0, dtype=torch.bool),
-        int(mask is not None),
-        _packed(packed),
-        lambda_depth_normal / max(1, pixels),
-        lambda_normal / max(1, pixels),
-        by_geometric,
-        by_learned,
-        by_alpha,
-        spread,
-        sums,
-    )
+        "agree_normals", count, width, height, depth, alpha, geometric_normal, normal,
+        mask if mask is not None else depth.new_empty(0, dtype=torch.bool), int(mask is not None),
+        _packed(packed), lambda_depth_normal / max(1, pixels), lambda_normal / max(1, pixels),
+        by_geometric, by_learned, by_alpha, spread, sums,
+    )  # fmt: skip
     kernels.launch_each("gather_depth", count, width, height, spread, by_depth)
     geometric, learned, _ = (sums.sum(0) / max(1, pixels)).unbind()
     gradients = ImageGradients(
@@ -154,15 +118,9 @@ def device_normal_losses(
 
 
 def device_prior_loss(
-    kernels: Kernels,
-    depth: Tensor,
-    camera: Camera,
-    prior: tuple[Tensor, Tensor, Camera],
-    mask: Tensor | None,
-    *,
-    weight: float,
-    pixels: int,
-) -> tuple[Tensor, ImageGradients]:
+    kernels: Kernels, depth: Tensor, camera: Camera, prior: tuple[Tensor, Tensor, Camera],
+    mask: Tensor | None, *, weight: float, pixels: int,
+) -> tuple[Tensor, ImageGradients]:  # fmt: skip
     """Return the loss on depths that leave the confirmed ones, and its gradient on the depth.
 
     Parameters
@@ -177,21 +135,12 @@ def device_prior_loss(
     blocks = -(-height * width // THREADS_PER_BLOCK)
     sums = depth.new_empty(blocks)
     kernels.launch_each(
-        "prior_depths",
-        height * width,
-        width,
-        depth,
-        confirmed,
-        confidence,
-        int(confirmed.shape[1]),
-        int(confirmed.shape[0]),
-        mask if mask is not None else depth.new_empty(0, dtype=torch.bool),
-        int(mask is not None),
-        _packed(np.concatenate([lens_of(camera), lens_of(prior_camera)])),
-        weight / max(1, pixels),
-        by_depth,
-        sums,
-    )
+        "prior_depths", height * width, width, depth, confirmed, confidence,
+        int(confirmed.shape[1]), int(confirmed.shape[0]),
+        mask if mask is not None else depth.new_empty(0, dtype=torch.bool), int(mask is not None),
+        _packed(np.concatenate([lens_of(camera), lens_of(prior_camera)])), weight / max(1, pixels),
+        by_depth, sums,
+    )  # fmt: skip
     return sums.sum(), ImageGradients(depth=by_depth)
 
 
@@ -208,14 +157,9 @@ def _packed(values: np.ndarray) -> CameraValues:
 
 
 def device_multi_view_losses(
-    kernels: Kernels,
-    images: DeviceView,
-    gaussians: OrientedGaussians,
-    shown: PhotoView,
-    other: PhotoView,
-    settings: MultiViewOptions,
-    random: np.random.Generator,
-) -> MultiViewLoss:
+    kernels: Kernels, images: DeviceView, gaussians: OrientedGaussians, shown: PhotoView,
+    other: PhotoView, settings: MultiViewOptions, random: np.random.Generator,
+) -> MultiViewLoss:  # fmt: skip
     """Compare a rendered view with the photo and the depth of another view.
 
     The definition, the sampled pixels and the numbers drawn are those of
@@ -281,21 +225,10 @@ def device_multi_view_losses(
         depth=torch.zeros_like(depth), geometric_normal=torch.zeros_like(normals)
     )
     kernels.launch_each(
-        "finish_pixels",
-        len(pixels),
-        pixels,
-        depth,
-        normals,
-        weights,
-        shares,
-        depth_slopes,
-        normal_slopes,
-        by_positions,
-        on_positions,
-        position_slopes,
-        gradients.depth,
+        "finish_pixels", len(pixels), pixels, depth, normals, weights, shares, depth_slopes,
+        normal_slopes, by_positions, on_positions, position_slopes, gradients.depth,
         gradients.geometric_normal,
-    )
+    )  # fmt: skip
     figures = MultiViewMetrics(means[0], means[1], (pixels >= 0).sum(), counts[1], counts[0])
     value = factors[0] * means[0] + factors[1] * means[1]
     return MultiViewLoss(value, gradients, on_other, figures)
@@ -311,13 +244,9 @@ def grey_on_device(kernels: Kernels, photo: Tensor) -> Tensor:
 
 
 def choose_on_device(
-    kernels: Kernels,
-    grey: Tensor,
-    depth: Tensor,
-    mask: Tensor,
-    count: int,
+    kernels: Kernels, grey: Tensor, depth: Tensor, mask: Tensor, count: int,
     random: np.random.Generator,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Sample the pixels that ``pixel_choice.choose_pixels`` samples.
 
     Parameters
@@ -340,17 +269,9 @@ def choose_on_device(
     block = max(height, width) if takes_all else BLOCK_PX
     steepness = torch.empty(grey.numel(), device=grey.device)  # by place
     kernels.launch_each(
-        "measure_pixels",
-        grey.numel(),
-        width,
-        height,
-        block,
-        BORDER_PX,
-        grey,
-        depth,
-        mask,
+        "measure_pixels", grey.numel(), width, height, block, BORDER_PX, grey, depth, mask,
         steepness,
-    )
+    )  # fmt: skip
     usable = steepness >= 0.0
     if takes_all:
         places = torch.arange(len(steepness), dtype=torch.int32, device=grey.device)
@@ -384,17 +305,9 @@ class _Pair:
         positions = depth.new_empty((len(self.pixels), 2))
         slopes = torch.empty_like(positions, dtype=torch.float64)
         self.kernels.launch_each(
-            "lift_points",
-            len(self.pixels),
-            self.pixels,
-            self.width,
-            depth,
-            self.camera,
-            self.pair,
-            other_mask,
-            positions,
-            slopes,
-        )
+            "lift_points", len(self.pixels), self.pixels, self.width, depth, self.camera, self.pair,
+            other_mask, positions, slopes,
+        )  # fmt: skip
         return positions, slopes
 
     def reproject(self, positions: Tensor, found: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -404,54 +317,25 @@ class _Pair:
         noise, weights, by_found = found.new_empty((3, count), dtype=torch.float64).unbind()
         by_positions = found.new_empty((count, 2), dtype=torch.float64)
         self.kernels.launch_each(
-            "return_points",
-            count,
-            self.pixels,
-            self.width,
-            positions,
-            found,
-            self.camera,
-            self.pair,
-            noise,
-            weights,
-            by_found,
-            by_positions,
-        )
+            "return_points", count, self.pixels, self.width, positions, found, self.camera,
+            self.pair, noise, weights, by_found, by_positions,
+        )  # fmt: skip
         return noise, weights, by_found, by_positions
 
     def compare(
-        self,
-        noise: Tensor,
-        images: tuple[Tensor, Tensor, Tensor],
-        greys: tuple[Tensor, Tensor],
-        masks: tuple[Tensor, Tensor],
-        settings: MultiViewOptions,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        self, noise: Tensor, images: tuple[Tensor, Tensor, Tensor], greys: tuple[Tensor, Tensor],
+        masks: tuple[Tensor, Tensor], settings: MultiViewOptions,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
         """Return states (m,), errors (m,), their derivatives by depth (m,) and normal (m, 3)."""
         count, height = len(self.pixels), images[0].shape[0]
         states = torch.empty(count, dtype=torch.uint8, device=noise.device)
         errors, by_depth = noise.new_empty((2, count)).unbind()
         by_normals = noise.new_empty((count, 3))
         self.kernels.launch(
-            "compare_patches",
-            -(-count // WARPS),
-            count,
-            self.pixels,
-            noise,
-            self.width,
-            height,
-            *images,
-            self.camera,
-            self.pair,
-            *greys,
-            *masks,
-            int(settings.correlation == "squared"),
-            settings.patch_sizes,
-            ctypes.c_double(settings.max_rise),
-            ctypes.c_double(SAMPLES * settings.min_contrast**2),
-            states,
-            errors,
-            by_depth,
+            "compare_patches", -(-count // WARPS), count, self.pixels, noise, self.width, height,
+            *images, self.camera, self.pair, *greys, *masks, int(settings.correlation == "squared"),
+            settings.patch_sizes, ctypes.c_double(settings.max_rise),
+            ctypes.c_double(SAMPLES * settings.min_contrast**2), states, errors, by_depth,
             by_normals,
-        )
+        )  # fmt: skip
         return states, errors, by_depth, by_normals

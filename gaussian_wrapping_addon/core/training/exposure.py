@@ -26,14 +26,9 @@ _STATE = ("first", "second", "steps")
 
 
 def photo_rate(
-    iteration: int,
-    iterations: int,
-    photos: int,
-    *,
-    travel: float,
-    bounds: tuple[float, float],
+    iteration: int, iterations: int, photos: int, *, travel: float, bounds: tuple[float, float],
     last_share: float,
-) -> float:
+) -> float:  # fmt: skip
     """Return the learning rate of an iteration.
 
     Parameters
@@ -275,14 +270,9 @@ class Exposure:
         return out
 
     def backward(
-        self,
-        view: int,
-        color: np.ndarray,
-        by_corrected: np.ndarray,
-        alpha: np.ndarray | None = None,
-        *,
-        threads: int = 0,
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+        self, view: int, color: np.ndarray, by_corrected: np.ndarray,
+        alpha: np.ndarray | None = None, *, threads: int = 0,
+    ) -> tuple[np.ndarray, np.ndarray | None]:  # fmt: skip
         """Return the gradients on colour and alpha; store that of the exposure for :meth:`step`.
 
         Parameters

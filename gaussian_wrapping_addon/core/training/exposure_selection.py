@@ -357,13 +357,9 @@ def _median_gain(gain: np.ndarray, total: np.ndarray) -> np.ndarray:
 
 
 def first_decisions(
-    scene: Scene,
-    photos: PhotoSource,
-    views: Sequence[int],
-    neighbours: Mapping[int, np.ndarray],
-    settings: TrainingSettings,
-    image_size: Decision,
-) -> tuple[ModelSelection, Exposure | None]:
+    scene: Scene, photos: PhotoSource, views: Sequence[int], neighbours: Mapping[int, np.ndarray],
+    settings: TrainingSettings, image_size: Decision,
+) -> tuple[ModelSelection, Exposure | None]:  # fmt: skip
     """Decide on exposure and multi-view terms, and on growth where the settings do.
 
     ``views`` are those trained on, ``image_size`` was decided before.

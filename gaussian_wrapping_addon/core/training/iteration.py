@@ -63,14 +63,9 @@ class Stepper:
     """
 
     def __init__(
-        self,
-        photos: PhotoSource,
-        schedule: Schedule,
-        views: Sequence[int],
-        neighbours: dict[int, np.ndarray],
-        backend: Backend,
-        threads: int,
-    ) -> None:
+        self, photos: PhotoSource, schedule: Schedule, views: Sequence[int],
+        neighbours: dict[int, np.ndarray], backend: Backend, threads: int,
+    ) -> None:  # fmt: skip
         self.photos, self.schedule, self.views = photos, schedule, list(views)
         self.settings, self.threads = schedule.settings, threads
         self.neighbours, self.backend = neighbours, backend
@@ -200,13 +195,10 @@ class Stepper:
         """Return the colour loss, its gradients on colour and alpha, and the mean squared error."""
         empty = self.settings.mask_mode == "background"
         return self.backend.compare_colors(
-            image,
-            sample.shown,
-            self.settings.lambda_dssim,
+            image, sample.shown, self.settings.lambda_dssim,
             exposure=None if state.exposure is None else (state.exposure, sample.view),
-            background=draw_background(state.random) if empty else None,
-            over_emptiness=empty,
-        )
+            background=draw_background(state.random) if empty else None, over_emptiness=empty,
+        )  # fmt: skip
 
     def _compares_views(self, state: TrainingState, sample: _Sample) -> bool:
         if not state.model_selection.chose("multi_view") or len(self.neighbours[sample.view]) == 0:
@@ -219,15 +211,11 @@ class Stepper:
         choices = self.neighbours[sample.view]
         other = int(choices[int(state.random.integers(len(choices)))])
         return self.backend.compare_views(
-            image,
-            state.adam,
-            sample.camera,
-            sample.shown,
+            image, state.adam, sample.camera, sample.shown,
             self.photos.camera(other, sample.divisor),
-            self.backend.shown(self.photos, other, sample.divisor, None),
-            self.multi_view,
+            self.backend.shown(self.photos, other, sample.divisor, None), self.multi_view,
             state.random,
-        )
+        )  # fmt: skip
 
 
 def trimmed(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:

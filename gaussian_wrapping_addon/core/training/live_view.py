@@ -58,15 +58,10 @@ def divisor_for(photos: PhotoSource, index: int, longest_px: int) -> int:
 
 
 def measure_held_out(
-    gaussians: OrientedGaussians,
-    photos: PhotoSource,
-    held_out: Sequence[int],
-    *,
-    threads: int,
-    renderer: Renderer | None = None,
-    exposure_correction: Correction | None = None,
+    gaussians: OrientedGaussians, photos: PhotoSource, held_out: Sequence[int], *, threads: int,
+    renderer: Renderer | None = None, exposure_correction: Correction | None = None,
     check: Callable[[], None] | None = None,
-) -> float:
+) -> float:  # fmt: skip
     """Return the mean PSNR of a few held-out photos at a small size.
 
     Depends on the Gaussians and photos alone, so it may enter a training's history.
@@ -108,14 +103,9 @@ def measure_held_out(
 
 
 def _rendered(
-    renderer: Renderer,
-    raw: RawArrays,
-    photos: PhotoSource,
-    view: int,
-    divisor: int,
-    threads: int,
+    renderer: Renderer, raw: RawArrays, photos: PhotoSource, view: int, divisor: int, threads: int,
     correction: Correction | None,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     options = RenderOptions(depth=False, threads=threads)
     image = renderer.render(raw, photos.camera(view, divisor), options).color
     if correction is None:
@@ -146,16 +136,10 @@ class LiveView:
     """
 
     def __init__(
-        self,
-        photos: PhotoSource,
-        held_out: Sequence[int],
-        folder: Path,
-        settings: TrainingSettings,
-        threads: int,
-        clock: Callable[[], float] = time.monotonic,
-        renderer: Renderer | None = None,
-        otherwise: int = 0,
-    ) -> None:
+        self, photos: PhotoSource, held_out: Sequence[int], folder: Path,
+        settings: TrainingSettings, threads: int, clock: Callable[[], float] = time.monotonic,
+        renderer: Renderer | None = None, otherwise: int = 0,
+    ) -> None:  # fmt: skip
         self._photos, self._held_out, self._folder = photos, list(held_out), folder
         self._every_s, self._threads, self._clock = settings.preview_every_s, threads, clock
         self.renderer = renderer or ViewRenderer()
@@ -168,13 +152,9 @@ class LiveView:
         return self._every_s > 0 and self._clock() - self._updated_s >= self._every_s
 
     def update(
-        self,
-        gaussians: OrientedGaussians,
-        iteration: int,
-        exposure_correction: Correction | None = None,
-        *,
-        force: bool = False,
-    ) -> dict[str, float] | None:
+        self, gaussians: OrientedGaussians, iteration: int,
+        exposure_correction: Correction | None = None, *, force: bool = False,
+    ) -> dict[str, float] | None:  # fmt: skip
         """Write the preview and measure the held-out photos, if due or ``force`` is set.
 
         Returns
@@ -187,13 +167,9 @@ class LiveView:
             return None
         figures = {}
         quality = measure_held_out(
-            gaussians,
-            self._photos,
-            self._held_out,
-            threads=self._threads,
-            renderer=self.renderer,
+            gaussians, self._photos, self._held_out, threads=self._threads, renderer=self.renderer,
             exposure_correction=exposure_correction,
-        )
+        )  # fmt: skip
         if np.isfinite(quality):
             figures = {"held_out_psnr": quality, "held_out_iteration": float(iteration)}
         self._write(gaussians, exposure_correction)
@@ -243,15 +219,10 @@ def png(picture: np.ndarray) -> bytes:
 
 
 def held_out_metrics(
-    gaussians: OrientedGaussians,
-    photos: PhotoSource,
-    names: Mapping[int, str],
-    progress: Progress,
-    *,
-    threads: int,
-    renderer: Renderer | None = None,
+    gaussians: OrientedGaussians, photos: PhotoSource, names: Mapping[int, str], progress: Progress,
+    *, threads: int, renderer: Renderer | None = None,
     exposure_correction: Correction | None = None,
-) -> tuple[list[HeldOutMetrics], str]:
+) -> tuple[list[HeldOutMetrics], str]:  # fmt: skip
     """Return the metrics of held-out photos, and the reason if they have no LPIPS.
 
     Parameters

@@ -173,15 +173,9 @@ def _prior_rows(
 
 
 def depth_prior_loss(
-    depth: np.ndarray,
-    camera: Camera,
-    prior: DepthPrior,
-    mask: np.ndarray | None = None,
-    *,
-    weight: float,
-    threads: int = 0,
-    store: ArrayStore | None = None,
-) -> tuple[float, ImageGradients]:
+    depth: np.ndarray, camera: Camera, prior: DepthPrior, mask: np.ndarray | None = None, *,
+    weight: float, threads: int = 0, store: ArrayStore | None = None,
+) -> tuple[float, ImageGradients]:  # fmt: skip
     """Return ``weight mean(c h(|d / d_prior - 1| / 0.01))`` and its gradient on the depth.
 
     Parameters
@@ -497,16 +491,9 @@ def agreement_rows(  # type: ignore[no-untyped-def]
             count = min(BLOCK_PX, width - first)
             _load_planes(i, first, count, depth, alpha, mask, geometric, learned, planes)
             g, o, n = _agree(
-                first,
-                count,
-                y,
-                camera,
-                rotation,
-                max_jump,
-                weight_geometric,
-                weight_learned,
+                first, count, y, camera, rotation, max_jump, weight_geometric, weight_learned,
                 planes,
-            )
+            )  # fmt: skip
             total_geometric += g
             total_learned += o
             found += n
@@ -532,14 +519,9 @@ def agreement_rows(  # type: ignore[no-untyped-def]
 
 
 def color_loss(
-    image: np.ndarray,
-    photo: np.ndarray,
-    mask: np.ndarray | None = None,
-    *,
-    lambda_dssim: float = 0.2,
-    threads: int = 0,
-    store: ArrayStore | None = None,
-) -> tuple[float, np.ndarray, float]:
+    image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None, *,
+    lambda_dssim: float = 0.2, threads: int = 0, store: ArrayStore | None = None,
+) -> tuple[float, np.ndarray, float]:  # fmt: skip
     """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and the mean squared error.
 
     See docs/method.md, section 3.1.
@@ -616,19 +598,11 @@ def normals_from_depth(
 
 
 def normal_losses(
-    depth: np.ndarray,
-    geometric_normal: np.ndarray,
-    normal: np.ndarray,
-    alpha: np.ndarray,
-    camera: Camera,
-    mask: np.ndarray | None = None,
-    *,
-    lambda_depth_normal: float = 0.05,
-    lambda_normal: float = 0.03,
-    max_jump: float = 0.0,
-    threads: int = 0,
+    depth: np.ndarray, geometric_normal: np.ndarray, normal: np.ndarray, alpha: np.ndarray,
+    camera: Camera, mask: np.ndarray | None = None, *, lambda_depth_normal: float = 0.05,
+    lambda_normal: float = 0.03, max_jump: float = 0.0, threads: int = 0,
     store: ArrayStore | None = None,
-) -> tuple[float, ImageGradients]:
+) -> tuple[float, ImageGradients]:  # fmt: skip
     """Return ``lambda_DN L_DN + lambda_N L_N`` and its gradients.
 
     See docs/method.md, sections 3.2 and 3.3.

@@ -147,15 +147,9 @@ def grey_image(
 
 
 def choose_pixels(
-    grey: np.ndarray,
-    depth: np.ndarray,
-    mask: np.ndarray | None,
-    count: int,
-    random: np.random.Generator,
-    *,
-    threads: int,
-    store: ArrayStore | None = None,
-) -> np.ndarray:
+    grey: np.ndarray, depth: np.ndarray, mask: np.ndarray | None, count: int,
+    random: np.random.Generator, *, threads: int, store: ArrayStore | None = None,
+) -> np.ndarray:  # fmt: skip
     """Sample up to ``count`` distinct pixels with depth, inside the mask; all, if it has no more.
 
     Stratified along blocks of pixels. The probability of a pixel is proportional to its brightness
@@ -213,14 +207,9 @@ def _grey_rows(begin: int, end: int, photo: np.ndarray, scale: float, grey: np.n
 
 @kernel(fast=False)
 def _steepness_rows(
-    begin: int,
-    end: int,
-    grey: np.ndarray,
-    depth: np.ndarray,
-    mask: np.ndarray,
-    steepness: np.ndarray,
-    sums: np.ndarray,
-) -> None:
+    begin: int, end: int, grey: np.ndarray, depth: np.ndarray, mask: np.ndarray,
+    steepness: np.ndarray, sums: np.ndarray,
+) -> None:  # fmt: skip
     """Write the length of the brightness gradient, -1 for pixels that cannot be chosen, and for
     each row their sum and number."""
     height, width = grey.shape
@@ -352,16 +341,10 @@ class PhotoView:
 
 
 def multi_view_losses(
-    image: ViewPass,
-    gaussians: RawArrays,
-    shown: PhotoView,
-    other: PhotoView,
-    settings: MultiViewOptions,
-    random: np.random.Generator,
-    *,
-    threads: int = 0,
+    image: ViewPass, gaussians: RawArrays, shown: PhotoView, other: PhotoView,
+    settings: MultiViewOptions, random: np.random.Generator, *, threads: int = 0,
     store: ArrayStore | None = None,
-) -> MultiViewLoss:
+) -> MultiViewLoss:  # fmt: skip
     """Compare a rendered view with the photo and the depth of another view.
 
     ``weight (lambda_photometric mean(w (1 - ncc)) + lambda_geometric mean(w noise))`` with
@@ -442,14 +425,9 @@ class _ViewPair:
     """Two views and the sampled pixels of the first, packed for the kernels."""
 
     def __init__(
-        self,
-        image: ViewPass,
-        camera: Camera,
-        other: Camera,
-        pixels: np.ndarray,
-        near_z: float,
+        self, image: ViewPass, camera: Camera, other: Camera, pixels: np.ndarray, near_z: float,
         threads: int,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.image, self.pixels, self.near_z, self.threads = image, pixels, near_z, threads
         self.rotation = np.ascontiguousarray(camera.rotation)
         self.camera, self.other = _pack(camera), _pack(other)

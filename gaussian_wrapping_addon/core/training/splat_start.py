@@ -178,31 +178,16 @@ def wrapping_settings(settings: TrainingSettings) -> TrainingSettings:
     wrapping rounds lie between 30 and 70 % of the iterations.
     """
     return dataclasses.replace(
-        settings,
-        iterations=max(1, round(ITERATIONS_SHARE * settings.iterations)),
-        growth="off",
-        refine_poses="off",
-        full_size="on",
-        prune_share=0.0,
-        depth_from=0.0,
-        densify_from=0.0,
-        densify_until=0.0,
-        orient_from=0.0,
-        wrap_from=0.3,
-        wrap_until=0.7,
-    )
+        settings, iterations=max(1, round(ITERATIONS_SHARE * settings.iterations)), growth="off",
+        refine_poses="off", full_size="on", prune_share=0.0, depth_from=0.0, densify_from=0.0,
+        densify_until=0.0, orient_from=0.0, wrap_from=0.3, wrap_until=0.7,
+    )  # fmt: skip
 
 
 def start_from_splat(
-    path: Path,
-    scene: Scene,
-    photos: PhotoSource,
-    view_indices: Sequence[int],
-    settings: TrainingSettings,
-    progress: Progress,
-    *,
-    threads: int = 0,
-) -> tuple[OrientedGaussians, list[ReportWarning]]:
+    path: Path, scene: Scene, photos: PhotoSource, view_indices: Sequence[int],
+    settings: TrainingSettings, progress: Progress, *, threads: int = 0,
+) -> tuple[OrientedGaussians, list[ReportWarning]]:  # fmt: skip
     """Read a splat in the world frame of the photos' cameras and prepare it for training.
 
     Parameters
@@ -347,13 +332,9 @@ def _mean_weights(
 
 
 def _compare_with_photos(
-    gaussians: OrientedGaussians,
-    photos: PhotoSource,
-    view_indices: Sequence[int],
-    progress: Progress,
-    *,
-    threads: int,
-) -> tuple[float, bool]:
+    gaussians: OrientedGaussians, photos: PhotoSource, view_indices: Sequence[int],
+    progress: Progress, *, threads: int,
+) -> tuple[float, bool]:  # fmt: skip
     """Return the median PSNR against some photos, dB, and whether the splat does not match them.
 
     It does not if the PSNR is below :data:`MATCH_DB`, or, below :data:`CLEAR_DB`, if it is no

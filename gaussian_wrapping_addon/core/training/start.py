@@ -138,12 +138,9 @@ def far_shell(
 def _shell(direction: np.ndarray, color: np.ndarray, step: float, radius: float) -> DensePoints:
     count = len(direction)
     return DensePoints(
-        radius * direction,
-        -direction,
-        np.clip(color + 0.5, 0, 255).astype(np.uint8),
-        np.full(count, radius * step),
-        np.zeros(count, np.float32),
-    )
+        radius * direction, -direction, np.clip(color + 0.5, 0, 255).astype(np.uint8),
+        np.full(count, radius * step), np.zeros(count, np.float32),
+    )  # fmt: skip
 
 
 def _open_cells(
@@ -213,18 +210,9 @@ class DenseStart:
 
 
 def dense_start(
-    scene: Scene,
-    photos: PhotoSource,
-    views: Sequence[int],
-    setting: str,
-    progress: Progress,
-    *,
-    side_px: int,
-    max_gaussians: int,
-    sh_degree: int,
-    seed: int,
-    threads: int,
-) -> DenseStart:
+    scene: Scene, photos: PhotoSource, views: Sequence[int], setting: str, progress: Progress, *,
+    side_px: int, max_gaussians: int, sh_degree: int, seed: int, threads: int,
+) -> DenseStart:  # fmt: skip
     """Match the photos and return flat Gaussians on the surfaces found.
 
     Parameters
@@ -273,15 +261,9 @@ def start_budget(max_gaussians: int) -> int:
 
 
 def matched_photos(
-    scene: Scene,
-    photos: PhotoSource,
-    views: Sequence[int],
-    progress: Progress,
-    *,
-    side_px: int,
-    seed: int,
-    threads: int,
-) -> list[DepthMap]:
+    scene: Scene, photos: PhotoSource, views: Sequence[int], progress: Progress, *, side_px: int,
+    seed: int, threads: int,
+) -> list[DepthMap]:  # fmt: skip
     """Return the depth maps of the training views; empty where there is too little to match."""
     points, _ = _usable(scene)
     return estimate_depth_maps(
@@ -326,13 +308,9 @@ def _decision(setting: str, confirmed: float, count: int) -> Decision:
 
 
 def _gaussians(
-    found: DensePoints,
-    guesses: DensePoints,
-    points: np.ndarray,
-    colors: np.ndarray,
-    cameras: Sequence[Camera],
-    sh_degree: int,
-) -> OrientedGaussians:
+    found: DensePoints, guesses: DensePoints, points: np.ndarray, colors: np.ndarray,
+    cameras: Sequence[Camera], sh_degree: int,
+) -> OrientedGaussians:  # fmt: skip
     """Return flat Gaussians of both kinds, and round ones at sparse points away from them."""
     dense = np.concatenate([found.positions, guesses.positions])
     tree = cKDTree(dense)

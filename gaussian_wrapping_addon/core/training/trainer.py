@@ -91,14 +91,9 @@ OPACITY = 0.95
 
 
 def with_backdrop(
-    gaussians: OrientedGaussians,
-    photos: PhotoSource,
-    views: Sequence[int],
-    renderer: Renderer | None = None,
-    *,
-    threads: int = 0,
-    check: Callable[[], None] | None = None,
-) -> OrientedGaussians:
+    gaussians: OrientedGaussians, photos: PhotoSource, views: Sequence[int],
+    renderer: Renderer | None = None, *, threads: int = 0, check: Callable[[], None] | None = None,
+) -> OrientedGaussians:  # fmt: skip
     """Return trained Gaussians with a sphere behind them, open where the photos see through.
 
     Parameters
@@ -272,19 +267,10 @@ RESTART_RATE = 0.5
 
 
 def train(
-    scene: Scene,
-    photos: PhotoSource,
-    settings: TrainingSettings,
-    folder: Path,
-    progress: Progress,
-    *,
-    seed: int = 0,
-    threads: int = 0,
-    start_splat: Path | None = None,
-    inside: Inside | None = None,
-    backend: Backend | None = None,
-    handover: Handover | None = None,
-) -> TrainingResult:
+    scene: Scene, photos: PhotoSource, settings: TrainingSettings, folder: Path, progress: Progress,
+    *, seed: int = 0, threads: int = 0, start_splat: Path | None = None,
+    inside: Inside | None = None, backend: Backend | None = None, handover: Handover | None = None,
+) -> TrainingResult:  # fmt: skip
     """Train oriented Gaussians on the photos of a scene.
 
     Resumes from the newest checkpoint in ``folder``; the result is then bit for bit that of an
@@ -344,19 +330,11 @@ class _Trainer:
     """One training run. Its attributes follow from the inputs; all else is in the state."""
 
     def __init__(
-        self,
-        scene: Scene,
-        photos: PhotoSource,
-        settings: TrainingSettings,
-        folder: Path,
-        seed: int,
-        threads: int,
-        start_splat: Path | None = None,
-        inside: Inside | None = None,
-        progress: Progress | None = None,
-        backend: Backend | None = None,
+        self, scene: Scene, photos: PhotoSource, settings: TrainingSettings, folder: Path,
+        seed: int, threads: int, start_splat: Path | None = None, inside: Inside | None = None,
+        progress: Progress | None = None, backend: Backend | None = None,
         handover: Handover | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if start_splat is not None:
             settings = wrapping_settings(settings)
         settings = dataclasses.replace(settings, mask_mode=scene.mask_mode(settings.mask_mode))
@@ -501,18 +479,10 @@ class _Trainer:
             exposure_correction=self._correction(state),
         )  # fmt: skip
         return TrainingResult(
-            gaussians,
-            self.schedule.total,
-            tuple(state.history),
-            tuple(held_out),
-            seconds,
-            tuple(state.warnings),
-            lpips_note,
-            state.model_selection,
-            state.exposure is not None,
-            None if state.poses is None else state.poses.moved(),
-            self.stepper.backend.name,
-        )
+            gaussians, self.schedule.total, tuple(state.history), tuple(held_out), seconds,
+            tuple(state.warnings), lpips_note, state.model_selection, state.exposure is not None,
+            None if state.poses is None else state.poses.moved(), self.stepper.backend.name,
+        )  # fmt: skip
 
     def _start(self, rounds: Rounds, key: str, progress: Progress) -> TrainingState:
         if self.handover is not None:

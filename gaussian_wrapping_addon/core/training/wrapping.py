@@ -28,13 +28,9 @@ FIRST_SIGN = TrainingSettings.first_sign
 
 
 def voted_orientation(
-    gaussians: OrientedGaussians,
-    cameras: Iterable[Camera],
-    renderer: Renderer | None = None,
-    *,
-    first_sign: float = FIRST_SIGN,
-    threads: int = 0,
-) -> np.ndarray:
+    gaussians: OrientedGaussians, cameras: Iterable[Camera], renderer: Renderer | None = None, *,
+    first_sign: float = FIRST_SIGN, threads: int = 0,
+) -> np.ndarray:  # fmt: skip
     """Return orientation parameters for Gaussians whose orientation was not trained.
 
     The direction is the shortest axis. Each camera votes for the side that it sees, weighted by the
@@ -100,13 +96,9 @@ class WrapView:
 
 
 def start_orientation(
-    adam: Adam,
-    views: Iterable[WrapView],
-    renderer: Renderer | None = None,
-    *,
-    first_sign: float = FIRST_SIGN,
-    threads: int = 0,
-) -> None:
+    adam: Adam, views: Iterable[WrapView], renderer: Renderer | None = None, *,
+    first_sign: float = FIRST_SIGN, threads: int = 0,
+) -> None:  # fmt: skip
     """Initialise missing orientations: the shortest axis, with its sign by a vote of the views.
 
     Each view votes for the side that it sees, weighted by the Gaussian's blending weight; the sign
