@@ -108,10 +108,8 @@ class DeviceAdam(Adam):
         twin = object.__new__(DeviceAdam)
         twin.__dict__.update(self.__dict__)
         twin.tensors = {name: tensor.clone() for name, tensor in self.tensors.items()}
-        twin.device_moments, twin.device_steps = (
-            self.device_moments.clone(),
-            self.device_steps.clone(),
-        )
+        twin.device_moments = self.device_moments.clone()
+        twin.device_steps = self.device_steps.clone()
         twin._held = {}
         return twin
 

@@ -115,7 +115,7 @@ Gradients = dict[str, Tensor]
 
 
 class DeviceBackend(Backend):
-    """Runs on a device.
+    """Runs on a device; methods as in :class:`.Backend`.
 
     Parameters
     ----------
@@ -164,23 +164,19 @@ class DeviceBackend(Backend):
         return self._budget
 
     def adopted(self, adam: Adam) -> DeviceAdam:
-        """Return the optimiser on the device."""
         if isinstance(adam, DeviceAdam) and adam.device == self.device:
             return adam
         return DeviceAdam(adam, self.kernels, self.device)
 
     def adopted_statistics(self, statistics: DensityStatistics) -> DeviceDensityStatistics:
-        """Return the statistics on the device."""
         if isinstance(statistics, DeviceDensityStatistics) and statistics.device == self.device:
             return statistics
         return DeviceDensityStatistics(statistics, self.device)
 
     def shown(self, photos: PhotoSource, view: int, divisor: int, window: Window | None) -> Shown:
-        """Return a photo and its mask on the device, whole or a window."""
         return self._photos.shown(photos, view, divisor, window)
 
     def render(self, adam: Adam, camera: Camera, options: RenderOptions) -> DeviceView:
-        """Return a rendered view."""
         assert isinstance(adam, DeviceAdam)
         self.renderer.release()  # rounds are over
         return DeviceView(self.kernels, adam.on_device(), camera, options, self._budget_bytes())
@@ -189,12 +185,8 @@ class DeviceBackend(Backend):
         self, image: DeviceView, shown: Shown, lambda_dssim: float, *,
         exposure: tuple[Exposure, int] | None, background: np.ndarray | None, over_emptiness: bool,
     ) -> tuple[Tensor, ImageGradients, Tensor]:  # fmt: skip
-        """Return the colour loss, its gradients and the mean squared error."""
-        color, photo, mask = (
-            image.color,
-            shown.photo.to(torch.float32).mul_(1.0 / 255.0),
-            shown.mask,
-        )
+        color, mask = image.color, shown.mask
+        photo = shown.photo.to(torch.float32).mul_(1.0 / 255.0)
         counts = (shown.pixels, shown.windows)
         cover = image.alpha[..., None] if over_emptiness else 1.0  # (h, w, 1)
         if exposure is not None:
@@ -226,7 +218,6 @@ class DeviceBackend(Backend):
         self, image: DeviceView, camera: Camera, shown: Shown, *, lambda_depth_normal: float,
         lambda_normal: float,
     ) -> tuple[Tensor, ImageGradients]:  # fmt: skip
-        """Return the normal losses and their gradients on the images."""
         return device_normal_losses(
             self.kernels, image.depth, image.geometric_normal, image.normal, image.alpha, camera,
             shown.mask, lambda_depth_normal=lambda_depth_normal, lambda_normal=lambda_normal,
@@ -236,28 +227,22 @@ class DeviceBackend(Backend):
     def prior_loss(
         self, image: DeviceView, camera: Camera, prior: DepthPrior, shown: Shown, weight: float
     ) -> tuple[Tensor, ImageGradients]:
-        """Return the loss on confirmed depths and its gradient on the depth."""
         held = self._priors.get(id(prior))
         if held is None or held[0] is not prior:
             sent = (self._sent(prior.depth), self._sent(prior.confidence), prior.camera)
-            held = (prior, sent)
-            self._keep_prior(held)
+            # Where they take too much, all others are given up first.
+            if sum(8 * kept.depth.size for kept, _ in self._priors.values()) > self._prior_bytes:
+                self._priors.clear()
+            held = self._priors[id(prior)] = (prior, sent)
         return device_prior_loss(
             self.kernels, image.depth, camera, held[1], shown.mask,
             weight=weight, pixels=shown.pixels,
         )  # fmt: skip
 
-    def _keep_prior(self, held: tuple[DepthPrior, tuple[Tensor, Tensor, Camera]]) -> None:
-        """Keep a prior that was sent; first give up all others where they take too much."""
-        if sum(8 * prior.depth.size for prior, _ in self._priors.values()) > self._prior_bytes:
-            self._priors.clear()
-        self._priors[id(held[0])] = held
-
     def compare_views(
         self, image: DeviceView, adam: Adam, camera: Camera, shown: Shown, other_camera: Camera,
         other: Shown, options: MultiViewOptions, random: np.random.Generator,
     ) -> tuple[Tensor, ImageGradients, Gradients | None]:  # fmt: skip
-        """Return the multi-view losses and their gradients."""
         assert isinstance(adam, DeviceAdam)
         found = device_multi_view_losses(
             self.kernels, image, adam.on_device(), PhotoView(camera, shown.photo, shown.mask),
@@ -274,7 +259,6 @@ class DeviceBackend(Backend):
         self, image: DeviceView, gradients: Gradients, adam: Adam, price: float,
         opacity_weight: float,
     ) -> None:  # fmt: skip
-        """Add the gradients of footprint regulariser and opacity prior."""
         if price <= 0.0 and opacity_weight <= 0.0:
             return
         assert isinstance(adam, DeviceAdam)
@@ -301,7 +285,6 @@ class DeviceBackend(Backend):
             by_logits -= 4.0 * opacity_weight * asked * ramp * opacity * (1.0 - opacity)
 
     def pose_gradient(self, camera: Camera, gradients: Gradients, adam: Adam) -> Tensor:
-        """Return the (6,) gradient on the camera's pose; see :mod:`.camera_poses`."""
         assert isinstance(adam, DeviceAdam)
         gaussians = adam.on_device()
         pose = torch.from_numpy(np.array(camera.cam_from_world, np.float64)).to(self.device)
@@ -327,14 +310,12 @@ class DeviceBackend(Backend):
         self, statistics: DensityStatistics, image: DeviceView, width: int, height: int,
         part: float,
     ) -> None:  # fmt: skip
-        """Accumulate the statistics of a view."""
         assert isinstance(statistics, DeviceDensityStatistics)
         statistics.add_view(image, width, height, part)
 
     def step(
         self, adam: Adam, gradients: Gradients, rates: Mapping[str, np.ndarray], sh_degree: int
     ) -> None:
-        """Step the Gaussians that the view has seen."""
         assert isinstance(adam, DeviceAdam)
         adam.step_all(gradients, rates, sh_degree=sh_degree)
 
@@ -398,7 +379,6 @@ def chosen_backend(device: str, threads: int, *, or_processor: bool = False) -> 
     """
     if device == "cpu":
         return CpuBackend(threads)
-
     try:
         return DeviceBackend.of_gpu(int(device.partition(":")[2] or 0))
     except (WrapError, RuntimeError) as error:

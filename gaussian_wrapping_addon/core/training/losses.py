@@ -600,7 +600,7 @@ def normals_from_depth(
 def normal_losses(
     depth: np.ndarray, geometric_normal: np.ndarray, normal: np.ndarray, alpha: np.ndarray,
     camera: Camera, mask: np.ndarray | None = None, *, lambda_depth_normal: float = 0.05,
-    lambda_normal: float = 0.03, max_jump: float = 0.0, threads: int = 0,
+    lambda_normal: float = 0.03, threads: int = 0,
     store: ArrayStore | None = None,
 ) -> tuple[float, ImageGradients]:  # fmt: skip
     """Return ``lambda_DN L_DN + lambda_N L_N`` and its gradients.
@@ -647,7 +647,7 @@ def normal_losses(
 
     def run(begin: int, end: int) -> None:
         agreement_rows(
-            begin, end, z, lens, rotation, flat_mask, geometric, learned, cover, max_jump,
+            begin, end, z, lens, rotation, flat_mask, geometric, learned, cover, 0.0,
             lambda_depth_normal / pixels, lambda_normal / pixels, sums,
             by_depth, by_geometric, by_learned, by_alpha,
         )  # fmt: skip

@@ -197,26 +197,20 @@ def start_poses(
     views : sequence of int
         Training views.
     """
-    decision = None
+    missing = ""
+    if len(views) < LEAST_VIEWS:
+        missing = f"Not tried: fewer than {LEAST_VIEWS} photos to train on."
+    elif setting == "auto" and not model_selection.chose("dense_start"):
+        missing = "Not tried: training did not start on surfaces found by matching photos."
     if setting == "off":
-        decision = Decision.by_settings("refine_poses", "off")
-    elif missing := _missing(setting, views, model_selection):
+        return None, model_selection.with_decision(Decision.by_settings("refine_poses", "off"))
+    if missing:
         decision = Decision("refine_poses", setting, "off", missing, measured=False)
-    if decision is not None:
         return None, model_selection.with_decision(decision)
     given = np.array([view.camera.cam_from_world for view in scene.views], np.float64)
     if setting == "on":
         model_selection = model_selection.with_decision(Decision.by_settings("refine_poses", "on"))
     return CameraPoses(given, views), model_selection
-
-
-def _missing(setting: str, views: Sequence[int], model_selection: ModelSelection) -> str:
-    """Return what poses cannot be refined for, or nothing."""
-    if len(views) < LEAST_VIEWS:
-        return f"Not tried: fewer than {LEAST_VIEWS} photos to train on."
-    if setting == "auto" and not model_selection.chose("dense_start"):
-        return "Not tried: training did not start on surfaces found by matching photos."
-    return ""
 
 
 def select_poses(poses: CameraPoses, cameras: Mapping[int, Camera], means: np.ndarray) -> Decision:

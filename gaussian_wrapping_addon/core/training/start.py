@@ -227,14 +227,14 @@ def dense_start(
         Limit of the growth; the start leaves room below it.
     """
     points, colors = _usable(scene)
-    maps = matched_photos(
-        scene, photos, views, progress, side_px=side_px, seed=seed, threads=threads
-    )
+    maps = estimate_depth_maps(
+        photos, views, points, progress, side_px=side_px, seed=seed, threads=threads
+    )  # none where there is too little to match
     confirmed = _confirmed_share(maps)
     decision = _decision(setting, confirmed, len(maps))
     if decision.chosen != "on":
         return DenseStart(None, {}, decision)
-    maps = on_planes(scene, maps, progress, seed=seed)
+    maps = fill_plain_parts(maps, points, progress, seed=seed)
     wanted = start_budget(max_gaussians)
     found = fuse(maps, wanted)
     guesses = fill_gaps(maps, found, round(GUESS_SHARE * wanted))
@@ -247,7 +247,11 @@ def dense_start(
         "dense start: %d points, %d guesses, %d far away, %d Gaussians",
         len(found), len(guesses), len(shell), len(gaussians) + len(shell),
     )  # fmt: skip
-    gaussians = gaussians.joined(_shell_gaussians(shell, sh_degree))
+    far = gaussians_at(
+        shell.positions, shell.colors / 255.0, SIZE_SHARE * shell.sizes, sh_degree,
+        normals=shell.normals, flatness=FLATNESS, opacities=OPACITY,
+    )  # fmt: skip
+    gaussians = gaussians.joined(far)
     if len(gaussians) > max_gaussians:
         random = np.random.default_rng([seed, 4])
         kept = np.sort(random.choice(len(gaussians), max_gaussians, replace=False))
@@ -258,24 +262,6 @@ def dense_start(
 def start_budget(max_gaussians: int) -> int:
     """Return how many points on confirmed depths are wanted below a limit of Gaussians."""
     return max(1, min(MOST_POINTS, round(BUDGET_SHARE * max_gaussians)))
-
-
-def matched_photos(
-    scene: Scene, photos: PhotoSource, views: Sequence[int], progress: Progress, *, side_px: int,
-    seed: int, threads: int,
-) -> list[DepthMap]:  # fmt: skip
-    """Return the depth maps of the training views; empty where there is too little to match."""
-    points, _ = _usable(scene)
-    return estimate_depth_maps(
-        photos, views, points, progress, side_px=side_px, seed=seed, threads=threads
-    )
-
-
-def on_planes(
-    scene: Scene, maps: Sequence[DepthMap], progress: Progress, *, seed: int
-) -> list[DepthMap]:
-    """Return the depth maps with planes through their plain parts."""
-    return fill_plain_parts(maps, _usable(scene)[0], progress, seed=seed)
 
 
 def _usable(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -328,13 +314,6 @@ def _gaussians(
         flatness=np.repeat([FLATNESS, GUESS_FLATNESS, 1.0], counts),
         opacities=np.repeat([OPACITY, GUESS_OPACITY, 0.1], counts),
     )
-
-
-def _shell_gaussians(shell: DensePoints, sh_degree: int) -> OrientedGaussians:
-    return gaussians_at(
-        shell.positions, shell.colors / 255.0, SIZE_SHARE * shell.sizes, sh_degree,
-        normals=shell.normals, flatness=FLATNESS, opacities=OPACITY,
-    )  # fmt: skip
 
 
 # -- The Gaussians a training starts from: at dense points from stereo, or at the sparse points
@@ -417,12 +396,12 @@ class PointStart:
         priors = load_priors(self.folder, cameras, key)
         if priors is None:
             _logger.info("the confirmed depths are not there: matching the photos again")
-            scene, quiet = self._start_scene(), progress.span(0.0, 0.0)
-            maps = matched_photos(
-                scene, self.photos, self.views, quiet, side_px=self.settings.match_px,
+            (points, _), quiet = _usable(self._start_scene()), progress.span(0.0, 0.0)
+            maps = estimate_depth_maps(
+                self.photos, self.views, points, quiet, side_px=self.settings.match_px,
                 seed=self.seed, threads=self.threads,
             )  # fmt: skip
-            priors = priors_of(self.views, on_planes(scene, maps, quiet, seed=self.seed))
+            priors = priors_of(self.views, fill_plain_parts(maps, points, quiet, seed=self.seed))
             save_priors(self.folder, priors, key)
         return priors
 

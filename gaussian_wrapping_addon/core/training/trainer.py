@@ -268,8 +268,8 @@ RESTART_RATE = 0.5
 
 def train(
     scene: Scene, photos: PhotoSource, settings: TrainingSettings, folder: Path, progress: Progress,
-    *, seed: int = 0, threads: int = 0, start_splat: Path | None = None,
-    inside: Inside | None = None, backend: Backend | None = None, handover: Handover | None = None,
+    *, seed: int = 0, threads: int = 0, start: Path | Handover | None = None,
+    inside: Inside | None = None, backend: Backend | None = None,
 ) -> TrainingResult:  # fmt: skip
     """Train oriented Gaussians on the photos of a scene.
 
@@ -288,17 +288,16 @@ def train(
         Updated every few iterations; checked for cancellation in each one.
     seed, threads : int
         0 threads uses every core. The result does not depend on ``threads``.
-    start_splat : Path, optional
+    start : Path or Handover, optional
         PLY of Gaussians in the world frame of the photos to start from; the training is then short
-        and does not densify (:func:`~.splat_start.wrapping_settings`).
+        and does not densify (:func:`~.splat_start.wrapping_settings`). Or what another training of
+        the scene has found; nothing is started or decided then, and the result's ``poses`` are
+        ``None``.
     inside : callable, optional
         Tells for points (n, 3), scene frame, where ``settings.region_weight`` applies.
     backend : Backend, optional
         Where to train; by default on the processor. A checkpoint goes on on any. One that fails
         (memory, driver) is replaced by the processor, with a warning in the result.
-    handover : Handover, optional
-        What another training of the scene has found; nothing is started or decided then. The
-        result's ``poses`` are ``None``.
 
     Raises
     ------
@@ -318,9 +317,8 @@ def train(
     try:
         with decoded_in(photos, folder):
             run = _Trainer(
-                scene, photos, settings, folder, seed, threads, start_splat, inside, progress,
-                backend, handover,
-            )  # fmt: skip
+                scene, photos, settings, folder, seed, threads, start, inside, progress, backend
+            )
             return run.run(progress)
     finally:
         torch.set_num_threads(before)
@@ -331,10 +329,12 @@ class _Trainer:
 
     def __init__(
         self, scene: Scene, photos: PhotoSource, settings: TrainingSettings, folder: Path,
-        seed: int, threads: int, start_splat: Path | None = None, inside: Inside | None = None,
-        progress: Progress | None = None, backend: Backend | None = None,
-        handover: Handover | None = None,
+        seed: int, threads: int, start: Path | Handover | None = None,
+        inside: Inside | None = None, progress: Progress | None = None,
+        backend: Backend | None = None,
     ) -> None:  # fmt: skip
+        handover = start if isinstance(start, Handover) else None
+        start_splat = start if isinstance(start, Path) else None
         if start_splat is not None:
             settings = wrapping_settings(settings)
         settings = dataclasses.replace(settings, mask_mode=scene.mask_mode(settings.mask_mode))

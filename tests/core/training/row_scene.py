@@ -112,7 +112,7 @@ def train_block(
 ) -> TrainingResult:  # fmt: skip
     """Train a block as a job does, without confirmed depths."""
     shorter, handover = block_training(plan, index, settings)
-    return train(scene, photos, shorter, folder, progress, handover=handover, **more)
+    return train(scene, photos, shorter, folder, progress, start=handover, **more)
 
 
 def join_blocks(
@@ -123,4 +123,4 @@ def join_blocks(
     last, handover = joint_training(
         plan, parts, photos, settings, progress.span(0.0, 0.05), ViewRenderer(), threads=1
     )
-    return train(scene, photos, last, folder, progress.span(0.05, 1.0), handover=handover, **more)
+    return train(scene, photos, last, folder, progress.span(0.05, 1.0), start=handover, **more)

@@ -209,7 +209,7 @@ def test_a_start_from_an_oriented_splat_keeps_its_orientation(tmp_path: Path) ->
     settings = dataclasses.replace(
         SETTINGS, iterations=10, wrapping="on", wrap_rounds=0, full_size="on"
     )
-    result = train(scene, photos, settings, tmp_path, Progress(), threads=1, start_splat=path)
+    result = train(scene, photos, settings, tmp_path, Progress(), threads=1, start=path)
     assert len(result.gaussians) == 150
     outward = (result.gaussians.normals().detach() * truth.means).sum(1).numpy()
     assert (outward[::2] < 0).all(), "a few iterations turn no normal over"

@@ -383,7 +383,7 @@ class BlockStages:
         result = train(
             scene, _photos(scene, settings), shorter, folder, progress,
             seed=self.job.settings.seed, threads=self.threads, inside=inside,
-            backend=self._backend(), handover=handover,
+            backend=self._backend(), start=handover,
         )  # fmt: skip
         save_gaussians(folder / GAUSSIANS_NAME, result.gaussians)
         remove_checkpoints(folder)
@@ -476,7 +476,7 @@ class BlockStages:
             result = train(
                 scene, photos, last, folder, progress.span(0.05, 1.0),
                 seed=self.job.settings.seed, threads=self.threads, backend=backend,
-                handover=handover,
+                start=handover,
             )  # fmt: skip
         earlier = [w for stage in stages for w in read_warnings(stage.done.get("warnings"))]
         return dataclasses.replace(
@@ -733,7 +733,7 @@ def _train(
         photos = PhotoStore(scene, settings.max_image_px)
         return train(
             scene, photos, settings, stage_folder, progress,
-            seed=job.settings.seed, threads=threads, start_splat=start_splat_of(job), inside=inside,
+            seed=job.settings.seed, threads=threads, start=start_splat_of(job), inside=inside,
             backend=chosen_backend(
                 device.device, threads, or_processor=job.settings.device == "auto"
             ),
