@@ -67,13 +67,7 @@ def failure_on(device_index: int) -> str:
 
 
 def check_kernels(kernels: Kernels, device: torch.device) -> str:
-    """Compare images and gradients of a small scene; return what differs, ``""`` if nothing.
-
-    Parameters
-    ----------
-    device : torch.device
-        Where their tensors are.
-    """
+    """Compare images and gradients of a small scene; return what differs, ``""`` if nothing."""
     camera = _camera()
     definition = _scene(torch.float64, torch.device("cpu"))
     expected = render_reference(definition, camera, _OPTIONS)
@@ -141,19 +135,11 @@ Made = TypeVar("Made")
 
 
 def with_renderer(device: str, what: str, work: Callable[[Renderer], Made]) -> Made:
-    """Return what work makes of the renderer of a device.
+    """Return what work makes of the renderer of a device, ``"cpu"`` or ``"cuda:N"``.
 
-    Where the GPU fails, the log says why, and the work is done again from its beginning with the
-    renderer of the processor.
-
-    Parameters
-    ----------
-    device : str
-        ``"cpu"`` or ``"cuda:N"``.
-    what : str
-        What is rendered, for the log; a plural that begins a sentence.
-    work : callable
-        Keeps nothing of a call that has failed.
+    Where the GPU fails, the log says why (``what`` is rendered, a plural that begins a sentence),
+    and the work is done again from its beginning with the renderer of the processor; it must keep
+    nothing of a call that has failed.
     """
     if device == CPU:
         return work(ViewRenderer())

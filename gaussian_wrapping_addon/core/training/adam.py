@@ -30,23 +30,10 @@ def merge_gradients(
     first: VisibleGradients, second: VisibleGradients, count: int, *, threads: int = 0,
     store: ArrayStore | None = None,
 ) -> VisibleGradients:  # fmt: skip
-    """Return the sum of two gradients, Gaussian by Gaussian.
+    """Return the sum of two gradients, one row for each Gaussian in either, with increasing ids.
 
-    Parameters
-    ----------
-    first, second : VisibleGradients
-        For the same Gaussians, each with increasing ids. Neither is changed.
-    count : int
-        Number of Gaussians that ids point into.
-    threads : int
-        The result does not depend on it.
-    store : ArrayStore, optional
-        Memory for the sum, which is then valid until the next call.
-
-    Returns
-    -------
-    VisibleGradients
-        One row for each Gaussian in either, with increasing ids.
+    Both are for the same ``count`` Gaussians, each with increasing ids; neither is changed. A sum
+    in memory of ``store`` is valid until the next call. The result does not depend on ``threads``.
     """
     threads = threads or default_threads()
     taken = ArrayStore() if store is None else store
@@ -405,12 +392,8 @@ class Adam:
     """Adam optimiser of the trained tensors; rows are Gaussians and can be rebuilt.
 
     Each Gaussian counts its own steps, so that one created late, or rarely seen, has the right bias
-    correction instead of an overshooting first step.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        float32, on the CPU. The tensors are copied.
+    correction instead of an overshooting first step. The tensors given, float32 on the CPU, are
+    copied.
     """
 
     def __init__(self, gaussians: OrientedGaussians) -> None:

@@ -76,22 +76,11 @@ def inside_masks(
     cameras: Sequence[Camera],
     masks: Iterable[np.ndarray | None],
 ) -> np.ndarray:
-    """Tell which points lie inside the masks of :data:`MIN_SHARE` of the photos that hold them.
+    """Tell which points (n, 3), scene frame, lie inside the masks of most photos that hold them.
 
     Other points would initialise Gaussians in empty space, and would extend an automatic region
-    over what was masked out.
-
-    Parameters
-    ----------
-    points : (n, 3)
-        Scene frame.
-    masks : iterable of (h, w) bool or None
-        Of the cameras' sizes; ``None`` masks nothing. One is held at a time.
-
-    Returns
-    -------
-    (n,) bool
-        False also for points outside all images.
+    over what was masked out. ``None`` masks nothing; one mask is held at a time. The result, (n,)
+    bool, is false also for points outside all images.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     held, inside = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)

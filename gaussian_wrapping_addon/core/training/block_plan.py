@@ -145,17 +145,8 @@ def confirmed_depths(
 ) -> dict[int, DepthPrior]:  # fmt: skip
     """Read the depths that a dense start of the coarse training confirmed for some views.
 
-    Parameters
-    ----------
-    folder, photos, settings
-        Of the coarse training.
-    all_views, views : sequence of int
-        All training views, and those to read.
-
-    Returns
-    -------
-    dict of int to DepthPrior
-        Empty without a dense start, or where the settings have no use for depths.
+    There are none without a dense start, or where the settings have no use for depths. ``folder``,
+    ``photos`` and ``settings`` are the coarse training's, ``all_views`` all training views.
 
     Raises
     ------
@@ -308,18 +299,10 @@ class Visibility:
 def chosen_photos(shown: np.ndarray, coverage: float) -> np.ndarray:
     """Choose the photos of each block: the fewest that together show most of what it trains.
 
-    A photo that no block would choose belongs to that of which it shows most.
-
-    Parameters
-    ----------
-    shown : (photos, blocks) float64
-        Weight of each block's cell and margin in each photo, at least 0.
-    coverage : float
-        Share of a block's weights over all photos that the chosen ones hold at least.
-
-    Returns
-    -------
-    (photos, blocks) bool
+    A photo that no block would choose belongs to that of which it shows most. ``shown``, (photos,
+    blocks) float64, is the weight of each block's cell and margin in each photo, at least 0; the
+    chosen ones, (photos, blocks) bool, hold at least ``coverage`` of a block's weights over all
+    photos.
     """
     chosen = np.zeros(shown.shape, np.bool_)
     for block, weights in enumerate(shown.T):
@@ -490,26 +473,17 @@ def plan_blocks(
     coarse: CoarseTraining, scene: Scene, photos: PhotoSource, settings: TrainingSettings,
     progress: Progress, *, renderer: Renderer | None = None, threads: int = 0,
 ) -> BlockPlan:  # fmt: skip
-    """Divide a training into blocks. The plan depends on the inputs alone.
+    """Divide a training into ``settings.blocks`` blocks. The plan depends on the inputs alone.
 
-    Parameters
-    ----------
-    scene : Scene
-        With the poses of the coarse training.
-    photos : PhotoSource
-        Of this scene, at the size that blocks train at.
-    settings : TrainingSettings
-        Of the whole training; ``blocks`` of them are made.
-    progress : Progress
-        Checked for cancellation before each photo.
-    renderer : Renderer, optional
-        Overwrites its last view; by default one on the processor.
+    The scene has the poses of the coarse training, the photos the size that blocks train at. A
+    renderer given overwrites its last view.
 
     Raises
     ------
     UsageError
         There are more blocks than the photos can be divided into.
     Cancelled
+        Before the next photo.
     """
     threads, count = threads or default_threads(), settings.blocks
     views = training_views(scene, photos, settings.holdout_every)

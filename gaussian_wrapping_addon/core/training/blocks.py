@@ -35,14 +35,8 @@ def block_training(
     """Return the settings of a block and what it takes over, for :func:`~.trainer.train`.
 
     The training's result has the Gaussians of the block, those in its margin included, and none
-    that stood still.
-
-    Parameters
-    ----------
-    settings : TrainingSettings
-        Of the whole training.
-    priors : mapping of int to DepthPrior, optional
-        Confirmed depths of at least the block's views (:func:`~.block_plan.confirmed_depths`).
+    that stood still. ``settings`` are the whole training's; ``priors`` holds the confirmed depths
+    of at least the block's views (:func:`~.block_plan.confirmed_depths`).
     """
     block, known = plan.blocks[index], priors or {}
     shorter = block_settings(plan, index, settings)
@@ -111,19 +105,15 @@ def joint_training(
 ) -> tuple[TrainingSettings, Handover]:  # fmt: skip
     """Join the Gaussians of all blocks; return settings and handover to train them together.
 
-    The last iterations are those of a training that is continued: on all photos, at the last
-    rates, with no Gaussian added or removed.
+    The last iterations are those of a training that is continued: on all photos, at the last rates,
+    with no Gaussian added or removed.
 
     Parameters
     ----------
     parts : iterable of OrientedGaussians
         Results of :func:`block_training`, in the order of the blocks; one at a time is held.
-    photos, settings
-        As they were given to :func:`~.block_plan.plan_blocks`.
-    renderer : Renderer
-        Overwrites its last view.
-    priors : mapping of int to DepthPrior, optional
-        Confirmed depths (:func:`~.block_plan.confirmed_depths`).
+    photos, settings, renderer
+        As for :func:`~.block_plan.plan_blocks`.
 
     Raises
     ------

@@ -73,17 +73,10 @@ class CameraPoses:
         return dataclasses.replace(camera, cam_from_world=self.refined[view])
 
     def step(self, view: int, camera: Camera, gradient: np.ndarray, rate_px: float) -> None:
-        """Move a photo's pose against a gradient, by Adam.
+        """Move a photo's pose against the (6,) ``gradient`` of :func:`pose_gradient`, by Adam.
 
-        Parameters
-        ----------
-        camera : Camera
-            Of the photo at the size that ``rate_px`` refers to.
-        gradient : (6,) float64
-            Of :func:`~.camera_poses.pose_gradient`.
-        rate_px : float
-            Size of a step: pixels by rotation, and by translation of what lies as far away as
-            the cameras are from the middle of the scene.
+        ``rate_px`` is the size of a step: pixels of ``camera``'s image by rotation, and by
+        translation of what lies as far away as the cameras are from the middle of the scene.
         """
         if not self.active:
             return
@@ -126,19 +119,10 @@ class CameraPoses:
         return self.refined.copy() if self.active and self.adam.steps.any() else None
 
     def shifts_px(self, cameras: Mapping[int, Camera], points: np.ndarray) -> np.ndarray:
-        """Return how far refined poses move what the given ones show.
+        """Return how far refined poses move what the given ones show, (photos,) float64, pixels.
 
-        Parameters
-        ----------
-        cameras : mapping of int to Camera
-            Of photos, by view, with any pose.
-        points : (n, 3) array
-            Scene frame.
-
-        Returns
-        -------
-        (photos,) float64
-            Median over the points in a photo, pixels; 0 where it shows none.
+        The median over the points (n, 3), scene frame, in a photo; 0 where it shows none.
+        ``cameras`` are those of photos, by view, with any pose.
         """
         shifts = []
         for view, camera in cameras.items():

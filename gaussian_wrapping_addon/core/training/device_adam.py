@@ -17,18 +17,11 @@ _WARPS = THREADS_PER_BLOCK // 32
 
 
 class DeviceAdam(Adam):
-    """Adam on the tensors of a device.
+    """Adam on the tensors of a device, to which those of another are copied.
 
-    What rounds between iterations read and write is copied: :meth:`array` and ``moments``
-    give copies on the host, which go back to the device before anything else uses it. Write to
-    them at once, and fetch them anew after a step.
-
-    Parameters
-    ----------
-    adam : Adam
-        Its values, moments and steps are copied to the device.
-    kernels : Kernels
-        Of the device.
+    What rounds between iterations read and write is copied: :meth:`array` and ``moments`` give
+    copies on the host, which go back to the device before anything else uses it. Write to them at
+    once, and fetch them anew after a step.
     """
 
     def __init__(self, adam: Adam, kernels: Kernels, device: torch.device) -> None:

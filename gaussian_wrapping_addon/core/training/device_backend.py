@@ -115,16 +115,10 @@ Gradients = dict[str, Tensor]
 
 
 class DeviceBackend(Backend):
-    """Runs on a device; methods as in :class:`.Backend`.
+    """Runs on a device such as "cuda:0"; methods as in :class:`.Backend`.
 
-    Parameters
-    ----------
-    name : str
-        Such as "cuda:0".
-    free_bytes : callable
-        Returns the device memory that tile intersections may take now.
-    photo_bytes : int
-        Device memory for photos.
+    ``free_bytes`` returns the device memory that tile intersections may take now, ``photo_bytes``
+    is that for photos.
     """
 
     def __init__(
@@ -361,16 +355,9 @@ _logger = logging.getLogger(__name__)
 
 
 def chosen_backend(device: str, threads: int, *, or_processor: bool = False) -> Backend:
-    """Return the backend of a device.
+    """Return the backend of "cpu", or of a GPU such as "cuda:0".
 
-    Parameters
-    ----------
-    device : str
-        "cpu", or a GPU such as "cuda:0".
-    threads : int
-        Of the processor.
-    or_processor : bool
-        Return the processor's where the GPU fails, and log why.
+    Where the GPU fails, ``or_processor`` returns the processor's, and logs why.
 
     Raises
     ------

@@ -160,23 +160,10 @@ def device_multi_view_losses(
     kernels: Kernels, images: DeviceView, gaussians: OrientedGaussians, shown: PhotoView,
     other: PhotoView, settings: MultiViewOptions, random: np.random.Generator,
 ) -> MultiViewLoss:  # fmt: skip
-    """Compare a rendered view with the photo and the depth of another view.
+    """Compare a rendered view with the photo and the depth of another view, on a device.
 
     The definition, the sampled pixels and the numbers drawn are those of
     :func:`~.multi_view.multi_view_losses`. Bitwise reproducible on the same GPU.
-
-    Parameters
-    ----------
-    kernels : Kernels
-        Of the tensors' device.
-    images : DeviceView
-        Rendered with depth.
-    gaussians : OrientedGaussians
-        Rendered Gaussians, scene frame.
-    shown, other : PhotoView
-        The rendered view's and another; sizes may differ.
-    random : numpy Generator
-        ``settings.pixels`` numbers are drawn, none where all pixels are taken.
 
     Raises
     ------
@@ -247,19 +234,10 @@ def choose_on_device(
     kernels: Kernels, grey: Tensor, depth: Tensor, mask: Tensor, count: int,
     random: np.random.Generator,
 ) -> Tensor:  # fmt: skip
-    """Sample the pixels that ``pixel_choice.choose_pixels`` samples.
+    """Sample the pixels of :func:`~.multi_view.choose_pixels`, with the same random numbers.
 
-    Parameters
-    ----------
-    grey, depth : (h, w) float32
-    mask : (h, w) bool, or (0,) for none
-    random : numpy Generator
-        ``count`` numbers are drawn; none if ``count`` is not less than the number of pixels.
-
-    Returns
-    -------
-    (m,) int32
-        ``row * width + column`` or -1; m is ``count`` or, if smaller, the number of pixels.
+    ``mask`` is (h, w) bool, or (0,) for none. Returns (m,) int32, ``row * width + column`` or -1; m
+    is ``count`` or, if smaller, the number of pixels.
     """
     height, width = grey.shape
     takes_all = count >= grey.numel()

@@ -435,20 +435,11 @@ def _window(pixels: float, most: int) -> float:
 def estimate(
     scene_facts: SceneFacts, settings: TrainingSettings, machine: Machine, *, first: int = 0
 ) -> Estimate:
-    """Estimate the cost of a training.
+    """Estimate the cost of a training in one piece, from iteration ``first`` of a checkpoint on.
 
-    For settings left to the photos (``"auto"``), the range extends from "off" to "on".
-
-    Parameters
-    ----------
-    first : int
-        Iterations already done by a checkpoint.
-
-    Returns
-    -------
-    Estimate
-        Times are those of the training alone, without camera poses, meshing and texture
-        (:data:`MESH_AND_TEXTURE_SHARE`).
+    For settings left to the photos (``"auto"``), the range extends from "off" to "on". Times are
+    those of the training alone, without camera poses, meshing and texture
+    (:data:`MESH_AND_TEXTURE_SHARE`).
     """
     decided = settings.multi_view == "auto"
     cheap = dataclasses.replace(settings, multi_view="off") if decided else settings
@@ -537,20 +528,10 @@ along two axes, on one side each for the four blocks of a square."""
 def estimate_training(
     facts: SceneFacts, settings: TrainingSettings, machine: Machine, *, first: int = 0
 ) -> Estimate:
-    """Estimate the cost of a training, in blocks or in one piece.
+    """Estimate the cost of a training, in blocks or in one piece; see :func:`estimate`.
 
-    Parameters
-    ----------
-    facts, settings, machine
-        As for :func:`estimate`.
-    first : int
-        Iterations already done by a checkpoint of a training in one piece.
-
-    Returns
-    -------
-    Estimate
-        Of blocks the time of all of them together, one after another, and the memory of the largest
-        process.
+    Of blocks: the time of all of them together, one after another, and the memory of the largest
+    process.
 
     Raises
     ------

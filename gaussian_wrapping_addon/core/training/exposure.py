@@ -48,18 +48,9 @@ def photo_rate(
 
 
 class PhotoAdam:
-    """Moments of the values of all photos.
+    """Moments, of type ``dtype``, of ``values`` values of each of ``count`` photos.
 
-    Parameters
-    ----------
-    count : int
-        Number of the scene's views.
-    values : int
-        Number of values per view.
-    dtype : numpy dtype
-        Of the moments.
-    epsilon : float
-        Added to the root of the second moment.
+    ``epsilon`` is added to the root of the second moment.
     """
 
     def __init__(self, count: int, values: int, dtype: type[np.floating], epsilon: float) -> None:
@@ -244,19 +235,11 @@ class Exposure:
     def corrected(
         self, view: int, color: np.ndarray, alpha: np.ndarray | None = None, *, threads: int = 0
     ) -> np.ndarray:
-        """Apply the photo's exposure to a render: ``exp(a) color + b``.
+        """Apply the photo's exposure to a render: ``exp(a) color + b``, valid until the next call.
 
-        Parameters
-        ----------
-        color : (h, w, 3) float32 or float64
-        alpha : (h, w), the same type, optional
-            The offset is then ``b alpha``, as for a colour blended over emptiness. For images that
-            are composited afterwards (:mod:`.background`).
-
-        Returns
-        -------
-        (h, w, 3), of the colour's type
-            Valid until the next call.
+        ``color`` is (h, w, 3) float32 or float64. With an ``alpha`` (h, w) the offset is
+        ``b alpha``, as for a colour blended over emptiness: for images that are composited
+        afterwards (:mod:`.background`).
         """
         color, alpha = self._arrays(color, alpha)
         out = self._store.take(f"corrected {color.dtype}", color.shape, color.dtype)
@@ -275,19 +258,9 @@ class Exposure:
     ) -> tuple[np.ndarray, np.ndarray | None]:  # fmt: skip
         """Return the gradients on colour and alpha; store that of the exposure for :meth:`step`.
 
-        Parameters
-        ----------
-        view, color, alpha
-            As passed to :meth:`corrected`.
-        by_corrected : (h, w, 3), of the colour's type
-            Gradient of the loss on the corrected image.
-
-        Returns
-        -------
-        by_color : (h, w, 3)
-            Valid until the next call.
-        by_alpha : (h, w) or None
-            ``None`` without alpha. Both are bitwise the same for any number of threads.
+        ``by_corrected`` (h, w, 3) is the gradient of the loss on the corrected image. The results,
+        (h, w, 3) and (h, w) or ``None`` without alpha, are valid until the next call, and bitwise
+        the same for any number of threads.
         """
         color, cover = self._arrays(color, alpha)
         by_out = np.ascontiguousarray(by_corrected, color.dtype)
@@ -390,11 +363,13 @@ MIN_FIT_PIXELS = 64
 def fit_exposure(
     render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit gain and offset per channel of a render to a photo.
+    """Return gain and offset (3,) float64 that fit a render to a photo.
 
-    Least squares in closed form, reweighted with ``1 / max(|error|, 0.05)`` (Huber), with a weak
-    prior :data:`FIT_PRIOR_SQ` on a gain of 1. For photos whose exposure was not trained. Metrics on
-    the fitted pixels are too optimistic; report those of :func:`corrected_for_measuring`.
+    ``photo ~ gain render + offset`` for each channel, by least squares in closed form, reweighted
+    with ``1 / max(|error|, 0.05)`` (Huber), with a weak prior :data:`FIT_PRIOR_SQ` on a gain of 1;
+    1 and 0 for a channel with fewer than :data:`MIN_FIT_PIXELS` usable pixels. For photos whose
+    exposure was not trained. Metrics on the fitted pixels are too optimistic; report those of
+    :func:`corrected_for_measuring`.
 
     Parameters
     ----------
@@ -402,12 +377,6 @@ def fit_exposure(
     photo : (h, w, 3) uint8, or floats in [0, 1]
     mask : (h, w) bool, optional
         Pixels to use.
-
-    Returns
-    -------
-    gain, offset : (3,) float64
-        ``photo ~ gain render + offset``; 1 and 0 for a channel with fewer than
-        :data:`MIN_FIT_PIXELS` usable pixels.
     """
     x, y = np.asarray(render, np.float64), np.asarray(photo)
     y = y / 255.0 if y.dtype == np.uint8 else y.astype(np.float64)
@@ -447,15 +416,8 @@ def corrected_for_measuring(
     reconstructed and not how well six numbers fit. They must be named as such: "PSNR after an
     exposure fitted crosswise on the image's halves".
 
-    Parameters
-    ----------
-    render, photo, mask
-        As for :func:`fit_exposure`. A half whose other half has too few pixels is not corrected.
-
-    Returns
-    -------
-    (h, w, 3) float32
-        In [0, 1].
+    Images are as for :func:`fit_exposure`, the result is (h, w, 3) float32 in [0, 1]. A half whose
+    other half has too few pixels is not corrected.
     """
     middle = np.shape(render)[1] // 2
     halves = (slice(None, middle), slice(middle, None))

@@ -112,20 +112,10 @@ class LogGains:
 
 
 def select_exposure(scene: Scene, photos: PhotoSource, views: Sequence[int]) -> ExposureEvidence:
-    """Decide from the colours of the sparse points whether to model exposures.
+    """Decide from the colours of the sparse points whether to model exposures of the views.
 
-    Parameters
-    ----------
-    photos : PhotoStore
-        Sampled at a small size.
-    views : sequence of int
-        Views that are trained on.
-
-    Returns
-    -------
-    ExposureEvidence
-        ``known=False`` and ``needed=False`` with too few points: the mean brightness of photos is
-        no evidence, since they show different things.
+    With too few points, the evidence is ``known=False`` and ``needed=False``: the mean brightness
+    of photos is no evidence, since they show different things.
     """
     views = list(views)
     count = len(scene.views)
@@ -261,16 +251,8 @@ def exposure_evidence(
 ) -> ExposureEvidence:
     """Return the evidence from gains and their standard errors.
 
-    Parameters
-    ----------
-    found : LogGains
-        Gains of the photos ``views`` from all points.
-    parts : sequence of LogGains
-        The same from the points of each part of the scene.
-    count : int
-        Number of views of the scene.
-    points : int
-        Number of common points, for the report.
+    ``found`` are the gains of the photos ``views`` from all points, ``parts`` those from the points
+    of each part of the scene; the scene has ``count`` views, and ``points`` common points.
     """
     known = (found.points >= MIN_POINTS).all(axis=1)
     number = int(np.count_nonzero(known))

@@ -62,30 +62,21 @@ def measure_held_out(
     renderer: Renderer | None = None, exposure_correction: Correction | None = None,
     check: Callable[[], None] | None = None,
 ) -> float:  # fmt: skip
-    """Return the mean PSNR of a few held-out photos at a small size.
+    """Return the mean PSNR of a few held-out photos at a small size, dB.
 
-    Depends on the Gaussians and photos alone, so it may enter a training's history.
+    NaN without held-out photos, or if masks cover all of them. Depends on the Gaussians and photos
+    alone, so it may enter a training's history.
 
     Parameters
     ----------
-    gaussians : OrientedGaussians
-        The tensors in training; neither copied nor changed.
     held_out : sequence of int
         Held-out views; :data:`MEASURED_VIEWS` of them, evenly spread, are measured.
-    threads : int
-        The result does not depend on it.
     renderer : Renderer, optional
         Renderer to reuse; not one whose last view still awaits its backward pass.
     exposure_correction : callable, optional
-        Applied to each render before it is measured
-        (:func:`~.exposure.corrected_for_measuring`).
+        Applied to each render before it is measured (:func:`~.exposure.corrected_for_measuring`).
     check : callable, optional
         Called before each view; an exception ends the measurement.
-
-    Returns
-    -------
-    float
-        dB; NaN without held-out photos, or if masks cover all of them.
     """
     renderer = renderer or ViewRenderer()
     raw = RawArrays.from_gaussians(gaussians)
@@ -118,19 +109,13 @@ class LiveView:
 
     Parameters
     ----------
-    photos : PhotoStore
-        The training's own; its cache is shared.
     held_out : sequence of int
-        Held-out views. The middle one is shown.
+        Held-out views. The middle one is shown, or ``otherwise`` without any.
     folder : Path
-        Receives :data:`PREVIEW_FILE`, :data:`PIXELS_FILE` and
-        :data:`~.preview_points.POINTS_FILE`, each replaced atomically.
+        Receives :data:`PREVIEW_FILE`, :data:`PIXELS_FILE` and :data:`~.preview_points.POINTS_FILE`,
+        each replaced atomically.
     settings : TrainingSettings
         ``preview_every_s`` is the time between two updates; 0 disables them.
-    renderer : Renderer, optional
-        By default one on the processor.
-    otherwise : int
-        View to show where none is held out.
     clock : callable
         Seconds; the first update comes ``preview_every_s`` after the start.
     """
@@ -223,15 +208,10 @@ def held_out_metrics(
     *, threads: int, renderer: Renderer | None = None,
     exposure_correction: Correction | None = None,
 ) -> tuple[list[HeldOutMetrics], str]:  # fmt: skip
-    """Return the metrics of held-out photos, and the reason if they have no LPIPS.
+    """Return the metrics of held-out photos, given by view and name, and why they have no LPIPS.
 
-    Parameters
-    ----------
-    names : mapping of int to str
-        Names of the held-out views.
-    exposure_correction : callable, optional
-        Where exposures are modelled: fits that of each half of a photo on the other half, as it
-        was never trained.
+    Where exposures are modelled, ``exposure_correction`` fits that of each half of a photo on the
+    other half, as it was never trained.
     """
     figures = []
     lpips, reason = lpips_if_ready() if names else (None, "")

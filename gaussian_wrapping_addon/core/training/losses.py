@@ -34,21 +34,20 @@ def add_opacity_prior(
     Parameters
     ----------
     gradients : VisibleGradients
-        The gradient is added to ``opacity_logits``, but for Gaussians whose opacity no pixel
-        asks about.
+        The gradient is added to ``opacity_logits``, but for Gaussians whose opacity no pixel asks
+        about.
     opacity_logits : (n,) float32
         Raw, of all Gaussians.
     shares : (v,) float32
-        Shares of the image in the footprints of the Gaussians that the gradient belongs to
-        (:func:`~.losses.footprint_shares`).
+        Of the Gaussians that the gradient belongs to (:func:`footprint_shares`).
     weight : float
         Setting ``lambda_opacity``.
 
     Returns
     -------
     float
-        Mean over the pixels of the sum over Gaussians of ``4 k(o)``, where ``k`` is the integral
-        of a ramp from 0 at :data:`FAINT` to 1 at :data:`SURE`.
+        Mean over the pixels of the sum over Gaussians of ``4 k(o)``, where ``k`` is the integral of
+        a ramp from 0 at :data:`FAINT` to 1 at :data:`SURE`.
     """
     # The optimizer takes a 0 for a Gaussian not seen.
     area = shares * (gradients.opacity_logits != 0.0)
@@ -63,18 +62,10 @@ def add_opacity_prior(
 
 
 def footprint_shares(boxes: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """Return the share of an image that lies in each Gaussian's box.
+    """Return the share of an image that lies in each Gaussian's box, (v,) float32.
 
-    Parameters
-    ----------
-    boxes : (v, 4) float32
-        Footprints on the screen: x0, y0, x1, y1 in pixels.
-    size_px : (int, int)
-        Width and height of the image; area outside it does not count.
-
-    Returns
-    -------
-    (v,) float32
+    ``boxes`` (v, 4) float32 are footprints on the screen: x0, y0, x1, y1 in pixels. ``size_px`` is
+    the width and height of the image; area outside it does not count.
     """
     width, height = size_px
     box = np.clip(boxes, 0.0, np.array([width, height, width, height], np.float32))  # (v, 4)
@@ -85,7 +76,7 @@ def footprint_shares(boxes: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
 def add_footprint_regulariser(
     gradients: VisibleGradients, log_scales: np.ndarray, shares: np.ndarray, weight: float
 ) -> float:
-    """Add the gradient of ``weight`` times the mean number of Gaussians over a pixel.
+    """Add the gradient of ``weight`` times the mean number of Gaussians over a pixel; return it.
 
     Blending costs time for every Gaussian whose footprint contains a pixel, visible or occluded.
     Photos alone do not penalise this: half-transparent layers that overlap a hundredfold look the
@@ -101,13 +92,6 @@ def add_footprint_regulariser(
         Raw, of all Gaussians.
     shares : (v,) float32
         Of the Gaussians that the gradient belongs to (:func:`footprint_shares`).
-    weight : float
-        Loss of one Gaussian over every pixel.
-
-    Returns
-    -------
-    float
-        Mean number of Gaussians over a pixel.
     """
     squares = np.exp(2.0 * log_scales[gradients.ids])  # (v, 3)
     squares *= (2.0 * weight * shares / squares.sum(1))[:, None]
@@ -188,12 +172,6 @@ def depth_prior_loss(
         Of any size; the nearest pixel counts, as interpolation would join what edges separate.
     mask : (h, w) bool, optional
         False pixels count in no term.
-
-    Returns
-    -------
-    loss : float
-    gradients : ImageGradients
-        On the depth alone.
     """
     threads, store = threads or default_threads(), store or ArrayStore()
     depth = np.ascontiguousarray(depth)
@@ -524,7 +502,8 @@ def color_loss(
 ) -> tuple[float, np.ndarray, float]:  # fmt: skip
     """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and the mean squared error.
 
-    See docs/method.md, section 3.1.
+    See docs/method.md, section 3.1. The loss is 0 if the mask leaves no pixel; the gradient has the
+    image's type and, with a ``store``, is valid until the next call.
 
     Parameters
     ----------
@@ -535,15 +514,6 @@ def color_loss(
         False pixels count in no term.
     lambda_dssim : float
         Weight of the SSIM term; 0 is used if no window of SSIM fits or is unmasked.
-    store : ArrayStore, optional
-        Memory for the gradient, which is then valid until the next call.
-
-    Returns
-    -------
-    loss : float
-        0 if the mask leaves no pixel.
-    gradient : (h, w, 3), of the image's type
-    mean_squared : float
 
     Raises
     ------
@@ -603,13 +573,13 @@ def normal_losses(
     lambda_normal: float = 0.03, threads: int = 0,
     store: ArrayStore | None = None,
 ) -> tuple[float, ImageGradients]:  # fmt: skip
-    """Return ``lambda_DN L_DN + lambda_N L_N`` and its gradients.
+    """Return ``lambda_DN L_DN + lambda_N L_N`` and its gradients on all images but the colour.
 
     See docs/method.md, sections 3.2 and 3.3.
 
     ``L_DN = mean(valid (1 - n_geo / alpha . n_depth))`` and ``L_N = mean(valid (1 - N . n_depth))``
     over all pixels of the image (of the mask), with the normals of :func:`normals_from_depth`.
-    Gradients flow through all terms.
+    Gradients flow through all terms; with a ``store``, they are valid until the next call.
 
     Parameters
     ----------
@@ -621,14 +591,6 @@ def normal_losses(
         Of the same size, scene frame.
     mask : (h, w) bool, optional
         False pixels count in no term.
-    store : ArrayStore, optional
-        Memory for the gradients, which are then valid until the next call.
-
-    Returns
-    -------
-    loss : float
-    gradients : ImageGradients
-        On all four images; none on the colour.
     """
     threads, store = threads or default_threads(), store or ArrayStore()
     height, width = depth.shape

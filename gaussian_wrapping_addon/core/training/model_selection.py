@@ -147,14 +147,9 @@ def decide(
 def select_multi_view(neighbours: Sequence[np.ndarray], setting: str = "auto") -> Decision:
     """Decide whether the multi-view terms are used (docs/method.md, section 3.4).
 
-    They compare a photo with one taken from a nearby pose, and are on if any photo has such a
-    neighbour: photos without one skip them at no cost. Without any neighbour they stay off,
-    whatever the setting, as there is nothing to compare.
-
-    Parameters
-    ----------
-    neighbours : sequence of (k,) int arrays
-        Neighbours of each training view.
+    They compare a photo with one taken from a nearby pose, and are on if any of the training views
+    has ``neighbours``: photos without one skip them at no cost. Without any neighbour they stay
+    off, whatever the setting, as there is nothing to compare.
     """
     count = len(neighbours)
     paired = sum(len(of_view) > 0 for of_view in neighbours)
@@ -189,13 +184,8 @@ def start_poses(
 ) -> tuple[CameraPoses | None, ModelSelection]:
     """Return poses to refine, if any, and the decisions with this one where nothing is to measure.
 
-    Parameters
-    ----------
-    setting : str
-        ``"on"``, ``"off"``, or ``"auto"``: only after a dense start. From sparse points Gaussians
-        are in the wrong places at first, and cameras would follow them.
-    views : sequence of int
-        Training views.
+    The setting ``"auto"`` refines them only after a dense start: from sparse points Gaussians are
+    in the wrong places at first, and cameras would follow them.
     """
     missing = ""
     if len(views) < LEAST_VIEWS:
@@ -217,13 +207,7 @@ def select_poses(poses: CameraPoses, cameras: Mapping[int, Camera], means: np.nd
     """Decide whether refined poses differ from those given, and give them up if not.
 
     Poses that photos move at random only are better as they were: what moves them is noise.
-
-    Parameters
-    ----------
-    cameras : mapping of int to Camera
-        Of the training photos.
-    means : (n, 3) array
-        Of the Gaussians, scene frame.
+    ``cameras`` are the training photos', ``means`` (n, 3) the Gaussians', scene frame.
     """
     shift_px = float(np.median(poses.shifts_px(cameras, means)))
     needed = shift_px >= LEAST_SHIFT_PX

@@ -348,26 +348,14 @@ def multi_view_losses(
     """Compare a rendered view with the photo and the depth of another view.
 
     ``weight (lambda_photometric mean(w (1 - ncc)) + lambda_geometric mean(w noise))`` with
-    ``w = exp(-noise)`` treated as constant (docs/method.md, section 3.4). A pixel is valid where
-    both depths exist, both masks include it and the noise is below one pixel; its patch is kept
-    where the plane is not seen edge-on, all samples are inside both images and masks, neither patch
-    is flat, and ``1 - ncc < 0.9``.
+    ``w = exp(-noise)`` treated as constant (docs/method.md, section 3.4). A pixel is valid where both
+    depths exist, both masks include it and the noise is below one pixel; its patch is kept where
+    the plane is not seen edge-on, all samples are inside both images and masks, neither patch is
+    flat, and ``1 - ncc < 0.9``.
 
-    Parameters
-    ----------
-    image : ViewPass
-        Rendered with depth; any object with the same images will do.
-    gaussians : RawArrays
-        Rendered Gaussians, scene frame.
-    shown, other : PhotoView
-        The rendered view's and another; sizes may differ.
-    random : numpy Generator
-        ``settings.pixels`` numbers are drawn, none where all pixels are taken.
-    threads : int
-        The result does not depend on it.
-    store : ArrayStore, optional
-        Memory for the gradients on images, which are then valid until the next call.
-
+    ``image`` is rendered with depth, of ``gaussians`` in the scene frame. ``settings.pixels``
+    numbers are drawn, none where all pixels are taken. The result does not depend on ``threads``;
+    with a ``store``, gradients on images are valid until the next call.
     """
     threads, store = threads or default_threads(), store or ArrayStore()
     options = RenderOptions(sh_degree=0, threads=threads)

@@ -38,19 +38,9 @@ _DIRECTIONS = 64
 def transform_gaussians(
     gaussians: OrientedGaussians, target_from_source: Similarity
 ) -> OrientedGaussians:
-    """Transform Gaussians to another frame.
+    """Transform Gaussians to another frame, float64; they look the same from transformed cameras.
 
-    They look the same from transformed cameras.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Source frame; lengths (``filter_3d`` too) in its units.
-
-    Returns
-    -------
-    OrientedGaussians
-        float64, target frame.
+    Lengths of the source (``filter_3d`` too) are in its units.
     """
     wide = {name: t.detach().cpu().double() for name, t in gaussians.tensors()}
     similarity = target_from_source
@@ -100,22 +90,11 @@ def _rotated(quats: Tensor, turn: np.ndarray) -> Tensor:
 
 
 def rotate_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
-    """Rotate functions on the sphere, given by real spherical harmonics.
+    """Rotate functions on the sphere, given by real spherical harmonics (n, (degree + 1)^2, 3).
 
-    The coefficients are fitted to the function in :data:`_DIRECTIONS` directions, by least squares
-    for each degree; rotations do not mix degrees, so the fit is exact.
-
-    Parameters
-    ----------
-    sh : (n, (degree + 1)^2, 3)
-        Of degree 0 to 3.
-    rotation : (3, 3)
-        Rotation of the frame: the result at ``rotation @ d`` equals the input at ``d``.
-
-    Returns
-    -------
-    Tensor
-        Same shape and type as ``sh``.
+    The coefficients, of degree 0 to 3, are fitted to the function in :data:`_DIRECTIONS`
+    directions, by least squares for each degree; rotations do not mix degrees, so the fit is exact.
+    The result at ``rotation @ d`` equals the input at ``d``.
     """
     degree = math.isqrt(sh.shape[1]) - 1
     if torch.equal(rotation, torch.eye(3, dtype=rotation.dtype)):
@@ -194,14 +173,10 @@ def start_from_splat(
     ----------
     path : Path
         3D Gaussian splatting PLY of any program.
-    scene : Scene
-        Scene of the photos.
     view_indices : sequence of int
         Training views.
     settings : TrainingSettings
         ``max_gaussians`` and ``sh_degree`` are respected.
-    progress : Progress
-        Checked for cancellation at every view.
 
     Returns
     -------
@@ -211,6 +186,8 @@ def start_from_splat(
 
     Raises
     ------
+    Cancelled
+        Before the next view.
     ParseError
         The file is not a splat.
     DatasetError
@@ -270,24 +247,12 @@ def fit_filter(
     variance_px: float = TrainingSettings.filter_variance,
     threads: int = 0,
 ) -> OrientedGaussians:
-    """Return Gaussians that look with the cameras' 3D filter like the given ones without.
+    """Return Gaussians that look with the cameras' 3D filter like the given ones without, float32.
 
     Where that is impossible (an axis shorter than :data:`FILTER_MULTIPLE` filters, a thin and
-    opaque Gaussian), the axis gets that length and the opacity the highest possible value.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Scene frame, with a filter of 0.
-    cameras : sequence of Camera
-        Training cameras at full size.
-    variance_px : float
-        Variance of the filter, squared pixels.
-
-    Returns
-    -------
-    OrientedGaussians
-        float32, with the filter of the cameras.
+    opaque Gaussian), the axis gets that length and the opacity the highest possible value. The
+    Gaussians given, scene frame, have a filter of 0; the cameras are those of training at full
+    size, and ``variance_px`` is the variance of their filter, squared pixels.
     """
     wide = {name: t.detach().double() for name, t in gaussians.tensors()}
     means = wide["means"].numpy()

@@ -213,18 +213,11 @@ def dense_start(
     scene: Scene, photos: PhotoSource, views: Sequence[int], setting: str, progress: Progress, *,
     side_px: int, max_gaussians: int, sh_degree: int, seed: int, threads: int,
 ) -> DenseStart:  # fmt: skip
-    """Match the photos and return flat Gaussians on the surfaces found.
+    """Match the photos of the training views and return flat Gaussians on the surfaces found.
 
-    Parameters
-    ----------
-    views : sequence of int
-        Training views.
-    setting : str
-        ``"auto"`` needs :data:`LEAST_CONFIRMED` of the pixels; ``"on"`` takes what there is.
-    side_px : int
-        Longest side at which photos are matched.
-    max_gaussians : int
-        Limit of the growth; the start leaves room below it.
+    The setting ``"auto"`` needs :data:`LEAST_CONFIRMED` of the pixels; ``"on"`` takes what there
+    is. Photos are matched at a longest side of ``side_px``; the start leaves room below
+    ``max_gaussians``, the limit of the growth.
     """
     points, colors = _usable(scene)
     maps = estimate_depth_maps(

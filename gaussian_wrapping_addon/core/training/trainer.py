@@ -96,16 +96,8 @@ def with_backdrop(
 ) -> OrientedGaussians:  # fmt: skip
     """Return trained Gaussians with a sphere behind them, open where the photos see through.
 
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Trained, scene frame.
-    views : sequence of int
-        Training views.
-    renderer : Renderer, optional
-        Overwrites its last view; by default one on the processor.
-    check : callable, optional
-        Called before each view; an exception ends the work.
+    A renderer given overwrites its last view. ``check`` is called before each of the training
+    views; an exception ends the work.
     """
     farthest = float(gaussians.means.norm(dim=1).max()) if len(gaussians) else 0.0
     radius = max(LEAST_REACH, REACH_FACTOR * farthest)
@@ -154,16 +146,8 @@ def with_backdrop(
 class DeviceRecovery:
     """Brings states to the backend that computes, and to another where that fails.
 
-    Parameters
-    ----------
-    stepper : Stepper
-        Its backend is replaced by the processor's where the device is given up.
-    photos : PosedPhotos
-        Follow the poses of the state in use.
-    live : LiveView
-        Renders where the stepper computes.
-    threads : int
-        Of the processor.
+    The stepper's backend is then replaced by the processor's, and the live view renders where it
+    computes; the photos follow the poses of the state in use.
     """
 
     def __init__(self, stepper: Stepper, photos: PosedPhotos, live: LiveView, threads: int) -> None:
@@ -201,14 +185,8 @@ class DeviceRecovery:
     ) -> TrainingState:
         """Go back to what a failing device has left: with less of its memory, or without it.
 
-        Parameters
-        ----------
-        error : Exception
-            How it failed.
-        snapshot : Snapshot
-            The last one; a driver that was reset takes it along.
-        again : callable
-            Returns the state of the last checkpoint, or of a new start.
+        That is the last snapshot, unless a driver that was reset took it along: then ``again``
+        returns the state of the last checkpoint, or of a new start.
         """
         backend = self.stepper.backend
         smaller = is_memory_failure(error) and backend.use_less_memory()
