@@ -348,8 +348,8 @@ def multi_view_losses(
     """Compare a rendered view with the photo and the depth of another view.
 
     ``weight (lambda_photometric mean(w (1 - ncc)) + lambda_geometric mean(w noise))`` with
-    ``w = exp(-noise)`` treated as constant (docs/method.md, section 3.4). A pixel is valid where both
-    depths exist, both masks include it and the noise is below one pixel; its patch is kept where
+    ``w = exp(-noise)`` treated as constant (docs/method.md, section 3.4). A pixel is valid where
+    both depths exist, both masks include it and the noise is below one pixel; its patch is kept where
     the plane is not seen edge-on, all samples are inside both images and masks, neither patch is
     flat, and ``1 - ncc < 0.9``.
 
