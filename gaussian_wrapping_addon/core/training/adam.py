@@ -17,7 +17,7 @@ from numba.extending import intrinsic
 
 from ..compiled import kernel, part
 from ..gaussians.model import OrientedGaussians
-from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
+from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks, run_rows
 from ..render.types import ImageGradients, VisibleGradients
 
 # -- Sum gradients of several views or losses -----------------------------------------------------
@@ -35,8 +35,7 @@ def merge_gradients(
     Both are for the same ``count`` Gaussians, each with increasing ids; neither is changed. A sum
     in memory of ``store`` is valid until the next call. The result does not depend on ``threads``.
     """
-    threads = threads or default_threads()
-    taken = ArrayStore() if store is None else store
+    taken = store or ArrayStore()
     listed = taken.zeros("merged listed", count, np.bool_)
     listed[first.ids] = True
     listed[second.ids] = True
@@ -56,18 +55,8 @@ def merge_gradients(
         sums[name] = out = taken.take(f"merged {name}", shape, np.float32)
         flat = out.reshape(len(ids), -1) if len(ids) else np.zeros((0, 1), np.float32)
         one, two = (part.reshape(len(part), flat.shape[1]) for part in (one, two))
-        _add_rows_everywhere(rows[0], rows[1], one, two, flat, threads)
+        run_rows(_add_rows, len(flat), threads, *rows, one, two, flat, chunks=2)
     return VisibleGradients(ids, **sums)
-
-
-def _add_rows_everywhere(
-    first_rows: np.ndarray, second_rows: np.ndarray, first: np.ndarray, second: np.ndarray,
-    out: np.ndarray, threads: int,
-) -> None:  # fmt: skip
-    def run(begin: int, end: int) -> None:
-        _add_rows(begin, end, first_rows, second_rows, first, second, out)
-
-    run_chunks(run, even_bounds(len(out), threads, 2), threads)
 
 
 def add_image_gradients(first: ImageGradients, second: ImageGradients) -> ImageGradients:

@@ -136,10 +136,6 @@ class CameraPoses:
             shifts.append(float(np.median(lengths)) if len(lengths) else 0.0)
         return np.array(shifts)
 
-    def is_finite(self) -> bool:
-        """Tell whether all poses are finite."""
-        return bool(np.isfinite(self.refined).all())
-
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of all arrays, by name."""
         arrays = {name: getattr(self, name).copy() for name in ("given", "refined", "trained")}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..compiled import kernel
-from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
+from ..parallel import ArrayStore, run_rows
 
 # -- Adam for values of single photos: exposures, camera poses ------------------------------------
 #
@@ -244,12 +244,7 @@ class Exposure:
         color, alpha = self._arrays(color, alpha)
         out = self._store.take(f"corrected {color.dtype}", color.shape, color.dtype)
         gains, offsets = self.factors(view, color.dtype)
-
-        def run(begin: int, end: int) -> None:
-            apply_rows(begin, end, color, alpha, gains, offsets, out)
-
-        threads = threads or default_threads()
-        run_chunks(run, even_bounds(len(color), threads, 1), threads)
+        run_rows(apply_rows, len(color), threads, color, alpha, gains, offsets, out, chunks=1)
         return out
 
     def backward(
@@ -268,14 +263,10 @@ class Exposure:
         by_alpha = self._store.take(f"by alpha {color.dtype}", cover.shape, color.dtype)
         gains, offsets = self.factors(view, color.dtype)
         sums = np.zeros((len(color), 6))
-
-        def run(begin: int, end: int) -> None:
-            backward_rows(
-                begin, end, color, cover, by_out, gains, offsets, by_color, by_alpha, sums
-            )
-
-        threads = threads or default_threads()
-        run_chunks(run, even_bounds(len(color), threads, 1), threads)
+        run_rows(
+            backward_rows, len(color), threads, color, cover, by_out, gains, offsets, by_color,
+            by_alpha, sums, chunks=1,
+        )  # fmt: skip
         self.gradient[:] = sums.sum(axis=0)
         # d/da of exp(a) (color - PIVOT alpha)
         self.gradient[:3] = gains * (self.gradient[:3] - PIVOT * self.gradient[3:])
@@ -305,10 +296,6 @@ class Exposure:
         value = self.values[view].astype(np.float64)
         gains = np.exp(value[:3])
         return gains.astype(dtype), (value[3:] + PIVOT * (1.0 - gains)).astype(dtype)
-
-    def spread(self) -> float:
-        """Return the standard deviation of the trained photos' log gains over all channels."""
-        return float(np.sqrt(np.mean(self.values[self.trained, :3].astype(np.float64) ** 2)))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of the arrays that the next iteration depends on, by name."""

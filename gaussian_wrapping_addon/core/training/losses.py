@@ -10,7 +10,7 @@ import numpy as np
 
 from ..compiled import inline, kernel, part
 from ..image_metrics import compare, has_windows
-from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
+from ..parallel import ArrayStore, default_threads, run_rows
 from ..render.types import ImageGradients, VisibleGradients
 from ..scene.camera import Camera
 from ..stereo.depth_maps import DepthPrior
@@ -173,21 +173,16 @@ def depth_prior_loss(
     mask : (h, w) bool, optional
         False pixels count in no term.
     """
-    threads, store = threads or default_threads(), store or ArrayStore()
+    store = store or ArrayStore()
     depth = np.ascontiguousarray(depth)
     by_depth = store.take("by depth of the prior", depth.shape, depth.dtype)
     flat_mask = kernel_mask(mask)
     pixels = max(1, depth.size if mask is None else int(np.count_nonzero(flat_mask)))
     sums = np.zeros(len(depth))
-    lens, prior_lens = lens_of(camera), lens_of(prior.camera)
-
-    def run(begin: int, end: int) -> None:
-        _prior_rows(
-            begin, end, depth, lens, prior.depth, prior.confidence, prior_lens, flat_mask,
-            weight / pixels, sums, by_depth,
-        )  # fmt: skip
-
-    run_chunks(run, even_bounds(len(depth), threads, 1), threads)
+    run_rows(
+        _prior_rows, len(depth), threads, depth, lens_of(camera), prior.depth, prior.confidence,
+        lens_of(prior.camera), flat_mask, weight / pixels, sums, by_depth, chunks=1,
+    )  # fmt: skip
     return float(sums.sum()), ImageGradients(depth=by_depth)
 
 
@@ -554,16 +549,11 @@ def normals_from_depth(
     valid : (h, w) bool
         The pixel is not on the border and all five pixels of the cross have depth.
     """
-    threads = threads or default_threads()
     depth = np.ascontiguousarray(depth)
     local = np.empty((*depth.shape, 3), depth.dtype)  # camera frame
     valid = np.empty(depth.shape, np.bool_)
-    lens = lens_of(camera)
-
-    def run(begin: int, end: int) -> None:
-        normal_rows(begin, end, depth, lens, max_jump, local, valid)
-
-    run_chunks(run, even_bounds(len(depth), threads, 2), threads)
+    given = (depth, lens_of(camera), max_jump, local, valid)
+    run_rows(normal_rows, len(depth), threads, *given, chunks=2)
     return local @ camera.rotation.astype(local.dtype), valid
 
 
@@ -592,7 +582,7 @@ def normal_losses(
     mask : (h, w) bool, optional
         False pixels count in no term.
     """
-    threads, store = threads or default_threads(), store or ArrayStore()
+    store = store or ArrayStore()
     height, width = depth.shape
     z, cover = np.ascontiguousarray(depth), np.ascontiguousarray(alpha)
     geometric = np.ascontiguousarray(geometric_normal).reshape(height, -1)  # (h, 3 w)
@@ -605,16 +595,11 @@ def normal_losses(
         for name in ("by geometric normal", "by normal")
     )
     by_depth, by_alpha = (store.take(name, z.shape, z.dtype) for name in ("by depth", "by alpha"))
-    lens, rotation = lens_of(camera), np.ascontiguousarray(camera.rotation)
-
-    def run(begin: int, end: int) -> None:
-        agreement_rows(
-            begin, end, z, lens, rotation, flat_mask, geometric, learned, cover, 0.0,
-            lambda_depth_normal / pixels, lambda_normal / pixels, sums,
-            by_depth, by_geometric, by_learned, by_alpha,
-        )  # fmt: skip
-
-    run_chunks(run, even_bounds(height, threads, 1), threads)
+    run_rows(
+        agreement_rows, height, threads, z, lens_of(camera), np.ascontiguousarray(camera.rotation),
+        flat_mask, geometric, learned, cover, 0.0, lambda_depth_normal / pixels,
+        lambda_normal / pixels, sums, by_depth, by_geometric, by_learned, by_alpha, chunks=1,
+    )  # fmt: skip
     depth_normal, oriented, _ = (sums.sum(0) / pixels).tolist()
     value = lambda_depth_normal * depth_normal + lambda_normal * oriented
     return value, ImageGradients(

@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import limits
 from ..compiled import kernel
-from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
+from ..parallel import ArrayStore, run_rows
 from ..render.depth_query import (
     QueryResult,
     QueryView,
@@ -138,11 +138,7 @@ def grey_image(
     """
     grey = (store or ArrayStore()).take(name, photo.shape[:2], np.float32)
     scale = 1.0 / 255.0 if photo.dtype == np.uint8 else 1.0
-
-    def run(begin: int, end: int) -> None:
-        _grey_rows(begin, end, photo, scale, grey)
-
-    run_chunks(run, even_bounds(len(photo), threads, 2), threads)
+    run_rows(_grey_rows, len(photo), threads, photo, scale, grey, chunks=2)
     return grey
 
 
@@ -175,12 +171,8 @@ def choose_pixels(
     jitter = random.random(0 if takes_all else count)
     steepness = (store or ArrayStore()).take("steepness", grey.shape, np.float32)
     sums = np.empty((height, 2))
-    flat_mask = kernel_mask(mask)
-
-    def run(begin: int, end: int) -> None:
-        _steepness_rows(begin, end, grey, depth, flat_mask, steepness, sums)
-
-    run_chunks(run, even_bounds(height, threads, 2), threads)
+    given = (grey, depth, kernel_mask(mask), steepness, sums)
+    run_rows(_steepness_rows, height, threads, *given, chunks=2)
     steep, usable = sums.sum(0).tolist()
     if usable == 0:
         return np.zeros(0, np.int32)
@@ -349,15 +341,15 @@ def multi_view_losses(
 
     ``weight (lambda_photometric mean(w (1 - ncc)) + lambda_geometric mean(w noise))`` with
     ``w = exp(-noise)`` treated as constant (docs/method.md, section 3.4). A pixel is valid where
-    both depths exist, both masks include it and the noise is below one pixel; its patch is kept where
-    the plane is not seen edge-on, all samples are inside both images and masks, neither patch is
-    flat, and ``1 - ncc < 0.9``.
+    both depths exist, both masks include it and the noise is below one pixel; its patch is kept
+    where the plane is not seen edge-on, all samples are inside both images and masks, neither
+    patch is flat, and ``1 - ncc < 0.9``.
 
     ``image`` is rendered with depth, of ``gaussians`` in the scene frame. ``settings.pixels``
     numbers are drawn, none where all pixels are taken. The result does not depend on ``threads``;
     with a ``store``, gradients on images are valid until the next call.
     """
-    threads, store = threads or default_threads(), store or ArrayStore()
+    store = store or ArrayStore()
     options = RenderOptions(sh_degree=0, threads=threads)
     grey = grey_image(shown.photo, "multi-view grey", threads=threads, store=store)
     pixels = choose_pixels(
@@ -422,20 +414,15 @@ class _ViewPair:
         turn = other.rotation @ camera.rotation.T  # (3, 3) other camera from this one
         shift = other.cam_from_world[:, 3] - turn @ camera.cam_from_world[:, 3]
         self.pose = np.concatenate([turn, shift[:, None]], 1)  # (3, 4)
-        self.bounds = even_bounds(len(pixels), threads)
 
     def lift(self, other_mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return positions in the other view (m, 2) float32, and their derivatives by depth."""
         count = len(self.pixels)
         positions, position_slopes = np.empty((count, 2), np.float32), np.empty((count, 2))
-
-        def run(begin: int, end: int) -> None:
-            lift_range(
-                begin, end, self.pixels, self.image.depth, self.camera, self.other, self.pose,
-                self.near_z, other_mask, positions, position_slopes,
-            )  # fmt: skip
-
-        run_chunks(run, self.bounds, self.threads)
+        run_rows(
+            lift_range, count, self.threads, self.pixels, self.image.depth, self.camera, self.other,
+            self.pose, self.near_z, other_mask, positions, position_slopes,
+        )  # fmt: skip
         return positions, position_slopes
 
     def reproject(
@@ -444,15 +431,10 @@ class _ViewPair:
         """Return noise (m,), its derivatives by the other view's depth (m,) and position (m, 2)."""
         count = len(self.pixels)
         noise, by_found, by_positions = np.empty(count), np.empty(count), np.empty((count, 2))
-        width = self.image.depth.shape[1]
-
-        def run(begin: int, end: int) -> None:
-            return_range(
-                begin, end, self.pixels, width, positions, found, self.camera, self.other,
-                self.pose, self.near_z, noise, by_found, by_positions,
-            )  # fmt: skip
-
-        run_chunks(run, self.bounds, self.threads)
+        run_rows(
+            return_range, count, self.threads, self.pixels, self.image.depth.shape[1], positions,
+            found, self.camera, self.other, self.pose, self.near_z, noise, by_found, by_positions,
+        )  # fmt: skip
         return noise, by_found, by_positions
 
     def compare(
@@ -464,16 +446,12 @@ class _ViewPair:
         states, errors = np.empty(count, np.uint8), np.empty(count)
         by_depth, by_normals = np.empty(count), np.empty((count, 3))
         squared, min_spread = settings.correlation == "squared", SAMPLES * settings.min_contrast**2
-
-        def run(begin: int, end: int) -> None:
-            compare_range(
-                begin, end, self.pixels, noise, image.depth, image.geometric_normal, image.alpha,
-                self.rotation, self.camera, self.other, self.pose, self.near_z, *greys, *masks,
-                squared, settings.patch_sizes, settings.max_rise, min_spread, states, errors,
-                by_depth, by_normals,
-            )  # fmt: skip
-
-        run_chunks(run, self.bounds, self.threads)
+        run_rows(
+            compare_range, count, self.threads, self.pixels, noise, image.depth,
+            image.geometric_normal, image.alpha, self.rotation, self.camera, self.other, self.pose,
+            self.near_z, *greys, *masks, squared, settings.patch_sizes, settings.max_rise,
+            min_spread, states, errors, by_depth, by_normals,
+        )  # fmt: skip
         return states, errors, by_depth, by_normals
 
 
