@@ -23,7 +23,6 @@ from ..scene.camera import Camera
 
 # -- Tell a device's failures from others: what another device, or less memory, would not have met
 
-
 _WORDS = ("CUDA error", "CUDA driver", "cuBLAS", "CUBLAS")
 """What torch's messages of a failing driver or library contain, whatever their type."""
 
@@ -41,7 +40,6 @@ def is_device_failure(error: Exception) -> bool:
 
 
 # -- Render a few Gaussians with the CUDA kernels and compare with the definition -----------------
-
 
 TOLERANCE = 1e-3
 """Of images and, relative to their length, of gradients: far above float32 rounding (below 1e-5
@@ -127,7 +125,6 @@ def _scene(dtype: torch.dtype, device: torch.device) -> OrientedGaussians:
 
 
 # -- Whole views on a job's device, or on the processor where that fails. Worker only: loads torch
-
 
 _logger = logging.getLogger(__name__)
 

@@ -15,7 +15,6 @@ from ..render.cuda.compiler import device_count, driver_cuda_version
 
 # -- Choose the device of a job by its setting; say why where it is not the GPU -------------------
 
-
 _logger = logging.getLogger(__name__)
 
 AUTO = "auto"
@@ -156,7 +155,6 @@ def _shortage(index: int, needed_bytes: int) -> str:
 
 
 # -- Facts about the GPUs of this machine, for the doctor. Worker only: loads torch ---------------
-
 
 _GIB = 2**30
 _TEXT_BYTES = 96

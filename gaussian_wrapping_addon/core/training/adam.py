@@ -22,7 +22,6 @@ from ..render.types import ImageGradients, VisibleGradients
 
 # -- Sum gradients of several views or losses -----------------------------------------------------
 
-
 _TENSORS = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 
 
@@ -88,7 +87,6 @@ def _add_rows(
 
 
 # -- Compiled Adam steps, all tensors of a Gaussian at once, with explicit SIMD vectors -----------
-
 
 BETA1, BETA2 = 0.9, 0.999
 EPSILON = 1e-15
@@ -350,7 +348,6 @@ def adam_rows(  # type: ignore[no-untyped-def]
 
 
 # -- Sparse Adam over the Gaussians' tensors, in place: only Gaussians seen by a view are stepped
-
 
 _TABLE_STEPS = 20_000
 """Steps from which both bias corrections are 1 in float32."""

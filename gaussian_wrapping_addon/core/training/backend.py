@@ -24,7 +24,6 @@ from .multi_view import MultiViewOptions
 
 # -- Split large photos into overlapping windows, one of which is trained on per iteration --------
 
-
 OVERLAP_PX = 16
 """Overlap of neighbouring windows: SSIM leaves out five pixels along the border of each."""
 

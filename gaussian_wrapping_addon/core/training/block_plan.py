@@ -46,7 +46,6 @@ from .trainer import DETAIL_PHOTOS, train
 
 # -- How a training is divided into blocks, and the settings of the coarse training before it -----
 
-
 SMALLEST_PX = 32
 """Least long side of the photos of the coarse training: that of the setting."""
 
@@ -264,7 +263,6 @@ class BlockPlan:
 
 # -- What photos show of the coarse Gaussians, and which of them a block needs --------------------
 
-
 LONGEST_PX = 144
 """Long side of the views that are rendered: shares of an image need no detail."""
 
@@ -316,7 +314,6 @@ def chosen_photos(shown: np.ndarray, coverage: float) -> np.ndarray:
 
 
 # -- Write and read a plan of blocks: ``blocks.npz``, and ``blocks.json``, which is written last
-
 
 PLAN_NAME = "blocks.json"
 ARRAYS_NAME = "blocks.npz"
@@ -449,7 +446,6 @@ def _checked(
 
 
 # -- Divide a coarse training into blocks of about the same cost (docs/method.md, section 16) -----
-
 
 _logger = logging.getLogger(__name__)
 

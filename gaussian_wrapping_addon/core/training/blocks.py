@@ -90,7 +90,6 @@ def _decided(plan: BlockPlan, settings: TrainingSettings) -> TrainingSettings:
 
 # -- Join trained blocks along the borders of their cells, and train them together for a while ----
 
-
 _logger = logging.getLogger(__name__)
 
 POLISH_RATE = 0.3

@@ -21,7 +21,6 @@ from .exposure import PhotoAdam, photo_rate
 # that all cameras share, and their common scale, are those of the given poses: they are the frame
 # that users measure in, and no photo tells them.
 
-
 TRAVEL_PX = 4.0
 """Total of a photo's steps over a training at the first rate; the rate falls, and steps waver, so
 that poses a pixel off are reached."""

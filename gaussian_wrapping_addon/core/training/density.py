@@ -46,7 +46,6 @@ def contradicted(
 
 # -- Density control: clone and split Gaussians with high gradients, prune transparent ones -------
 
-
 GRADIENT_THRESHOLD = 2e-4
 """Average loss gradient, in half image units, from which a Gaussian is densified.
 

@@ -104,7 +104,6 @@ def _bytes(held: tuple[Tensor, Tensor | None]) -> int:
 # on the host's memory as well, with kernels that are emulated there, which is how it is tested
 # without a GPU.
 
-
 PHOTO_SHARE = 0.2
 """Share of the free device memory in which photos are kept."""
 
@@ -349,7 +348,6 @@ class DeviceBackend(Backend):
 
 
 # -- The backend of a chosen device ---------------------------------------------------------------
-
 
 _logger = logging.getLogger(__name__)
 

@@ -39,7 +39,6 @@ from .multi_view_kernels import KEPT, SAMPLES
 #
 # Values and their gradients stay on the device; nothing is read back.
 
-
 _CAMERA_VALUES = 22
 
 

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 # -- Rendering speed of this machine, relative to the reference machine of the estimate -----------
 
-
 _logger = logging.getLogger(__name__)
 
 GAUSSIANS = 4000
@@ -187,7 +186,6 @@ def _scene(count: int, side_px: int) -> tuple[RawArrays, Camera]:
 # with much background take longest per pixel. The reported range covers all of them. On a machine
 # with 14 waiting processes (3 trainings of 200 to 300 iterations, speed from its fastest pass)
 # the estimate was between 0.45 and 0.69 times the measured time, one of them above the range.
-
 
 ITERATION_S = 2.06e-3
 """Per iteration, whatever its size."""
@@ -514,7 +512,6 @@ def check_resources(expected: Estimate, machine: Machine) -> list[ReportWarning]
 
 
 # -- Estimate the cost of a training in blocks: coarse training, one block, joining ---------------
-
 
 PHOTOS_OVERLAP = 1.6
 """A block takes about so many times its share of the photos: those of its margin, and those that

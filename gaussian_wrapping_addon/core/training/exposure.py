@@ -17,7 +17,6 @@ from ..parallel import ArrayStore, run_rows
 # A step moves the values of one photo only, so that each photo has its own moments and count of
 # steps, and the rate follows from how many turns a photo has.
 
-
 BETAS = (0.9, 0.99)
 """Decay rates of the moments. A photo has only some dozens of steps in a short run, and its
 gradient, a mean over all its pixels, has little noise: a shorter memory than 0.999 works better."""
@@ -156,7 +155,6 @@ def backward_rows(
 # The Gaussians have the mean exposure of the training photos: the means over these of all log
 # gains and of all offsets (at middle grey) are held at 0; otherwise colours and exposures could
 # drift against each other.
-
 
 SRGB_PEDESTAL = 0.055
 """Offset of the sRGB curve: display values plus this are a power of the light."""

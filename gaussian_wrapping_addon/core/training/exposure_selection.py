@@ -27,7 +27,6 @@ from .model_selection import Decision, ModelSelection, decide, select_multi_view
 # together. So the points are split spatially, gains are solved for each part alone, and the
 # consensus of the parts decides.
 
-
 NEEDED_SPREAD = 0.025
 """Robust spread of the log gains above which exposures are modelled. At middle grey such photos
 differ by 1.2 % of white, an error that alone limits the PSNR to 38 dB. Among the scenes it was

@@ -17,7 +17,6 @@ from ..stereo.depth_maps import DepthPrior
 
 # -- Opacity prior: what photos leave open is opaque ----------------------------------------------
 
-
 FAINT, SURE = 0.2, 0.5
 """Opacity up to which a Gaussian is left to the photos, and from which the prior counts fully."""
 
@@ -100,7 +99,6 @@ def add_footprint_regulariser(
 
 
 # -- Loss on rendered depths that leave those that stereo confirmed (docs/method.md, section 3.6)
-
 
 TOLERANCE_SHARE = 0.01
 """Relative difference in depth up to which the loss is quadratic; beyond, it is linear."""
@@ -192,7 +190,6 @@ def lens_of(camera: Camera) -> np.ndarray:
 
 
 # -- Compiled normal losses: normals of a depth map and their agreement with blended normals ------
-
 
 MIN_NORMAL_SQ = 1e-30
 """Cross products whose squared length (scene units^4) is below this give no normal."""

@@ -23,7 +23,6 @@ from .camera_poses import LEAST_VIEWS, CameraPoses
 # of the model is enabled by evidence from the photos, records that evidence, and can be
 # overridden by a setting.
 
-
 ON, OFF = "on", "off"
 
 
@@ -173,7 +172,6 @@ def select_multi_view(neighbours: Sequence[np.ndarray], setting: str = "auto") -
 
 
 # -- Whether camera poses are refined (docs/method.md, section 1.8) -------------------------------
-
 
 LEAST_SHIFT_PX = 0.25
 """Median shift from which given poses count as inexact. Noise alone moves exact ones by 0.12."""

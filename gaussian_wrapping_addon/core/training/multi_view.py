@@ -31,7 +31,6 @@ from .multi_view_kernels import BROKEN, KEPT, SAMPLES, compare_range, lift_range
 
 # -- Select neighbouring cameras for the multi-view terms (docs/method.md, section 3.4) -----------
 
-
 _MOST_POINTS = 2000
 """Most points for estimating the overlap of two images, subsampled from those given."""
 _FEW_POINTS = 10
@@ -120,7 +119,6 @@ def _seen_points(cameras: Sequence[Camera], points: np.ndarray | None) -> np.nda
 
 
 # -- Sample the pixels for the multi-view terms: stratified, with more of them on texture ---------
-
 
 BORDER_PX = 2
 """Pixels closer to the border than this have patches that leave the image."""
@@ -256,7 +254,6 @@ def _pick(
 # view. *Geometric*: the depth of the other view there, reprojected, should meet the pixel again.
 # *Photometric*: the plane through the point should show the same patch in both photos. The other
 # view is not rendered: its depth is solved at the projected positions only.
-
 
 _GEOMETRY_COLUMNS = 13
 """Columns of the screen parameters that a depth depends on."""

@@ -30,7 +30,6 @@ from .wrapping import orient
 
 # -- Similarity transforms of Gaussians: means, shapes, orientations and harmonics ----------------
 
-
 _DIRECTIONS = 64
 """Directions for the fit of rotated harmonics; 16 would do, more are better conditioned."""
 
@@ -125,7 +124,6 @@ def with_degree(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:
 
 
 # -- Initialise a training from an existing splat: transform, cap, check against photos, orient
-
 
 ITERATIONS_SHARE = 0.3
 """Share of the preset's iterations: positions and colours exist, shapes and orientations do not."""

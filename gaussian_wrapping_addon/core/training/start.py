@@ -80,7 +80,6 @@ class Handover:
 # Sky and the far distance have no parallax. Without Gaussians there, training explains them by
 # fog before the things. See docs/method.md, section 11.9.
 
-
 REACH_FACTOR = 4.0
 """Radius of the shell over the distance of the farthest points but one in a hundred."""
 
@@ -163,7 +162,6 @@ def onto_sphere(center: np.ndarray, rays: np.ndarray, radius: float) -> np.ndarr
 
 
 # -- Initial Gaussians on the surfaces that stereo finds (docs/method.md, section 11) -------------
-
 
 _logger = logging.getLogger(__name__)
 

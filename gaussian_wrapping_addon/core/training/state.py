@@ -34,7 +34,6 @@ from .model_selection import ModelSelection
 
 # -- Cancellation inside the loops of a training that render many views per iteration -------------
 
-
 Item = TypeVar("Item")
 
 
@@ -85,7 +84,6 @@ class CancellablePhotos:
 
 
 # -- Training state: everything that the next iteration depends on --------------------------------
-
 
 _MOMENTS = ("first", "second")
 _STATISTICS = ("gradient", "gradient_abs", "views")
@@ -266,7 +264,6 @@ def _require(like: np.ndarray, array: np.ndarray, count: int) -> np.ndarray:
 
 
 # -- Training checkpoints: arrays in an npz; the rest, and its hash, in a JSON file written last
-
 
 _logger = logging.getLogger(__name__)
 

@@ -65,7 +65,6 @@ from .state import (
 # comes after the training, which needs the black: only before black must a surface become opaque
 # to look right. See docs/method.md, section 11.11.
 
-
 _logger = logging.getLogger(__name__)
 
 DIRECTIONS = 2000
@@ -227,7 +226,6 @@ def _note(state: TrainingState, device: str, error: Exception, onward: str) -> N
 
 
 # -- Training loop: from photos and cameras to oriented Gaussians, resumable at any iteration -----
-
 
 SNAPSHOT_EVERY = 100
 """Iterations between checks that all values are finite; each one takes a snapshot."""

@@ -22,7 +22,6 @@ from .losses import normals_from_depth
 
 # -- Orientation without training: the shortest axis, with its sign by a vote of the cameras ------
 
-
 FIRST_SIGN = TrainingSettings.first_sign
 """Magnitude of the sign parameter after the vote of views of a splat."""
 
@@ -63,7 +62,6 @@ def orient(
 
 
 # -- Wrapping: initial orientations, and clones of opposite orientation where normals disagree ----
-
 
 SHIFT = 0.1
 """Original and clone are each moved by this many standard deviations along the normal."""
