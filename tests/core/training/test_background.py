@@ -90,7 +90,7 @@ def test_points_inside_of_masks() -> None:
         ]
     )
     assert inside_masks(points, cameras, masks).tolist() == [True, False, False, False]
-    open_masks = [None, None, masks[2]]
+    open_masks = [None, masks[1], None]
     assert inside_masks(points, cameras, open_masks).tolist() == [True, True, False, False]
     assert inside_masks(np.zeros((0, 3)), cameras, masks).shape == (0,)
     assert not inside_masks(points, [], []).any()
