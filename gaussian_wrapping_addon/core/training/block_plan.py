@@ -467,12 +467,11 @@ photos. Others stand still: as the block's photos hardly show them, it would onl
 
 def plan_blocks(
     coarse: CoarseTraining, scene: Scene, photos: PhotoSource, settings: TrainingSettings,
-    progress: Progress, *, renderer: Renderer | None = None, threads: int = 0,
+    progress: Progress, *, threads: int = 0,
 ) -> BlockPlan:  # fmt: skip
     """Divide a training into ``settings.blocks`` blocks. The plan depends on the inputs alone.
 
-    The scene has the poses of the coarse training, the photos the size that blocks train at. A
-    renderer given overwrites its last view.
+    The scene has the poses of the coarse training, the photos the size that blocks train at.
 
     Raises
     ------
@@ -487,7 +486,7 @@ def plan_blocks(
     means = gaussians.means.double().numpy()
     if count > min(len(views), len(means)):
         raise _too_many(count, f"{len(views)} photos, {len(means)} Gaussians")
-    seen = Visibility(gaussians, photos, views, renderer or ViewRenderer(), threads)
+    seen = Visibility(gaussians, photos, views, ViewRenderer(), threads)
     total, near = np.zeros(len(means)), np.zeros(len(means))
     shown = seen.weights(progress.span(0.0, 0.2), "what photos show")
     for view, weights in zip(views, shown, strict=True):

@@ -111,8 +111,8 @@ def joint_training(
     ----------
     parts : iterable of OrientedGaussians
         Results of :func:`block_training`, in the order of the blocks; one at a time is held.
-    photos, settings, renderer
-        As for :func:`~.block_plan.plan_blocks`.
+    photos, settings
+        As for :func:`~.block_plan.plan_blocks`; the renderer overwrites its last view.
 
     Raises
     ------

@@ -25,6 +25,7 @@ from ..render.types import Renderer, RenderOptions
 from ..render.view_renderer import ViewRenderer
 from ..scene.scene import PhotoSource, evenly_spaced
 from ..settings import TrainingSettings
+from .exposure import corrected_for_measuring
 from .state import HeldOutMetrics
 
 _logger = logging.getLogger(__name__)
@@ -46,9 +47,6 @@ GAP_PX = 4
 
 TOO_SMALL = "The photos are too small for LPIPS."
 
-Correction = Callable[[np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
-"""Maps a (h, w, 3) render to the exposure of a (h, w, 3) uint8 photo, within a mask."""
-
 
 def divisor_for(photos: PhotoSource, index: int, longest_px: int) -> int:
     """Return the smallest divisor that brings a photo's long side to at most ``longest_px``."""
@@ -59,8 +57,7 @@ def divisor_for(photos: PhotoSource, index: int, longest_px: int) -> int:
 
 def measure_held_out(
     gaussians: OrientedGaussians, photos: PhotoSource, held_out: Sequence[int], *, threads: int,
-    renderer: Renderer | None = None, exposure_correction: Correction | None = None,
-    check: Callable[[], None] | None = None,
+    renderer: Renderer | None = None, exposed: bool = False,
 ) -> float:  # fmt: skip
     """Return the mean PSNR of a few held-out photos at a small size, dB.
 
@@ -73,35 +70,32 @@ def measure_held_out(
         Held-out views; :data:`MEASURED_VIEWS` of them, evenly spread, are measured.
     renderer : Renderer, optional
         Renderer to reuse; not one whose last view still awaits its backward pass.
-    exposure_correction : callable, optional
-        Applied to each render before it is measured (:func:`~.exposure.corrected_for_measuring`).
-    check : callable, optional
-        Called before each view; an exception ends the measurement.
+    exposed : bool
+        Whether exposures are modelled: renders are brought to those of the photos before they are
+        measured (:func:`~.exposure.corrected_for_measuring`).
     """
     renderer = renderer or ViewRenderer()
     raw = RawArrays.from_gaussians(gaussians)
     figures = []
     for view in evenly_spaced(held_out, MEASURED_VIEWS):
-        if check is not None:
-            check()
         divisor = divisor_for(photos, view, MEASURED_PX)
         mask = photos.mask(view, divisor)
         if mask is not None and not mask.any():
             continue
-        image = _rendered(renderer, raw, photos, view, divisor, threads, exposure_correction)
+        image = _rendered(renderer, raw, photos, view, divisor, threads, exposed)
         figures.append(min(psnr(image, photos.photo(view, divisor), mask), BEST_PSNR))
     return float(np.mean(figures)) if figures else float("nan")
 
 
 def _rendered(
     renderer: Renderer, raw: RawArrays, photos: PhotoSource, view: int, divisor: int, threads: int,
-    correction: Correction | None,
+    exposed: bool,
 ) -> np.ndarray:  # fmt: skip
     options = RenderOptions(depth=False, threads=threads)
     image = renderer.render(raw, photos.camera(view, divisor), options).color
-    if correction is None:
+    if not exposed:
         return image
-    return correction(image, photos.photo(view, divisor), photos.mask(view, divisor))
+    return corrected_for_measuring(image, photos.photo(view, divisor), photos.mask(view, divisor))
 
 
 class LiveView:
@@ -138,7 +132,7 @@ class LiveView:
 
     def update(
         self, gaussians: OrientedGaussians, iteration: int,
-        exposure_correction: Correction | None = None, *, force: bool = False,
+        exposed: bool = False, *, force: bool = False,
     ) -> dict[str, float] | None:  # fmt: skip
         """Write the preview and measure the held-out photos, if due or ``force`` is set.
 
@@ -153,20 +147,20 @@ class LiveView:
         figures = {}
         quality = measure_held_out(
             gaussians, self._photos, self._held_out, threads=self._threads, renderer=self.renderer,
-            exposure_correction=exposure_correction,
+            exposed=exposed,
         )  # fmt: skip
         if np.isfinite(quality):
             figures = {"held_out_psnr": quality, "held_out_iteration": float(iteration)}
-        self._write(gaussians, exposure_correction)
+        self._write(gaussians, exposed)
         # Taken after the work, so that slow updates do not run back to back.
         self._updated_s = self._clock()
         return figures
 
-    def _write(self, gaussians: OrientedGaussians, correction: Correction | None) -> None:
+    def _write(self, gaussians: OrientedGaussians, exposed: bool) -> None:
         divisor = divisor_for(self._photos, self._shown_view, (PREVIEW_PX - GAP_PX) // 2)
         raw = RawArrays.from_gaussians(gaussians)
         image = _rendered(
-            self.renderer, raw, self._photos, self._shown_view, divisor, self._threads, correction
+            self.renderer, raw, self._photos, self._shown_view, divisor, self._threads, exposed
         )
         picture = side_by_side(self._photos.photo(self._shown_view, divisor), image)
         try:
@@ -205,13 +199,12 @@ def png(picture: np.ndarray) -> bytes:
 
 def held_out_metrics(
     gaussians: OrientedGaussians, photos: PhotoSource, names: Mapping[int, str], progress: Progress,
-    *, threads: int, renderer: Renderer | None = None,
-    exposure_correction: Correction | None = None,
+    *, threads: int, renderer: Renderer | None = None, exposed: bool = False,
 ) -> tuple[list[HeldOutMetrics], str]:  # fmt: skip
     """Return the metrics of held-out photos, given by view and name, and why they have no LPIPS.
 
-    Where exposures are modelled, ``exposure_correction`` fits that of each half of a photo on the
-    other half, as it was never trained.
+    Where exposures are modelled (``exposed``), that of each half of a photo is fitted on the other
+    half, as it was never trained.
     """
     figures = []
     lpips, reason = lpips_if_ready() if names else (None, "")
@@ -221,7 +214,7 @@ def held_out_metrics(
         mask = photos.mask(view, 1)
         if mask is not None and not mask.any():
             continue
-        image = _rendered(renderer, raw, photos, view, 1, threads, exposure_correction)
+        image = _rendered(renderer, raw, photos, view, 1, threads, exposed)
         scores = score_images(image, photos.photo(view, 1), mask, lpips=lpips, threads=threads)
         figures.append(HeldOutMetrics(name, scores.psnr, scores.ssim, scores.lpips))
     if not figures or any(figure.lpips is not None for figure in figures):
