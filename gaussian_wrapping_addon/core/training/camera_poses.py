@@ -178,13 +178,7 @@ def _without_common_motion(given: np.ndarray, refined: np.ndarray) -> np.ndarray
 
 
 class PosedPhotos:
-    """Photo source whose cameras follow the poses of a training.
-
-    Parameters
-    ----------
-    photos : PhotoSource
-        With the given cameras.
-    """
+    """Photo source whose cameras follow the poses of a training instead of those given."""
 
     def __init__(self, photos: PhotoSource) -> None:
         self._photos = photos
@@ -192,16 +186,13 @@ class PosedPhotos:
         """Poses to follow; ``None``: those given."""
 
     def camera(self, index: int, divisor: int = 1) -> Camera:
-        """Return the camera at a pyramid level."""
         camera = self._photos.camera(index, divisor)
         return camera if self.poses is None else self.poses.camera(index, camera)
 
     def photo(self, index: int, divisor: int = 1) -> np.ndarray:
-        """Return (h, w, 3) uint8."""
         return self._photos.photo(index, divisor)
 
     def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
-        """Return (h, w) bool or ``None``."""
         return self._photos.mask(index, divisor)
 
 

@@ -67,8 +67,7 @@ def device_color_loss(
         lambda_dssim = 0.0
     tiles_x, tiles_y = (-(-side // limits.TILE_PX) for side in (width, height))
     tiles = tiles_x * tiles_y
-    masked = mask if mask is not None else image.new_empty(0, dtype=torch.bool)
-    size = (masked, int(mask is not None), width, height, tiles_x)
+    size = (*_masked(mask, image), width, height, tiles_x)
     similar = lambda_dssim > 0.0
     maps = image.new_empty((3, 3, height, width) if similar else (0,))
     ssim: Tensor | float = 1.0
@@ -104,7 +103,7 @@ def device_normal_losses(
     spread, sums = depth.new_empty((4, height, width)), depth.new_empty((blocks, 3))
     kernels.launch_each(
         "agree_normals", count, width, height, depth, alpha, geometric_normal, normal,
-        mask if mask is not None else depth.new_empty(0, dtype=torch.bool), int(mask is not None),
+        *_masked(mask, depth),
         _packed(packed), lambda_depth_normal / max(1, pixels), lambda_normal / max(1, pixels),
         by_geometric, by_learned, by_alpha, spread, sums,
     )  # fmt: skip
@@ -136,11 +135,16 @@ def device_prior_loss(
     kernels.launch_each(
         "prior_depths", height * width, width, depth, confirmed, confidence,
         int(confirmed.shape[1]), int(confirmed.shape[0]),
-        mask if mask is not None else depth.new_empty(0, dtype=torch.bool), int(mask is not None),
+        *_masked(mask, depth),
         _packed(np.concatenate([lens_of(camera), lens_of(prior_camera)])), weight / max(1, pixels),
         by_depth, sums,
     )  # fmt: skip
     return sums.sum(), ImageGradients(depth=by_depth)
+
+
+def _masked(mask: Tensor | None, like: Tensor) -> tuple[Tensor, int]:
+    """Return a mask as kernels take it, and whether there is one."""
+    return (like.new_empty(0, dtype=torch.bool), 0) if mask is None else (mask, 1)
 
 
 def _packed(values: np.ndarray) -> CameraValues:

@@ -135,20 +135,16 @@ def gpu_speed(index: int) -> float:
 
 def speeds(threads: int, device: str) -> tuple[float, float]:
     """Return the speeds of the processor and of the GPU that a training runs on (0: of none)."""
-    if device != "cpu":
-        return THREAD_SPEED * threads, _gpu_speed_or_reference(device)
-    return (machine_speed(threads) if renderer_is_compiled() else 1.0), 0.0
-
-
-def _gpu_speed_or_reference(device: str) -> float:
-    """Return a GPU's speed; 1 where it fails, which the training will meet as well, and tell."""
+    if device == "cpu":
+        return (machine_speed(threads) if renderer_is_compiled() else 1.0), 0.0
     try:
-        return gpu_speed(int(device.partition(":")[2] or 0))
+        on_gpu = gpu_speed(int(device.partition(":")[2] or 0))
     except (WrapError, RuntimeError) as error:
         if not is_device_failure(error):
             raise
         _logger.warning("%s could not be timed: %s", device, error)
-        return 1.0
+        on_gpu = 1.0  # the training will meet the failure as well, and tell
+    return THREAD_SPEED * threads, on_gpu
 
 
 def _scene(count: int, side_px: int) -> tuple[RawArrays, Camera]:

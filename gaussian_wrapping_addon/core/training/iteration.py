@@ -131,12 +131,8 @@ class Stepper:
         if other is not None:
             seen = backend.merged(seen, other, len(adam))
         if gathers:
-            part = (
-                sample.camera.width
-                * sample.camera.height
-                / (sample.whole.width * sample.whole.height)
-            )
-            whole = sample.whole
+            whole, shown = sample.whole, sample.camera
+            part = shown.width * shown.height / (whole.width * whole.height)
             backend.add_statistics(state.statistics, image, whole.width, whole.height, part)
         rates = schedule.rates(iteration, state.rate_factor)
         if not oriented:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -98,7 +97,7 @@ def rotate_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
     degree = math.isqrt(sh.shape[1]) - 1
     if torch.equal(rotation, torch.eye(3, dtype=rotation.dtype)):
         return sh
-    before = _directions()  # (m, 3)
+    before = torch.from_numpy(fibonacci_directions(_DIRECTIONS))  # (m, 3) unit vectors
     after = before @ rotation.double().T
     basis, turned = harmonics_basis(before, degree), harmonics_basis(after, degree)  # (m, k)
     out = sh.double().clone()
@@ -107,12 +106,6 @@ def rotate_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
         matrix = torch.linalg.lstsq(turned[:, band], basis[:, band]).solution  # (2l+1, 2l+1)
         out[:, band] = torch.einsum("ij,njc->nic", matrix, sh[:, band].double())
     return out.to(sh.dtype)
-
-
-@functools.cache
-def _directions() -> Tensor:
-    """Return (m, 3) evenly spread unit vectors: a spherical Fibonacci lattice."""
-    return torch.from_numpy(fibonacci_directions(_DIRECTIONS))
 
 
 def with_degree(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:

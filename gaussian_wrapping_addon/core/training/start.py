@@ -110,8 +110,11 @@ def far_shell(
     radius = max(LEAST_REACH, REACH_FACTOR * reach)
     directions, colors, angles = [], [], []
     for depth_map in depth_maps:
-        row, column, color = _open_cells(depth_map, points)
-        camera = depth_map.camera
+        camera, unexplained = depth_map.camera, open_cells(depth_map)
+        _, row, column = cells_of(points, depth_map)
+        unexplained[row, column] = False
+        row, column = np.nonzero(unexplained)
+        color = by_cell(depth_map.color.astype(np.float64))[row, column]
         at = (np.stack([column, row], 1) + 0.5) * CELL_PX  # (m, 2) pixels
         rays = camera.rays_at(at) @ camera.rotation
         directions.append(onto_sphere(camera.center, rays, radius))
@@ -140,17 +143,6 @@ def _shell(direction: np.ndarray, color: np.ndarray, step: float, radius: float)
         radius * direction, -direction, np.clip(color + 0.5, 0, 255).astype(np.uint8),
         np.full(count, radius * step), np.zeros(count, np.float32),
     )  # fmt: skip
-
-
-def _open_cells(
-    depth_map: DepthMap, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows, columns and mean colours (m, 3) of the cells that nothing explains."""
-    found = open_cells(depth_map)
-    _, row, column = cells_of(points, depth_map)
-    found[row, column] = False
-    row, column = np.nonzero(found)
-    return row, column, by_cell(depth_map.color.astype(np.float64))[row, column]
 
 
 def onto_sphere(center: np.ndarray, rays: np.ndarray, radius: float) -> np.ndarray:

@@ -69,16 +69,13 @@ class CancellablePhotos:
         self._photos, self._progress = photos, progress
 
     def camera(self, index: int, divisor: int = 1) -> Camera:
-        """Return the camera at a pyramid level."""
         return self._photos.camera(index, divisor)
 
     def photo(self, index: int, divisor: int = 1) -> np.ndarray:
-        """Return (h, w, 3) uint8, or raise :class:`~.errors.Cancelled`."""
         self._progress.check()
         return self._photos.photo(index, divisor)
 
     def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
-        """Return (h, w) bool or ``None``, or raise :class:`~.errors.Cancelled`."""
         self._progress.check()
         return self._photos.mask(index, divisor)
 

@@ -149,8 +149,8 @@ def test_cancelling_is_noticed_before_the_next_view_is_rendered() -> None:
             return photos.photo(index, divisor)
 
     progress = Progress(is_cancelled=lambda: len(rendered) >= 2)
+    watched = CancellablePhotos(Watched(), progress)
     with pytest.raises(Cancelled):
-        held_out = CancellablePhotos(Watched(), progress)
-        measure_held_out(sphere_gaussians(20), held_out, [0, 1, 2, 3], threads=1)
+        measure_held_out(sphere_gaussians(20), watched, [0, 1, 2, 3], threads=1)
     assert rendered == [0, 1]
     assert list(cancellable([1, 2], Progress())) == [1, 2]
