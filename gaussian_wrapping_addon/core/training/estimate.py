@@ -283,7 +283,6 @@ class SceneFacts:
 class Machine:
     """Machine properties for the estimate; 0 bytes if unknown."""
 
-    threads: int
     speed: float = 1.0
     """Relative to the reference machine (:func:`~.estimate.machine_speed`)."""
     memory_bytes: int = 0
@@ -337,7 +336,7 @@ def scene_facts(scene: Scene) -> SceneFacts:
     )
 
 
-def this_machine(folder: Path, threads: int, speed: float = 1.0, gpu_speed: float = 0.0) -> Machine:
+def this_machine(folder: Path, speed: float = 1.0, gpu_speed: float = 0.0) -> Machine:
     """Return the resources free now; disk space is that of ``folder``, which need not exist yet."""
     existing = folder
     while not existing.exists() and existing != existing.parent:
@@ -346,7 +345,7 @@ def this_machine(folder: Path, threads: int, speed: float = 1.0, gpu_speed: floa
         free_bytes = shutil.disk_usage(existing).free
     except OSError:
         free_bytes = 0
-    return Machine(threads, speed, available_memory_bytes(), free_bytes, gpu_speed)
+    return Machine(speed, available_memory_bytes(), free_bytes, gpu_speed)
 
 
 def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float) -> np.ndarray:

@@ -374,7 +374,7 @@ def mesh_in_stage(
     )
     for line in expected.lines():
         _logger.info("region %s, estimated %s", region.name, line)
-    memory_bytes = free_bytes(stage_folder, field.threads)
+    memory_bytes = free_bytes(stage_folder)
     tiled = meshing.tiles != "off" and (
         meshing.tiles != "auto" or bool(expected.tiles_for(memory_bytes))
     )
@@ -461,7 +461,7 @@ def mesh_by_pivots_in_stage(
     expected = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
     for line in expected.lines():
         _logger.info("region %s, estimated %s", region.name, line)
-    memory_bytes = free_bytes(stage_folder, threads)
+    memory_bytes = free_bytes(stage_folder)
     expected.refuse(memory_bytes)
     mesh = mesh_by_pivots(
         vacancy, arrays, vacancy.cameras, region, meshing, progress, seed=seed,
@@ -520,11 +520,11 @@ def estimate_region_mesh(
     )
 
 
-def free_bytes(folder: Path, threads: int) -> int:
+def free_bytes(folder: Path) -> int:
     """Return how much memory a mesh may use on this machine; 0 if unknown."""
     from ...training.estimate import MEMORY_SHARE_LEFT, this_machine
 
-    return int(MEMORY_SHARE_LEFT * this_machine(folder, threads).memory_bytes)
+    return int(MEMORY_SHARE_LEFT * this_machine(folder).memory_bytes)
 
 
 def remove_tiles(stage_folder: Path) -> None:
