@@ -452,7 +452,6 @@ def mesh_by_pivots_in_stage(
     progress: Progress,
     *,
     seed: int,
-    threads: int,
     depth_samples: DepthSamples | None,
 ) -> tuple[SurfaceMesh, dict[str, Any]]:
     """Estimate the mesh of a region by pivots, then make it; see :func:`mesh_in_stage`."""
@@ -681,8 +680,7 @@ def run_mesh(
             alone = meshing.pivot_samples == "none"
             mesh, expected = mesh_by_pivots_in_stage(
                 stage_folder, vacancy, inputs.arrays, region, meshing, progress.span(0.15, 0.9),
-                seed=job.settings.seed, threads=inputs.field.threads,
-                depth_samples=None if alone else sampled(),
+                seed=job.settings.seed, depth_samples=None if alone else sampled(),
             )  # fmt: skip
             _note(mesh, warnings)
         else:
