@@ -217,7 +217,7 @@ class Iteration:
         if not self.depth:
             return ImageGradients(color=by_color)
         normals = (image.depth, image.geometric_normal, image.normal, image.alpha)
-        _, gradients, _ = normal_losses(*normals, self.camera, threads=threads, store=store)
+        _, gradients = normal_losses(*normals, self.camera, threads=threads, store=store)
         return dataclasses.replace(gradients, color=by_color)
 
     def run(self) -> None:

@@ -98,6 +98,18 @@ def run_chunks(function: Callable[[int, int], object], bounds: np.ndarray, threa
         raise min(failures, key=lambda failed: failed[0])[1]
 
 
+def run_rows(
+    function: Callable[..., object], count: int, threads: int, *given: object, chunks: int = 4
+) -> None:
+    """Call ``function(begin, end, *given)`` for even runs of ``count`` rows; 0 threads: all.
+
+    ``chunks`` are the runs for each thread.
+    """
+    threads = threads or default_threads()
+    bounds = even_bounds(count, threads, chunks)
+    run_chunks(lambda begin, end: function(begin, end, *given), bounds, threads)
+
+
 # -- Memory for large arrays, aligned so that the system can use huge pages -----------------------
 
 

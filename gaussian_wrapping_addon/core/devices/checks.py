@@ -23,7 +23,6 @@ from ..scene.camera import Camera
 
 # -- Tell a device's failures from others: what another device, or less memory, would not have met
 
-
 _WORDS = ("CUDA error", "CUDA driver", "cuBLAS", "CUBLAS")
 """What torch's messages of a failing driver or library contain, whatever their type."""
 
@@ -41,7 +40,6 @@ def is_device_failure(error: Exception) -> bool:
 
 
 # -- Render a few Gaussians with the CUDA kernels and compare with the definition -----------------
-
 
 TOLERANCE = 1e-3
 """Of images and, relative to their length, of gradients: far above float32 rounding (below 1e-5
@@ -67,14 +65,7 @@ def failure_on(device_index: int) -> str:
 
 
 def check_kernels(kernels: Kernels, device: torch.device) -> str:
-    """Compare images and gradients of a small scene; return what differs, ``""`` if nothing.
-
-    Parameters
-    ----------
-    kernels : Kernels
-    device : torch.device
-        Where their tensors are.
-    """
+    """Compare images and gradients of a small scene; return what differs, ``""`` if nothing."""
     camera = _camera()
     definition = _scene(torch.float64, torch.device("cpu"))
     expected = render_reference(definition, camera, _OPTIONS)
@@ -135,26 +126,17 @@ def _scene(dtype: torch.dtype, device: torch.device) -> OrientedGaussians:
 
 # -- Whole views on a job's device, or on the processor where that fails. Worker only: loads torch
 
-
 _logger = logging.getLogger(__name__)
 
 Made = TypeVar("Made")
 
 
 def with_renderer(device: str, what: str, work: Callable[[Renderer], Made]) -> Made:
-    """Return what work makes of the renderer of a device.
+    """Return what work makes of the renderer of a device, ``"cpu"`` or ``"cuda:N"``.
 
-    Where the GPU fails, the log says why, and the work is done again from its beginning with the
-    renderer of the processor.
-
-    Parameters
-    ----------
-    device : str
-        ``"cpu"`` or ``"cuda:N"``.
-    what : str
-        What is rendered, for the log; a plural that begins a sentence.
-    work : callable
-        Keeps nothing of a call that has failed.
+    Where the GPU fails, the log says why (``what`` is rendered, a plural that begins a sentence),
+    and the work is done again from its beginning with the renderer of the processor; it must keep
+    nothing of a call that has failed.
     """
     if device == CPU:
         return work(ViewRenderer())

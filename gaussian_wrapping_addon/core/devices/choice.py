@@ -15,7 +15,6 @@ from ..render.cuda.compiler import device_count, driver_cuda_version
 
 # -- Choose the device of a job by its setting; say why where it is not the GPU -------------------
 
-
 _logger = logging.getLogger(__name__)
 
 AUTO = "auto"
@@ -49,15 +48,9 @@ def choose_device(setting: str, needed_bytes: int = 0) -> DeviceChoice:
     """Return the device that a setting stands for on this machine. Worker only: loads torch.
 
     A GPU is taken where torch is built for CUDA, the driver responds, NVRTC is found, a small
-    rendering on it is right, and ``needed_bytes`` are free. All but the free memory is looked at
-    once per process.
-
-    Parameters
-    ----------
-    setting : str
-        ``"auto"``, ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
-    needed_bytes : int
-        Memory of the GPU that the work takes in addition to what is in use.
+    rendering on it is right, and ``needed_bytes``, in addition to what is in use, are free. All but
+    the free memory is looked at once per process. Settings are ``"auto"``, ``"cpu"``, ``"cuda"``,
+    ``"cuda:N"``.
 
     Raises
     ------
@@ -85,16 +78,7 @@ def choose_device(setting: str, needed_bytes: int = 0) -> DeviceChoice:
 def stage_device(chosen: DeviceChoice, setting: str, needed_bytes: int, what: str) -> DeviceChoice:
     """Return the job's device, or the processor where a stage does not fit into its GPU.
 
-    Parameters
-    ----------
-    chosen : DeviceChoice
-        The job's.
-    setting : str
-        That it was chosen by.
-    needed_bytes : int
-        As for :func:`choose_device`.
-    what : str
-        What runs there, for the log.
+    ``chosen`` is the job's, by ``setting``; ``what`` is what runs there, for the log.
 
     Raises
     ------
@@ -171,7 +155,6 @@ def _shortage(index: int, needed_bytes: int) -> str:
 
 
 # -- Facts about the GPUs of this machine, for the doctor. Worker only: loads torch ---------------
-
 
 _GIB = 2**30
 _TEXT_BYTES = 96

@@ -17,43 +17,24 @@ from numba.extending import intrinsic
 
 from ..compiled import kernel, part
 from ..gaussians.model import OrientedGaussians
-from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
+from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks, run_rows
 from ..render.types import ImageGradients, VisibleGradients
 
 # -- Sum gradients of several views or losses -----------------------------------------------------
-
 
 _TENSORS = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 
 
 def merge_gradients(
-    first: VisibleGradients,
-    second: VisibleGradients,
-    count: int,
-    *,
-    threads: int = 0,
+    first: VisibleGradients, second: VisibleGradients, count: int, *, threads: int = 0,
     store: ArrayStore | None = None,
-) -> VisibleGradients:
-    """Return the sum of two gradients, Gaussian by Gaussian.
+) -> VisibleGradients:  # fmt: skip
+    """Return the sum of two gradients, one row for each Gaussian in either, with increasing ids.
 
-    Parameters
-    ----------
-    first, second : VisibleGradients
-        For the same Gaussians, each with increasing ids. Neither is changed.
-    count : int
-        Number of Gaussians that ids point into.
-    threads : int
-        The result does not depend on it.
-    store : ArrayStore, optional
-        Memory for the sum, which is then valid until the next call.
-
-    Returns
-    -------
-    VisibleGradients
-        One row for each Gaussian in either, with increasing ids.
+    Both are for the same ``count`` Gaussians, each with increasing ids; neither is changed. A sum
+    in memory of ``store`` is valid until the next call. The result does not depend on ``threads``.
     """
-    threads = threads or default_threads()
-    taken = ArrayStore() if store is None else store
+    taken = store or ArrayStore()
     listed = taken.zeros("merged listed", count, np.bool_)
     listed[first.ids] = True
     listed[second.ids] = True
@@ -73,22 +54,8 @@ def merge_gradients(
         sums[name] = out = taken.take(f"merged {name}", shape, np.float32)
         flat = out.reshape(len(ids), -1) if len(ids) else np.zeros((0, 1), np.float32)
         one, two = (part.reshape(len(part), flat.shape[1]) for part in (one, two))
-        _add_rows_everywhere(rows[0], rows[1], one, two, flat, threads)
+        run_rows(_add_rows, len(flat), threads, *rows, one, two, flat, chunks=2)
     return VisibleGradients(ids, **sums)
-
-
-def _add_rows_everywhere(
-    first_rows: np.ndarray,
-    second_rows: np.ndarray,
-    first: np.ndarray,
-    second: np.ndarray,
-    out: np.ndarray,
-    threads: int,
-) -> None:
-    def run(begin: int, end: int) -> None:
-        _add_rows(begin, end, first_rows, second_rows, first, second, out)
-
-    run_chunks(run, even_bounds(len(out), threads, 2), threads)
 
 
 def add_image_gradients(first: ImageGradients, second: ImageGradients) -> ImageGradients:
@@ -104,14 +71,9 @@ def add_image_gradients(first: ImageGradients, second: ImageGradients) -> ImageG
 
 @kernel(fast=False)
 def _add_rows(
-    begin: int,
-    end: int,
-    first_rows: np.ndarray,
-    second_rows: np.ndarray,
-    first: np.ndarray,
-    second: np.ndarray,
-    out: np.ndarray,
-) -> None:
+    begin: int, end: int, first_rows: np.ndarray, second_rows: np.ndarray, first: np.ndarray,
+    second: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
     """Sum the rows of both (-1: none) into rows [begin, end) of ``out``."""
     for k in range(begin, end):
         one, two = first_rows[k], second_rows[k]
@@ -125,7 +87,6 @@ def _add_rows(
 
 
 # -- Compiled Adam steps, all tensors of a Gaussian at once, with explicit SIMD vectors -----------
-
 
 BETA1, BETA2 = 0.9, 0.999
 EPSILON = 1e-15
@@ -388,7 +349,6 @@ def adam_rows(  # type: ignore[no-untyped-def]
 
 # -- Sparse Adam over the Gaussians' tensors, in place: only Gaussians seen by a view are stepped
 
-
 _TABLE_STEPS = 20_000
 """Steps from which both bias corrections are 1 in float32."""
 
@@ -418,12 +378,8 @@ class Adam:
     """Adam optimiser of the trained tensors; rows are Gaussians and can be rebuilt.
 
     Each Gaussian counts its own steps, so that one created late, or rarely seen, has the right bias
-    correction instead of an overshooting first step.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        float32, on the CPU. The tensors are copied.
+    correction instead of an overshooting first step. The tensors given, float32 on the CPU, are
+    copied.
     """
 
     def __init__(self, gaussians: OrientedGaussians) -> None:
@@ -473,13 +429,9 @@ class Adam:
         return twin
 
     def step_rows(
-        self,
-        gradients: VisibleGradients,
-        rates: Mapping[str, np.ndarray],
-        *,
-        sh_degree: int | None = None,
-        threads: int = 0,
-    ) -> None:
+        self, gradients: VisibleGradients, rates: Mapping[str, np.ndarray], *,
+        sh_degree: int | None = None, threads: int = 0,
+    ) -> None:  # fmt: skip
         """Step the Gaussians that a view has seen, in place.
 
         A Gaussian counts as seen if any of its gradients is not 0. Listed Gaussians that are hidden

@@ -24,7 +24,6 @@ from .multi_view import MultiViewOptions
 
 # -- Split large photos into overlapping windows, one of which is trained on per iteration --------
 
-
 OVERLAP_PX = 16
 """Overlap of neighbouring windows: SSIM leaves out five pixels along the border of each."""
 
@@ -43,12 +42,9 @@ class Window:
         if (self.left, self.top, self.width, self.height) == (0, 0, camera.width, camera.height):
             return camera
         return dataclasses.replace(
-            camera,
-            width=self.width,
-            height=self.height,
-            cx=camera.cx - self.left,
+            camera, width=self.width, height=self.height, cx=camera.cx - self.left,
             cy=camera.cy - self.top,
-        )
+        )  # fmt: skip
 
     def of(self, image: np.ndarray) -> np.ndarray:
         """Crop an (h, w, ...) image to this window, C-contiguous."""
@@ -120,15 +116,9 @@ class Backend(ABC):
 
     @abstractmethod
     def compare_colors(
-        self,
-        image: Any,
-        shown: Shown,
-        lambda_dssim: float,
-        *,
-        exposure: tuple[Exposure, int] | None,
-        background: np.ndarray | None,
-        over_emptiness: bool,
-    ) -> tuple[Any, ImageGradients, Any]:
+        self, image: Any, shown: Shown, lambda_dssim: float, *,
+        exposure: tuple[Exposure, int] | None, background: np.ndarray | None, over_emptiness: bool,
+    ) -> tuple[Any, ImageGradients, Any]:  # fmt: skip
         """Return the colour loss, its gradients on colour and alpha, and the mean squared error.
 
         Parameters
@@ -144,14 +134,9 @@ class Backend(ABC):
 
     @abstractmethod
     def normal_losses(
-        self,
-        image: Any,
-        camera: Camera,
-        shown: Shown,
-        *,
-        lambda_depth_normal: float,
+        self, image: Any, camera: Camera, shown: Shown, *, lambda_depth_normal: float,
         lambda_normal: float,
-    ) -> tuple[Any, ImageGradients]:
+    ) -> tuple[Any, ImageGradients]:  # fmt: skip
         """Return the normal losses and their gradients on the images."""
 
     @abstractmethod
@@ -162,16 +147,9 @@ class Backend(ABC):
 
     @abstractmethod
     def compare_views(
-        self,
-        image: Any,
-        adam: Adam,
-        camera: Camera,
-        shown: Shown,
-        other_camera: Camera,
-        other: Shown,
-        options: MultiViewOptions,
-        random: np.random.Generator,
-    ) -> tuple[Any, ImageGradients, Any]:
+        self, image: Any, adam: Adam, camera: Camera, shown: Shown, other_camera: Camera,
+        other: Shown, options: MultiViewOptions, random: np.random.Generator,
+    ) -> tuple[Any, ImageGradients, Any]:  # fmt: skip
         """Return the multi-view losses, their gradients on the images, and those on the Gaussians
         through the other view (or ``None``)."""
 

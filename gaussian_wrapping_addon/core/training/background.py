@@ -13,7 +13,6 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from .. import limits
-from ..errors import UsageError
 from ..parallel import ArrayStore
 from ..scene.camera import Camera
 
@@ -27,14 +26,9 @@ def draw_background(random: np.random.Generator) -> np.ndarray:
 
 
 def composited(
-    color: np.ndarray,
-    alpha: np.ndarray,
-    photo: np.ndarray,
-    mask: np.ndarray | None,
-    background: np.ndarray,
-    *,
-    store: ArrayStore | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+    color: np.ndarray, alpha: np.ndarray, photo: np.ndarray, mask: np.ndarray | None,
+    background: np.ndarray, *, store: ArrayStore | None = None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Composite render and photo over a background colour, to be compared without a mask.
 
     Parameters
@@ -56,25 +50,13 @@ def composited(
         ``color + (1 - alpha) background``.
     target : (h, w, 3), the same type
         The photo inside the mask, the background elsewhere.
-
-    Raises
-    ------
-    UsageError
-        If the shapes differ.
     """
-    color, alpha = np.asarray(color), np.asarray(alpha)
-    if (
-        color.shape != np.shape(photo)
-        or alpha.shape != color.shape[:2]
-        or (mask is not None and np.shape(mask) != alpha.shape)
-    ):
-        raise UsageError(
-            f"Render {color.shape}, alpha {alpha.shape}, photo {np.shape(photo)} and mask differ "
-            "in size.",
-            "Use the images of one camera.",
-        )
+    color, alpha, store = np.asarray(color), np.asarray(alpha), store or ArrayStore()
     behind = np.asarray(background, color.dtype)
-    image, target = (_take(store, name, color) for name in ("over background", "target"))
+    image, target = (
+        store.take(f"{name} {color.dtype}", color.shape, color.dtype)
+        for name in ("over background", "target")
+    )
     np.multiply((1 - alpha)[..., None], behind, out=image)  # (h, w, 3)
     image += color
     white = 255.0 if np.asarray(photo).dtype == np.uint8 else 1.0
@@ -93,53 +75,20 @@ def inside_masks(
     points: np.ndarray,
     cameras: Sequence[Camera],
     masks: Iterable[np.ndarray | None],
-    min_share: float = MIN_SHARE,
 ) -> np.ndarray:
-    """Tell which points lie inside the masks in a sufficient share of the photos.
+    """Tell which points (n, 3), scene frame, lie inside the masks of most photos that hold them.
 
     Other points would initialise Gaussians in empty space, and would extend an automatic region
-    over what was masked out.
-
-    Parameters
-    ----------
-    points : (n, 3)
-        Scene frame.
-    cameras : sequence of Camera
-    masks : iterable of (h, w) bool or None
-        Of the cameras' sizes; ``None`` masks nothing. One is held at a time.
-    min_share : float
-        Share of the cameras with the point in their image whose masks must contain it; with 0 one
-        of them suffices.
-
-    Returns
-    -------
-    (n,) bool
-        False also for points outside all images.
-
-    Raises
-    ------
-    UsageError
-        Cameras and masks differ in number or size.
+    over what was masked out. ``None`` masks nothing; one mask is held at a time. The result, (n,)
+    bool, is false also for points outside all images.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     held, inside = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
-    count = 0
-    for count, mask in enumerate(masks, start=1):
-        if count > len(cameras):
-            break
-        camera = cameras[count - 1]
-        size = (camera.height, camera.width)
-        if mask is not None and mask.shape != size:
-            raise UsageError(
-                f"The mask of {camera.name} is {mask.shape}, its camera {size}.",
-                "Use a mask of the camera's size.",
-            )
+    for camera, mask in zip(cameras, masks, strict=True):
         rows, columns, _, seen = pixels_of(points, camera)
         held[seen] += 1
         inside[seen] += 1 if mask is None else mask[rows, columns]
-    if count != len(cameras):
-        raise UsageError("The numbers of cameras and masks differ.", "Give one mask a camera.")
-    return (inside > 0) & (inside >= min_share * held)
+    return (inside > 0) & (inside >= MIN_SHARE * held)
 
 
 def pixels_of(
@@ -153,9 +102,3 @@ def pixels_of(
     seen = np.nonzero(held)[0]
     column, row = np.floor(where[seen]).astype(np.int64).T
     return row, column, depth[seen], seen
-
-
-def _take(store: ArrayStore | None, name: str, like: np.ndarray) -> np.ndarray:
-    if store is None:
-        return np.empty(like.shape, like.dtype)
-    return store.take(f"{name} {like.dtype}", like.shape, like.dtype)

@@ -46,74 +46,45 @@ from .trainer import DETAIL_PHOTOS, train
 
 # -- How a training is divided into blocks, and the settings of the coarse training before it -----
 
-
 SMALLEST_PX = 32
 """Least long side of the photos of the coarse training: that of the setting."""
 
+MARGIN = 0.2
+"""A block also trains what lies so far outside of its cell, as a share of the cell's size."""
 
-@dataclass(frozen=True)
-class BlockSettings:
-    """How a training is divided. The shares are of the settings of the whole training."""
+COARSE_ITERATIONS, COARSE_PX = 0.3, 0.5
+"""Shares of the iterations, and of the photos' long side, that the coarse training has."""
 
-    blocks: int = 2
-    margin: float = 0.2
-    """A block also trains what lies so far outside of its cell, as a share of the cell's size."""
-    coarse_iterations: float = 0.3
-    """Share of the iterations that the coarse training has."""
-    begin: float = 0.1
-    """Share of the schedule at which blocks begin. Earlier than the coarse training has come: what
-    they add takes most rounds of growth, and moves fastest, at first."""
-    coarse_gaussians: float = 0.5
-    """Share of the Gaussians that the coarse training has at most; less for more blocks, so that it
-    does not need the most memory (:attr:`coarse_share`)."""
-    coarse_px: float = 0.5
-    """Share of the photos' long side at which it trains."""
-    coverage: float = 0.95
-    """A block takes the fewest photos that together show this share, by weight, of what lies in its
-    cell and margin."""
-    hidden_share: float = 0.002
-    """Of the Gaussians around a block, those stay away that make up less than this share of the
-    weights in each of its photos."""
-    polish_iterations: float = 0.1
-    """Share of the iterations that the joined Gaussians are trained together."""
+COARSE_GAUSSIANS = 0.5
+"""Share of the Gaussians that the coarse training has at most; less for more blocks, so that it
+does not need the most memory (:func:`coarse_settings`)."""
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.blocks <= MAX_BLOCKS:
-            raise UsageError(
-                f"A training cannot be divided into {self.blocks} blocks.",
-                f"Give a number from 1 to {MAX_BLOCKS}.",
-            )
-        bounds = {
-            "margin": (0.0, 1.0), "coarse_iterations": (0.01, 1.0), "begin": (0.0, 0.9),
-            "coarse_gaussians": (0.01, 1.0), "coarse_px": (0.05, 1.0), "coverage": (0.5, 1.0),
-            "hidden_share": (0.0, 0.1), "polish_iterations": (0.0, 1.0),
-        }  # fmt: skip
-        for name, (low, high) in bounds.items():
-            value = getattr(self, name)
-            if not low <= value <= high:  # false for NaN
-                raise UsageError(
-                    f"{name} of a training in blocks is {value}.", f"Give {low} to {high}."
-                )
+BEGIN = 0.1
+"""Share of the schedule at which blocks begin. Earlier than the coarse training has come: what they
+add takes most rounds of growth, and moves fastest, at first."""
 
-    @classmethod
-    def of(cls, settings: TrainingSettings) -> BlockSettings:
-        """Return how settings of a whole training divide it."""
-        return cls(settings.blocks)
+COVERAGE = 0.95
+"""A block takes the fewest photos that together show this share, by weight, of what lies in its
+cell and margin."""
 
-    @property
-    def coarse_share(self) -> float:
-        """Share of the Gaussians that the coarse training has at most: of two blocks, or less."""
-        return min(self.coarse_gaussians, 2.0 / self.blocks)
+HIDDEN_SHARE = 0.002
+"""Of the Gaussians around a block, those stay away that make up less than this share of the weights
+in each of its photos."""
 
-    def coarse(self, settings: TrainingSettings) -> TrainingSettings:
-        """Return the settings of the coarse training that comes before the blocks."""
-        return dataclasses.replace(
-            settings,
-            iterations=max(1, round(self.coarse_iterations * settings.iterations)),
-            extra_iterations=0,
-            max_gaussians=max(1, round(self.coarse_share * settings.max_gaussians)),
-            max_image_px=max(SMALLEST_PX, math.ceil(self.coarse_px * settings.max_image_px)),
-        )
+POLISH_ITERATIONS = 0.1
+"""Share of the iterations that the joined Gaussians are trained together."""
+
+
+def coarse_settings(settings: TrainingSettings) -> TrainingSettings:
+    """Return the settings of the coarse training, for settings of the whole training."""
+    share = min(COARSE_GAUSSIANS, 2.0 / settings.blocks)
+    return dataclasses.replace(
+        settings,
+        iterations=max(1, round(COARSE_ITERATIONS * settings.iterations)),
+        extra_iterations=0,
+        max_gaussians=max(1, round(share * settings.max_gaussians)),
+        max_image_px=max(SMALLEST_PX, math.ceil(COARSE_PX * settings.max_image_px)),
+    )
 
 
 # -- The coarse training of a whole scene: what all blocks start from and do not decide anew ------
@@ -137,30 +108,17 @@ class CoarseTraining:
 
 
 def train_coarse(
-    scene: Scene,
-    photos: PhotoSource,
-    settings: TrainingSettings,
-    folder: Path,
-    progress: Progress,
-    *,
-    seed: int = 0,
-    threads: int = 0,
-    inside: Inside | None = None,
+    scene: Scene, photos: PhotoSource, settings: TrainingSettings, folder: Path, progress: Progress,
+    *, seed: int = 0, threads: int = 0, inside: Inside | None = None,
     backend: Backend | None = None,
-) -> CoarseTraining:
+) -> CoarseTraining:  # fmt: skip
     """Train the whole scene coarsely, or read a finished such training of the same folder.
 
     Parameters
     ----------
-    scene, photos, folder, progress, seed, threads, inside, backend
-        As for :func:`~.trainer.train`; photos at the size of the settings.
     settings : TrainingSettings
-        Those of :meth:`~.block_plan.BlockSettings.coarse`.
-
-    Raises
-    ------
-    Cancelled, DatasetError, UsageError, ParseError, WrapError
-        As by :func:`~.trainer.train`.
+        Of :func:`coarse_settings`; the photos have their size. All else is as for
+        :func:`~.trainer.train`, and so are the errors raised.
     """
     result = train(
         scene, photos, settings, folder, progress,
@@ -175,40 +133,19 @@ def train_coarse(
         )
     own = torch.arange(len(state.adam))  # what lies behind them is the backdrop
     return CoarseTraining(
-        result.gaussians.select(own),
-        state.model_selection,
-        state.exposure,
-        result.poses,
-        key,
+        result.gaussians.select(own), state.model_selection, state.exposure, result.poses, key,
         result.warnings,
-    )
+    )  # fmt: skip
 
 
 def confirmed_depths(
-    coarse: CoarseTraining,
-    folder: Path,
-    photos: PhotoSource,
-    settings: TrainingSettings,
-    all_views: Sequence[int],
-    views: Sequence[int],
-) -> dict[int, DepthPrior]:
+    coarse: CoarseTraining, folder: Path, photos: PhotoSource, settings: TrainingSettings,
+    all_views: Sequence[int], views: Sequence[int],
+) -> dict[int, DepthPrior]:  # fmt: skip
     """Read the depths that a dense start of the coarse training confirmed for some views.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the coarse training.
-    photos : PhotoSource
-        As it was trained on.
-    settings : TrainingSettings
-        Of the coarse training.
-    all_views, views : sequence of int
-        All training views, and those to read.
-
-    Returns
-    -------
-    dict of int to DepthPrior
-        Empty without a dense start, or where the settings have no use for depths.
+    There are none without a dense start, or where the settings have no use for depths. ``folder``,
+    ``photos`` and ``settings`` are the coarse training's, ``all_views`` all training views.
 
     Raises
     ------
@@ -282,12 +219,7 @@ class BlockPlan:
     def handover(self, part: str, **further: Any) -> Handover:
         """Return a handover of what all parts take over alike.
 
-        Parameters
-        ----------
-        part : str
-            Names the part among those of the plan.
-        **further
-            The other fields of :class:`~.start.Handover`.
+        ``part`` names it among those of the plan; ``further`` are the other fields.
         """
         # Growth ended, or did not, at the size of the coarse photos: each block decides that anew.
         lasting = tuple(d for d in self.coarse.model_selection if d.name != "growth")
@@ -310,12 +242,8 @@ class BlockPlan:
             "key": self.coarse.key,
             "decisions": self.coarse.model_selection.to_json(),
             "blocks": [
-                {
-                    "views": list(block.views),
-                    "max_gaussians": block.max_gaussians,
-                    "pixels": block.pixels,
-                }
-                for block in self.blocks
+                {"views": list(b.views), "max_gaussians": b.max_gaussians, "pixels": b.pixels}
+                for b in self.blocks
             ],
         }
 
@@ -335,32 +263,17 @@ class BlockPlan:
 
 # -- What photos show of the coarse Gaussians, and which of them a block needs --------------------
 
-
 LONGEST_PX = 144
 """Long side of the views that are rendered: shares of an image need no detail."""
 
 
 class Visibility:
-    """Renders what each photo shows of some Gaussians, small.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-    photos : PhotoSource
-    views : sequence of int
-    renderer : Renderer
-        Overwrites its last view.
-    threads : int
-    """
+    """Renders what each photo shows of some Gaussians, small, in the renderer's last view."""
 
     def __init__(
-        self,
-        gaussians: OrientedGaussians,
-        photos: PhotoSource,
-        views: Sequence[int],
-        renderer: Renderer,
-        threads: int,
-    ) -> None:
+        self, gaussians: OrientedGaussians, photos: PhotoSource, views: Sequence[int],
+        renderer: Renderer, threads: int,
+    ) -> None:  # fmt: skip
         self._raw, self._photos, self._views = RawArrays.from_gaussians(gaussians), photos, views
         self._renderer = renderer
         self._options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
@@ -384,18 +297,10 @@ class Visibility:
 def chosen_photos(shown: np.ndarray, coverage: float) -> np.ndarray:
     """Choose the photos of each block: the fewest that together show most of what it trains.
 
-    A photo that no block would choose belongs to that of which it shows most.
-
-    Parameters
-    ----------
-    shown : (photos, blocks) float64
-        Weight of each block's cell and margin in each photo, at least 0.
-    coverage : float
-        Share of a block's weights over all photos that the chosen ones hold at least.
-
-    Returns
-    -------
-    (photos, blocks) bool
+    A photo that no block would choose belongs to that of which it shows most. ``shown``, (photos,
+    blocks) float64, is the weight of each block's cell and margin in each photo, at least 0; the
+    chosen ones, (photos, blocks) bool, hold at least ``coverage`` of a block's weights over all
+    photos.
     """
     chosen = np.zeros(shown.shape, np.bool_)
     for block, weights in enumerate(shown.T):
@@ -409,7 +314,6 @@ def chosen_photos(shown: np.ndarray, coverage: float) -> np.ndarray:
 
 
 # -- Write and read a plan of blocks: ``blocks.npz``, and ``blocks.json``, which is written last
-
 
 PLAN_NAME = "blocks.json"
 ARRAYS_NAME = "blocks.npz"
@@ -485,12 +389,9 @@ def _plan(values: dict[str, Any], path: Path) -> BlockPlan:
     if poses is not None:
         _checked(poses, np.float64, (len(poses), 3, 4), "poses")
     coarse = CoarseTraining(
-        gaussians,
-        ModelSelection.from_json(values["decisions"]),
-        Exposure.restore(exposure) if exposure else None,
-        poses,
-        str(values["key"]),
-    )
+        gaussians, ModelSelection.from_json(values["decisions"]),
+        Exposure.restore(exposure) if exposure else None, poses, str(values["key"]),
+    )  # fmt: skip
     blocks = tuple(
         _block(entry, views, len(gaussians), arrays[f"trained.{k}"], arrays[f"still.{k}"])
         for k, entry in enumerate(listed)
@@ -498,9 +399,7 @@ def _plan(values: dict[str, Any], path: Path) -> BlockPlan:
     begin = float(values["begin"])
     if not 0.0 <= begin < 1.0:
         raise ValueError(f"begin at {begin}")
-    return BlockPlan(
-        coarse, tiling, margins, blocks, views, begin, values["full_size"] is True
-    )  # fmt: skip
+    return BlockPlan(coarse, tiling, margins, blocks, views, begin, values["full_size"] is True)
 
 
 def _gaussians(arrays: dict[str, np.ndarray]) -> OrientedGaussians:
@@ -548,7 +447,6 @@ def _checked(
 
 # -- Divide a coarse training into blocks of about the same cost (docs/method.md, section 16) -----
 
-
 _logger = logging.getLogger(__name__)
 
 OUTLIER_SHARE = 0.005
@@ -568,48 +466,27 @@ photos. Others stand still: as the block's photos hardly show them, it would onl
 
 
 def plan_blocks(
-    coarse: CoarseTraining,
-    scene: Scene,
-    photos: PhotoSource,
-    settings: TrainingSettings,
-    blocks: BlockSettings,
-    progress: Progress,
-    *,
-    renderer: Renderer | None = None,
-    threads: int = 0,
-) -> BlockPlan:
-    """Divide a training into blocks. The plan depends on the inputs alone.
+    coarse: CoarseTraining, scene: Scene, photos: PhotoSource, settings: TrainingSettings,
+    progress: Progress, *, threads: int = 0,
+) -> BlockPlan:  # fmt: skip
+    """Divide a training into ``settings.blocks`` blocks. The plan depends on the inputs alone.
 
-    Parameters
-    ----------
-    coarse : CoarseTraining
-    scene : Scene
-        With the poses of the coarse training.
-    photos : PhotoSource
-        Of this scene, at the size that blocks train at.
-    settings : TrainingSettings
-        Of the whole training.
-    blocks : BlockSettings
-    progress : Progress
-        Checked for cancellation before each photo.
-    renderer : Renderer, optional
-        Overwrites its last view; by default one on the processor.
-    threads : int
-        The plan does not depend on it.
+    The scene has the poses of the coarse training, the photos the size that blocks train at.
 
     Raises
     ------
     UsageError
         There are more blocks than the photos can be divided into.
     Cancelled
+        Before the next photo.
     """
-    threads = threads or default_threads()
+    threads, count = threads or default_threads(), settings.blocks
     views = training_views(scene, photos, settings.holdout_every)
     gaussians = coarse.gaussians
     means = gaussians.means.double().numpy()
-    if blocks.blocks > min(len(views), len(means)):
-        raise _too_many(blocks.blocks, f"{len(views)} photos, {len(means)} Gaussians")
-    seen = Visibility(gaussians, photos, views, renderer or ViewRenderer(), threads)
+    if count > min(len(views), len(means)):
+        raise _too_many(count, f"{len(views)} photos, {len(means)} Gaussians")
+    seen = Visibility(gaussians, photos, views, ViewRenderer(), threads)
     total, near = np.zeros(len(means)), np.zeros(len(means))
     shown = seen.weights(progress.span(0.0, 0.2), "what photos show")
     for view, weights in zip(views, shown, strict=True):
@@ -621,14 +498,14 @@ def plan_blocks(
         )
     cameras = [photos.camera(view, 1) for view in views]
     sizes = np.array([camera.width * camera.height for camera in cameras])
-    tiling, chosen = _balanced(means, near, sizes, blocks, seen, progress.span(0.2, 0.8))
+    tiling, chosen = _balanced(means, near, sizes, count, seen, progress.span(0.2, 0.8))
     low, high = _extent(means, near)
-    margins = _margins(tiling, blocks.margin, low, high)
-    within = [tiling.within(index, means, margins[index]) for index in range(blocks.blocks)]
+    margins = _margins(tiling, low, high)
+    within = [tiling.within(index, means, margins[index]) for index in range(count)]
     own = [np.zeros(np.count_nonzero(inside)) for inside in within]
-    needed = np.zeros((blocks.blocks, len(means)), np.bool_)
+    needed = np.zeros((count, len(means)), np.bool_)
     for row, weights in enumerate(seen.weights(progress.span(0.8, 1.0), "photos of blocks")):
-        largest = largest_contributors(weights, blocks.hidden_share)
+        largest = largest_contributors(weights, HIDDEN_SHARE)
         for index in np.flatnonzero(chosen[row]):
             own[index] += weights[within[index]]
             needed[index, largest] = True
@@ -643,24 +520,19 @@ def plan_blocks(
         needed[index, rows] = False
         mine = chosen[:, index]
         if len(rows) == 0:
-            raise _too_many(blocks.blocks, f"nothing to train in block {index}")
-        made.append(
-            Block(
-                tuple(np.array(views)[mine].tolist()),
-                rows.astype(np.int32),
-                np.flatnonzero(needed[index]).astype(np.int32),
-                limits[index],
-                int(sizes[mine].sum()),
-            )
-        )
+            raise _too_many(count, f"nothing to train in block {index}")
+        still = np.flatnonzero(needed[index]).astype(np.int32)
+        own_views, pixels = tuple(np.array(views)[mine].tolist()), int(sizes[mine].sum())
+        made.append(Block(own_views, rows.astype(np.int32), still, limits[index], pixels))
         _logger.info(
             "block %d: %d photos, %d Gaussians to train, %d around them",
-            index, len(made[-1].views), len(rows), len(made[-1].still),
+            index, len(own_views), len(rows), len(still),
         )  # fmt: skip
-    return BlockPlan(
-        coarse, tiling, margins, tuple(made), tuple(views), blocks.begin,
-        _full_size(photos, views, settings),
-    )  # fmt: skip
+    # Decided for all blocks alike: whether photos are trained on at their full size.
+    sample = evenly_spaced(views, DETAIL_PHOTOS)
+    found = select_image_size([photo_detail(photos.photo(v, 1), photos.mask(v, 1)) for v in sample])
+    full_size = found.uses_full_size(settings.full_size)
+    return BlockPlan(coarse, tiling, margins, tuple(made), tuple(views), BEGIN, full_size)
 
 
 def _is_near(camera: Camera, means: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -677,28 +549,24 @@ def _is_near(camera: Camera, means: np.ndarray, weights: np.ndarray) -> np.ndarr
 
 
 def _balanced(
-    means: np.ndarray,
-    near: np.ndarray,
-    sizes: np.ndarray,
-    blocks: BlockSettings,
-    seen: Visibility,
+    means: np.ndarray, near: np.ndarray, sizes: np.ndarray, cells: int, seen: Visibility,
     progress: Progress,
-) -> tuple[Tiling, np.ndarray]:
+) -> tuple[Tiling, np.ndarray]:  # fmt: skip
     """Return the cells, and the photos of each, (photos, cells) bool, of least largest cost."""
     low, high = _extent(means, near)
     costs = np.where(((means >= low) & (means <= high)).all(1), near, 0.0)
     best: tuple[int, Tiling, np.ndarray] | None = None
     for number in range(BALANCE_ROUNDS):
-        tiling = split_evenly(means, costs, (low, high), lambda count, _: count >= blocks.blocks)
+        tiling = split_evenly(means, costs, (low, high), lambda count, _: count >= cells)
         owner = tiling.owner(means)
         part = progress.span(number / BALANCE_ROUNDS, (number + 1) / BALANCE_ROUNDS)
-        margins = _margins(tiling, blocks.margin, low, high)
+        margins = _margins(tiling, low, high)
         within = [tiling.within(k, means, reach) for k, reach in enumerate(margins)]
         # No product of matrices: its sums depend on the threads of the linear algebra.
         shown = np.array(
             [_sums(weights, within) for weights in seen.weights(part, "dividing the scene")]
         )
-        chosen = chosen_photos(shown, blocks.coverage)
+        chosen = chosen_photos(shown, COVERAGE)
         pixels = sizes @ chosen
         if best is None or pixels.max() < best[0]:
             best = (int(pixels.max()), tiling, chosen)
@@ -727,11 +595,11 @@ def _extent(means: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return low, high
 
 
-def _margins(tiling: Tiling, share: float, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _margins(tiling: Tiling, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the (cells, 3) margins: a share of each cell's extent in the box of the scene."""
     cells = [tiling.box(index) for index in range(len(tiling))]
     sizes = [np.minimum(last, high) - np.maximum(first, low) for first, last in cells]
-    return share * np.maximum(sizes, 0.0)
+    return MARGIN * np.maximum(sizes, 0.0)
 
 
 def _limits(owner: np.ndarray, trained: Sequence[np.ndarray], most: int) -> list[int]:
@@ -742,13 +610,6 @@ def _limits(owner: np.ndarray, trained: Sequence[np.ndarray], most: int) -> list
     counted = sum(int((owner[rows] == index).sum()) for index, rows in enumerate(trained))
     growth = max(1.0, (most - (len(owner) - counted)) / max(1, counted))
     return [max(len(rows), int(growth * len(rows))) for rows in trained]
-
-
-def _full_size(photos: PhotoSource, views: Sequence[int], settings: TrainingSettings) -> bool:
-    """Decide for all blocks whether photos are trained on at their full size."""
-    sample = evenly_spaced(views, DETAIL_PHOTOS)
-    found = select_image_size([photo_detail(photos.photo(v, 1), photos.mask(v, 1)) for v in sample])
-    return found.uses_full_size(settings.full_size)
 
 
 def _too_many(blocks: int, what: str) -> UsageError:

@@ -21,7 +21,6 @@ from .exposure import PhotoAdam, photo_rate
 # that all cameras share, and their common scale, are those of the given poses: they are the frame
 # that users measure in, and no photo tells them.
 
-
 TRAVEL_PX = 4.0
 """Total of a photo's steps over a training at the first rate; the rate falls, and steps waver, so
 that poses a pixel off are reached."""
@@ -42,13 +41,9 @@ EPSILON = 1e-20
 def pose_rate_px(iteration: int, iterations: int, photos: int) -> float:
     """Return the learning rate of an iteration: how far a step moves the image, in pixels."""
     return photo_rate(
-        iteration,
-        iterations,
-        photos,
-        travel=TRAVEL_PX,
-        bounds=(SMALLEST_RATE_PX, LARGEST_RATE_PX),
-        last_share=LAST_SHARE,
-    )
+        iteration, iterations, photos,
+        travel=TRAVEL_PX, bounds=(SMALLEST_RATE_PX, LARGEST_RATE_PX), last_share=LAST_SHARE,
+    )  # fmt: skip
 
 
 class CameraPoses:
@@ -77,17 +72,10 @@ class CameraPoses:
         return dataclasses.replace(camera, cam_from_world=self.refined[view])
 
     def step(self, view: int, camera: Camera, gradient: np.ndarray, rate_px: float) -> None:
-        """Move a photo's pose against a gradient, by Adam.
+        """Move a photo's pose against the (6,) ``gradient`` of :func:`pose_gradient`, by Adam.
 
-        Parameters
-        ----------
-        camera : Camera
-            Of the photo at the size that ``rate_px`` refers to.
-        gradient : (6,) float64
-            Of :func:`~.camera_poses.pose_gradient`.
-        rate_px : float
-            Size of a step: pixels by rotation, and by translation of what lies as far away as
-            the cameras are from the middle of the scene.
+        ``rate_px`` is the size of a step: pixels of ``camera``'s image by rotation, and by
+        translation of what lies as far away as the cameras are from the middle of the scene.
         """
         if not self.active:
             return
@@ -130,19 +118,10 @@ class CameraPoses:
         return self.refined.copy() if self.active and self.adam.steps.any() else None
 
     def shifts_px(self, cameras: Mapping[int, Camera], points: np.ndarray) -> np.ndarray:
-        """Return how far refined poses move what the given ones show.
+        """Return how far refined poses move what the given ones show, (photos,) float64, pixels.
 
-        Parameters
-        ----------
-        cameras : mapping of int to Camera
-            Of photos, by view, with any pose.
-        points : (n, 3) array
-            Scene frame.
-
-        Returns
-        -------
-        (photos,) float64
-            Median over the points in a photo, pixels; 0 where it shows none.
+        The median over the points (n, 3), scene frame, in a photo; 0 where it shows none.
+        ``cameras`` are those of photos, by view, with any pose.
         """
         shifts = []
         for view, camera in cameras.items():
@@ -155,10 +134,6 @@ class CameraPoses:
             lengths = np.linalg.norm(moved, axis=1)
             shifts.append(float(np.median(lengths)) if len(lengths) else 0.0)
         return np.array(shifts)
-
-    def is_finite(self) -> bool:
-        """Tell whether all poses are finite."""
-        return bool(np.isfinite(self.refined).all())
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of all arrays, by name."""
@@ -203,13 +178,7 @@ def _without_common_motion(given: np.ndarray, refined: np.ndarray) -> np.ndarray
 
 
 class PosedPhotos:
-    """Photo source whose cameras follow the poses of a training.
-
-    Parameters
-    ----------
-    photos : PhotoSource
-        With the given cameras.
-    """
+    """Photo source whose cameras follow the poses of a training instead of those given."""
 
     def __init__(self, photos: PhotoSource) -> None:
         self._photos = photos
@@ -217,16 +186,13 @@ class PosedPhotos:
         """Poses to follow; ``None``: those given."""
 
     def camera(self, index: int, divisor: int = 1) -> Camera:
-        """Return the camera at a pyramid level."""
         camera = self._photos.camera(index, divisor)
         return camera if self.poses is None else self.poses.camera(index, camera)
 
     def photo(self, index: int, divisor: int = 1) -> np.ndarray:
-        """Return (h, w, 3) uint8."""
         return self._photos.photo(index, divisor)
 
     def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
-        """Return (h, w) bool or ``None``."""
         return self._photos.mask(index, divisor)
 
 

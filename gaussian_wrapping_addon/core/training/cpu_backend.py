@@ -33,7 +33,7 @@ from .multi_view import MultiViewOptions, PhotoView, multi_view_losses
 
 
 class CpuBackend(Backend):
-    """Runs on the processor.
+    """Runs on the processor; methods as in :class:`.Backend`.
 
     Parameters
     ----------
@@ -48,38 +48,24 @@ class CpuBackend(Backend):
         self.renderer, self.store = ViewRenderer(), ArrayStore()
 
     def adopted(self, adam: Adam) -> Adam:
-        """Return the optimiser in the host's memory."""
         return adam.on_host()
 
     def adopted_statistics(self, statistics: DensityStatistics) -> DensityStatistics:
-        """Return the statistics in the host's memory."""
         return statistics.on_host()
 
     def shown(self, photos: PhotoSource, view: int, divisor: int, window: Window | None) -> Shown:
-        """Return a photo and its mask, whole or a window; see :class:`Backend`."""
         photo, mask = photos.photo(view, divisor), photos.mask(view, divisor)
         if window is not None:
-            rows = slice(window.top, window.top + window.height)
-            columns = slice(window.left, window.left + window.width)
-            photo = np.ascontiguousarray(photo[rows, columns])
-            mask = None if mask is None else np.ascontiguousarray(mask[rows, columns])
+            photo, mask = window.of(photo), None if mask is None else window.of(mask)
         return Shown(photo, mask, *counts_of(mask, *photo.shape[:2]))
 
     def render(self, adam: Adam, camera: Camera, options: RenderOptions) -> ViewPass:
-        """Return a rendered view."""
         return self.renderer.render(RawArrays.from_gaussians(adam.gaussians()), camera, options)
 
     def compare_colors(
-        self,
-        image: ViewPass,
-        shown: Shown,
-        lambda_dssim: float,
-        *,
-        exposure: tuple[Exposure, int] | None,
-        background: np.ndarray | None,
-        over_emptiness: bool,
-    ) -> tuple[float, ImageGradients, float]:
-        """Return the colour loss, its gradients and the mean squared error."""
+        self, image: ViewPass, shown: Shown, lambda_dssim: float, *,
+        exposure: tuple[Exposure, int] | None, background: np.ndarray | None, over_emptiness: bool,
+    ) -> tuple[float, ImageGradients, float]:  # fmt: skip
         alpha = image.alpha if over_emptiness else None
         color, threads = image.color, self.threads
         if exposure is not None:
@@ -88,7 +74,7 @@ class CpuBackend(Backend):
         if background is not None:
             color, photo = composited(color, image.alpha, photo, mask, background, store=self.store)
             mask = None
-        value, by_color, figures = color_loss(
+        value, by_color, mean_squared = color_loss(
             color, photo, mask, lambda_dssim=lambda_dssim, threads=threads, store=self.store
         )
         by_alpha = None if background is None else background_gradient(by_color, background)
@@ -98,78 +84,44 @@ class CpuBackend(Backend):
             )
             if by_alpha is not None and more is not None:
                 by_alpha += more
-        return value, ImageGradients(color=by_color, alpha=by_alpha), figures.mean_squared
+        return value, ImageGradients(color=by_color, alpha=by_alpha), mean_squared
 
     def normal_losses(
-        self,
-        image: ViewPass,
-        camera: Camera,
-        shown: Shown,
-        *,
-        lambda_depth_normal: float,
+        self, image: ViewPass, camera: Camera, shown: Shown, *, lambda_depth_normal: float,
         lambda_normal: float,
-    ) -> tuple[float, ImageGradients]:
-        """Return the normal losses and their gradients on the images."""
-        value, gradients, _ = normal_losses(
-            image.depth,
-            image.geometric_normal,
-            image.normal,
-            image.alpha,
-            camera,
-            shown.mask,
-            lambda_depth_normal=lambda_depth_normal,
-            lambda_normal=lambda_normal,
-            threads=self.threads,
-            store=self.store,
-        )
-        return value, gradients
+    ) -> tuple[float, ImageGradients]:  # fmt: skip
+        return normal_losses(
+            image.depth, image.geometric_normal, image.normal, image.alpha, camera, shown.mask,
+            lambda_depth_normal=lambda_depth_normal, lambda_normal=lambda_normal,
+            threads=self.threads, store=self.store,
+        )  # fmt: skip
 
     def prior_loss(
         self, image: ViewPass, camera: Camera, prior: DepthPrior, shown: Shown, weight: float
     ) -> tuple[float, ImageGradients]:
-        """Return the loss on confirmed depths and its gradient on the depth."""
         return depth_prior_loss(
             image.depth, camera, prior, shown.mask, weight=weight,
             threads=self.threads, store=self.store,
         )  # fmt: skip
 
     def compare_views(
-        self,
-        image: ViewPass,
-        adam: Adam,
-        camera: Camera,
-        shown: Shown,
-        other_camera: Camera,
-        other: Shown,
-        options: MultiViewOptions,
-        random: np.random.Generator,
-    ) -> tuple[float, ImageGradients, VisibleGradients | None]:
-        """Return the multi-view losses and their gradients."""
+        self, image: ViewPass, adam: Adam, camera: Camera, shown: Shown, other_camera: Camera,
+        other: Shown, options: MultiViewOptions, random: np.random.Generator,
+    ) -> tuple[float, ImageGradients, VisibleGradients | None]:  # fmt: skip
         found = multi_view_losses(
-            image,
-            image.gaussians,
-            PhotoView(camera, shown.photo, shown.mask),
-            PhotoView(other_camera, other.photo, other.mask),
-            options,
-            random,
-            threads=self.threads,
-            store=self.store,
-        )
+            image, image.gaussians, PhotoView(camera, shown.photo, shown.mask),
+            PhotoView(other_camera, other.photo, other.mask), options, random,
+            threads=self.threads, store=self.store,
+        )  # fmt: skip
         return found.value, found.gradients, found.other
 
     def backward(self, image: ViewPass, gradients: ImageGradients) -> VisibleGradients:
-        """Return the gradients on the Gaussians seen."""
         return image.backward(gradients)
 
     def add_priors(
-        self,
-        image: ViewPass,
-        gradients: VisibleGradients,
-        adam: Adam,
-        price: float,
+        self, image: ViewPass, gradients: VisibleGradients, adam: Adam, price: float,
         opacity_weight: float,
-    ) -> None:
-        """Add the gradients of footprint regulariser and opacity prior."""
+    ) -> None:  # fmt: skip
         if price <= 0.0 and opacity_weight <= 0.0:
             return
         height, width = image.alpha.shape
@@ -180,20 +132,17 @@ class CpuBackend(Backend):
             add_opacity_prior(gradients, adam.array("opacity_logits"), shares, opacity_weight)
 
     def pose_gradient(self, camera: Camera, gradients: VisibleGradients, adam: Adam) -> np.ndarray:
-        """Return the (6,) gradient on the camera's pose."""
         pose = np.asarray(camera.cam_from_world, np.float64)
         return pose_gradient(pose, gradients, adam.array("means"), adam.array("quats"))
 
     def merged(
         self, gradients: VisibleGradients, other: VisibleGradients, count: int
     ) -> VisibleGradients:
-        """Return the sum of two gradients."""
         return merge_gradients(gradients, other, count, threads=self.threads, store=self.store)
 
     def add_statistics(
         self, statistics: DensityStatistics, image: ViewPass, width: int, height: int, part: float
     ) -> None:
-        """Accumulate the statistics of a view."""
         assert image.statistics is not None
         statistics.add(image.statistics, width, height, part)
 
@@ -204,9 +153,7 @@ class CpuBackend(Backend):
         rates: Mapping[str, np.ndarray],
         sh_degree: int,
     ) -> None:
-        """Step the Gaussians that the view has seen."""
         adam.step_rows(gradients, rates, sh_degree=sh_degree, threads=self.threads)
 
     def numbers(self, *values: Any) -> list[np.ndarray]:
-        """Return the values as numpy arrays."""
         return [np.asarray(value, np.float64) for value in values]

@@ -27,22 +27,11 @@ from .wrapping import WrapView
 def contradicted(
     means: np.ndarray, priors: Mapping[int, DepthPrior], least_views: int
 ) -> np.ndarray:
-    """Tell which Gaussians stand where photos show nothing.
+    """Tell which Gaussians stand where photos show nothing, (n,) bool; scene frame.
 
-    Parameters
-    ----------
-    means : (n, 3) array
-        Scene frame.
-    priors : mapping of int to DepthPrior
-        By view.
-    least_views : int
-        Photos that must see through a Gaussian; more of them than of those whose confirmed depth
-        agrees with its own.
-
-    Returns
-    -------
-    (n,) bool
-        Never true beyond the smallest radius of the far shell: what lies there may be the sky.
+    At least ``least_views`` photos must see through a Gaussian, and more of them than of those
+    whose confirmed depth agrees with its own. Never true beyond the smallest radius of the far
+    shell: what lies there may be the sky.
     """
     means = np.asarray(means, np.float64)
     through, agreeing = (np.zeros(len(means), np.int32) for _ in range(2))
@@ -56,7 +45,6 @@ def contradicted(
 
 
 # -- Density control: clone and split Gaussians with high gradients, prune transparent ones -------
-
 
 GRADIENT_THRESHOLD = 2e-4
 """Average loss gradient, in half image units, from which a Gaussian is densified.
@@ -108,13 +96,8 @@ class DensityStatistics:
     def add(self, statistics: RenderStatistics, width: int, height: int, part: float = 1.0) -> None:
         """Accumulate one view after its backward pass.
 
-        Parameters
-        ----------
-        width, height : int
-            Size of its image, pixels.
-        part : float
-            Share of the image that was rendered: a mean loss over fewer pixels has larger
-            gradients.
+        ``part`` is the share of the image of ``width`` x ``height`` pixels that was rendered: a
+        mean loss over fewer pixels has larger gradients.
         """
         half_image = 0.5 * max(width, height) * part
         # 0 for invisible ones: adding all is faster than indexing the visible.
@@ -139,29 +122,19 @@ class DensityChange:
 
 
 def densify_and_prune(
-    adam: Adam,
-    statistics: DensityStatistics,
-    limit: int,
-    random: np.random.Generator,
-    weights: np.ndarray | None = None,
-    *,
-    least_score: float = LOWEST_SCORE,
+    adam: Adam, statistics: DensityStatistics, limit: int, random: np.random.Generator,
+    weights: np.ndarray | None = None, *, least_score: float = LOWEST_SCORE,
     min_opacity: float = MIN_OPACITY,
-) -> DensityChange:
+) -> DensityChange:  # fmt: skip
     """Clone small and split large Gaussians with high gradients; prune transparent ones.
 
     A Gaussian is a candidate by its average gradient, or by an average absolute gradient above the
     quantile that selects the same share (docs/method.md, section 4.1). If there are more candidates
-    than room up to ``limit``, those with the highest gradients are taken.
+    than room up to ``limit``, those with the highest gradients are taken. New Gaussians start with
+    zero moments; frozen ones are neither parents, nor pruned, nor counted by the limit.
 
     Parameters
     ----------
-    adam : Adam
-        Rebuilt; new Gaussians start with zero moments. Frozen ones are neither parents nor pruned.
-    statistics : DensityStatistics
-        Statistics of the current Gaussians.
-    limit : int
-        Largest number of Gaussians that are not frozen.
     random : numpy.random.Generator
         Draws the means of new Gaussians from the distributions of the old ones.
     weights : (n,), optional
@@ -259,7 +232,6 @@ class DeviceDensityStatistics(DensityStatistics):
     ----------
     statistics : DensityStatistics
         Sums so far.
-    device : torch.device
     """
 
     def __init__(self, statistics: DensityStatistics, device: torch.device) -> None:
@@ -299,18 +271,9 @@ def _read(tensor: Tensor) -> np.ndarray:
 
 
 def largest_contributors(weights: np.ndarray, share: float) -> np.ndarray:
-    """Return the Gaussians that a view needs: all but the least, which make up ``share`` of it.
+    """Return the Gaussians (k,) that a view needs: all but the least, ``share`` of it together.
 
-    Parameters
-    ----------
-    weights : (n,) float64
-        Contribution of each Gaussian to the view, at least 0.
-    share : float
-        In [0, 1).
-
-    Returns
-    -------
-    (k,) int64
+    ``weights`` (n,) are the contributions of the Gaussians to the view, at least 0.
     """
     seen = np.flatnonzero(weights > 0.0)
     if len(seen) == 0:
@@ -322,36 +285,15 @@ def largest_contributors(weights: np.ndarray, share: float) -> np.ndarray:
 
 
 def needed_by_a_view(
-    gaussians: OrientedGaussians,
-    views: Iterable[WrapView],
-    renderer: Renderer,
-    share: float,
-    weights: np.ndarray | None = None,
-    *,
-    threads: int = 0,
-) -> np.ndarray:
-    """Tell which Gaussians any view needs (docs/method.md, section 4.3).
+    gaussians: OrientedGaussians, views: Iterable[WrapView], renderer: Renderer, share: float,
+    weights: np.ndarray | None = None, *, threads: int = 0,
+) -> np.ndarray:  # fmt: skip
+    """Tell which Gaussians any view needs, (n,) bool (docs/method.md, section 4.3).
 
     A view does not need its least contributors, which together make up ``share`` of its blending
-    weights. The Gaussians that any view needs therefore keep at least ``1 - share`` of the weights
-    of every view, however many views there are, and however few of them see a part of the scene.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Scene frame.
-    views : iterable of WrapView
-        All training views.
-    renderer : Renderer
-        Overwrites its last view.
-    share : float
-        In [0, 1).
-    weights : (n,), optional
-        Factors on the contributions of the Gaussians.
-
-    Returns
-    -------
-    (n,) bool
+    weights, by factors ``weights`` (n,). The Gaussians that any view needs therefore keep at least
+    ``1 - share`` of the weights of every view, however many views there are, and however few of
+    them see a part of the scene. The renderer overwrites its last view.
     """
     raw = RawArrays.from_gaussians(gaussians)
     options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)

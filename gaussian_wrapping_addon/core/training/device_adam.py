@@ -17,19 +17,11 @@ _WARPS = THREADS_PER_BLOCK // 32
 
 
 class DeviceAdam(Adam):
-    """Adam on the tensors of a device.
+    """Adam on the tensors of a device, to which those of another are copied.
 
-    What rounds between iterations read and write is copied: :meth:`array` and ``moments``
-    give copies on the host, which go back to the device before anything else uses it. Write to
-    them at once, and fetch them anew after a step.
-
-    Parameters
-    ----------
-    adam : Adam
-        Its values, moments and steps are copied to the device.
-    kernels : Kernels
-        Of the device.
-    device : torch.device
+    What rounds between iterations read and write is copied: :meth:`array` and ``moments`` give
+    copies on the host, which go back to the device before anything else uses it. Write to them at
+    once, and fetch them anew after a step.
     """
 
     def __init__(self, adam: Adam, kernels: Kernels, device: torch.device) -> None:
@@ -109,10 +101,8 @@ class DeviceAdam(Adam):
         twin = object.__new__(DeviceAdam)
         twin.__dict__.update(self.__dict__)
         twin.tensors = {name: tensor.clone() for name, tensor in self.tensors.items()}
-        twin.device_moments, twin.device_steps = (
-            self.device_moments.clone(),
-            self.device_steps.clone(),
-        )
+        twin.device_moments = self.device_moments.clone()
+        twin.device_steps = self.device_steps.clone()
         twin._held = {}
         return twin
 
@@ -155,20 +145,11 @@ class DeviceAdam(Adam):
         names = ("quats", "orientation", "means", "opacity_logits", "log_scales", "sh")
         first = self.frozen
         self.kernels.launch(
-            "adam_rows",
-            -(-(len(self) - first) // _WARPS),
-            len(self) - first,
-            columns,
-            SH_COLUMN + 3 * used,
-            3 * coefficients,
-            *(self.tensors[name][first:] for name in names),
-            *(gradients[name][first:] for name in names),
-            self.device_moments[first:],
-            self.device_steps[first:],
-            self._corrections,
-            len(self._corrections) - 1,
-            packed,
-        )
+            "adam_rows", -(-(len(self) - first) // _WARPS), len(self) - first, columns,
+            SH_COLUMN + 3 * used, 3 * coefficients, *(self.tensors[name][first:] for name in names),
+            *(gradients[name][first:] for name in names), self.device_moments[first:],
+            self.device_steps[first:], self._corrections, len(self._corrections) - 1, packed,
+        )  # fmt: skip
 
     def rebuild(
         self, parents: np.ndarray, fresh: np.ndarray, changes: Mapping[str, np.ndarray]

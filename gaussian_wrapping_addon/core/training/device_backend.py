@@ -45,7 +45,6 @@ class DevicePhotos:
 
     Parameters
     ----------
-    device : torch.device
     limit_bytes : int
         Device memory; the photo in use is kept whatever its size.
     """
@@ -105,7 +104,6 @@ def _bytes(held: tuple[Tensor, Tensor | None]) -> int:
 # on the host's memory as well, with kernels that are emulated there, which is how it is tested
 # without a GPU.
 
-
 PHOTO_SHARE = 0.2
 """Share of the free device memory in which photos are kept."""
 
@@ -116,28 +114,16 @@ Gradients = dict[str, Tensor]
 
 
 class DeviceBackend(Backend):
-    """Runs on a device.
+    """Runs on a device such as "cuda:0"; methods as in :class:`.Backend`.
 
-    Parameters
-    ----------
-    name : str
-        Such as "cuda:0".
-    kernels : Kernels
-    device : torch.device
-    free_bytes : callable
-        Returns the device memory that tile intersections may take now.
-    photo_bytes : int
-        Device memory for photos.
+    ``free_bytes`` returns the device memory that tile intersections may take now, ``photo_bytes``
+    is that for photos.
     """
 
     def __init__(
-        self,
-        name: str,
-        kernels: Kernels,
-        device: torch.device,
-        free_bytes: Callable[[], int],
+        self, name: str, kernels: Kernels, device: torch.device, free_bytes: Callable[[], int],
         photo_bytes: int,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.name, self.kernels, self.device = name, kernels, device
         self._free_bytes, self._budget, self._renders = free_bytes, 0, 0
         self.budget_share = 1.0
@@ -171,43 +157,29 @@ class DeviceBackend(Backend):
         return self._budget
 
     def adopted(self, adam: Adam) -> DeviceAdam:
-        """Return the optimiser on the device."""
         if isinstance(adam, DeviceAdam) and adam.device == self.device:
             return adam
         return DeviceAdam(adam, self.kernels, self.device)
 
     def adopted_statistics(self, statistics: DensityStatistics) -> DeviceDensityStatistics:
-        """Return the statistics on the device."""
         if isinstance(statistics, DeviceDensityStatistics) and statistics.device == self.device:
             return statistics
         return DeviceDensityStatistics(statistics, self.device)
 
     def shown(self, photos: PhotoSource, view: int, divisor: int, window: Window | None) -> Shown:
-        """Return a photo and its mask on the device, whole or a window."""
         return self._photos.shown(photos, view, divisor, window)
 
     def render(self, adam: Adam, camera: Camera, options: RenderOptions) -> DeviceView:
-        """Return a rendered view."""
         assert isinstance(adam, DeviceAdam)
         self.renderer.release()  # rounds are over
         return DeviceView(self.kernels, adam.on_device(), camera, options, self._budget_bytes())
 
     def compare_colors(
-        self,
-        image: DeviceView,
-        shown: Shown,
-        lambda_dssim: float,
-        *,
-        exposure: tuple[Exposure, int] | None,
-        background: np.ndarray | None,
-        over_emptiness: bool,
-    ) -> tuple[Tensor, ImageGradients, Tensor]:
-        """Return the colour loss, its gradients and the mean squared error."""
-        color, photo, mask = (
-            image.color,
-            shown.photo.to(torch.float32).mul_(1.0 / 255.0),
-            shown.mask,
-        )
+        self, image: DeviceView, shown: Shown, lambda_dssim: float, *,
+        exposure: tuple[Exposure, int] | None, background: np.ndarray | None, over_emptiness: bool,
+    ) -> tuple[Tensor, ImageGradients, Tensor]:  # fmt: skip
+        color, mask = image.color, shown.mask
+        photo = shown.photo.to(torch.float32).mul_(1.0 / 255.0)
         counts = (shown.pixels, shown.windows)
         cover = image.alpha[..., None] if over_emptiness else 1.0  # (h, w, 1)
         if exposure is not None:
@@ -236,74 +208,40 @@ class DeviceBackend(Backend):
         return value, ImageGradients(color=by_color, alpha=by_alpha), squared
 
     def normal_losses(
-        self,
-        image: DeviceView,
-        camera: Camera,
-        shown: Shown,
-        *,
-        lambda_depth_normal: float,
+        self, image: DeviceView, camera: Camera, shown: Shown, *, lambda_depth_normal: float,
         lambda_normal: float,
-    ) -> tuple[Tensor, ImageGradients]:
-        """Return the normal losses and their gradients on the images."""
+    ) -> tuple[Tensor, ImageGradients]:  # fmt: skip
         return device_normal_losses(
-            self.kernels,
-            image.depth,
-            image.geometric_normal,
-            image.normal,
-            image.alpha,
-            camera,
-            shown.mask,
-            lambda_depth_normal=lambda_depth_normal,
-            lambda_normal=lambda_normal,
+            self.kernels, image.depth, image.geometric_normal, image.normal, image.alpha, camera,
+            shown.mask, lambda_depth_normal=lambda_depth_normal, lambda_normal=lambda_normal,
             pixels=shown.pixels,
-        )
+        )  # fmt: skip
 
     def prior_loss(
         self, image: DeviceView, camera: Camera, prior: DepthPrior, shown: Shown, weight: float
     ) -> tuple[Tensor, ImageGradients]:
-        """Return the loss on confirmed depths and its gradient on the depth."""
         held = self._priors.get(id(prior))
         if held is None or held[0] is not prior:
             sent = (self._sent(prior.depth), self._sent(prior.confidence), prior.camera)
-            held = (prior, sent)
-            self._keep_prior(held)
+            # Where they take too much, all others are given up first.
+            if sum(8 * kept.depth.size for kept, _ in self._priors.values()) > self._prior_bytes:
+                self._priors.clear()
+            held = self._priors[id(prior)] = (prior, sent)
         return device_prior_loss(
             self.kernels, image.depth, camera, held[1], shown.mask,
             weight=weight, pixels=shown.pixels,
         )  # fmt: skip
 
-    def _keep_prior(self, held: tuple[DepthPrior, tuple[Tensor, Tensor, Camera]]) -> None:
-        """Keep a prior that was sent; first give up all others where they take too much."""
-        if sum(8 * prior.depth.size for prior, _ in self._priors.values()) > self._prior_bytes:
-            self._priors.clear()
-        self._priors[id(held[0])] = held
-
     def compare_views(
-        self,
-        image: DeviceView,
-        adam: Adam,
-        camera: Camera,
-        shown: Shown,
-        other_camera: Camera,
-        other: Shown,
-        options: MultiViewOptions,
-        random: np.random.Generator,
-    ) -> tuple[Tensor, ImageGradients, Gradients | None]:
-        """Return the multi-view losses and their gradients."""
+        self, image: DeviceView, adam: Adam, camera: Camera, shown: Shown, other_camera: Camera,
+        other: Shown, options: MultiViewOptions, random: np.random.Generator,
+    ) -> tuple[Tensor, ImageGradients, Gradients | None]:  # fmt: skip
         assert isinstance(adam, DeviceAdam)
         found = device_multi_view_losses(
-            self.kernels,
-            image,
-            adam.on_device(),
-            PhotoView(camera, shown.photo, shown.mask),
-            PhotoView(other_camera, other.photo, other.mask),
-            options,
-            random,
-        )
-        gradients = ImageGradients(
-            depth=found.gradients.depth, geometric_normal=found.gradients.geometric_normal
-        )
-        return found.value, gradients, found.other
+            self.kernels, image, adam.on_device(), PhotoView(camera, shown.photo, shown.mask),
+            PhotoView(other_camera, other.photo, other.mask), options, random,
+        )  # fmt: skip
+        return found.value, found.gradients, found.other
 
     def backward(self, image: DeviceView, gradients: ImageGradients) -> Gradients:
         """Return the gradients on all Gaussians, 0 for those not seen."""
@@ -314,7 +252,6 @@ class DeviceBackend(Backend):
         self, image: DeviceView, gradients: Gradients, adam: Adam, price: float,
         opacity_weight: float,
     ) -> None:  # fmt: skip
-        """Add the gradients of footprint regulariser and opacity prior."""
         if price <= 0.0 and opacity_weight <= 0.0:
             return
         assert isinstance(adam, DeviceAdam)
@@ -341,7 +278,6 @@ class DeviceBackend(Backend):
             by_logits -= 4.0 * opacity_weight * asked * ramp * opacity * (1.0 - opacity)
 
     def pose_gradient(self, camera: Camera, gradients: Gradients, adam: Adam) -> Tensor:
-        """Return the (6,) gradient on the camera's pose; see :mod:`.camera_poses`."""
         assert isinstance(adam, DeviceAdam)
         gaussians = adam.on_device()
         pose = torch.from_numpy(np.array(camera.cam_from_world, np.float64)).to(self.device)
@@ -367,14 +303,12 @@ class DeviceBackend(Backend):
         self, statistics: DensityStatistics, image: DeviceView, width: int, height: int,
         part: float,
     ) -> None:  # fmt: skip
-        """Accumulate the statistics of a view."""
         assert isinstance(statistics, DeviceDensityStatistics)
         statistics.add_view(image, width, height, part)
 
     def step(
         self, adam: Adam, gradients: Gradients, rates: Mapping[str, np.ndarray], sh_degree: int
     ) -> None:
-        """Step the Gaussians that the view has seen."""
         assert isinstance(adam, DeviceAdam)
         adam.step_all(gradients, rates, sh_degree=sh_degree)
 
@@ -415,21 +349,13 @@ class DeviceBackend(Backend):
 
 # -- The backend of a chosen device ---------------------------------------------------------------
 
-
 _logger = logging.getLogger(__name__)
 
 
 def chosen_backend(device: str, threads: int, *, or_processor: bool = False) -> Backend:
-    """Return the backend of a device.
+    """Return the backend of "cpu", or of a GPU such as "cuda:0".
 
-    Parameters
-    ----------
-    device : str
-        "cpu", or a GPU such as "cuda:0".
-    threads : int
-        Of the processor.
-    or_processor : bool
-        Return the processor's where the GPU fails, and log why.
+    Where the GPU fails, ``or_processor`` returns the processor's, and logs why.
 
     Raises
     ------
@@ -438,7 +364,6 @@ def chosen_backend(device: str, threads: int, *, or_processor: bool = False) -> 
     """
     if device == "cpu":
         return CpuBackend(threads)
-
     try:
         return DeviceBackend.of_gpu(int(device.partition(":")[2] or 0))
     except (WrapError, RuntimeError) as error:

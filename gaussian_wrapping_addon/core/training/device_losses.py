@@ -5,15 +5,12 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
-from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .. import limits
-from ..errors import UsageError
 from ..gaussians.model import OrientedGaussians
 from ..render.cuda.device_query import (
     add_query_gradients,
@@ -21,32 +18,34 @@ from ..render.cuda.device_query import (
     query_view,
     solve_depths,
 )
-from ..render.cuda.device_view import WARPS
+from ..render.cuda.device_view import WARPS, DeviceView
 from ..render.cuda.kernels import THREADS_PER_BLOCK, CameraValues, Kernels
 from ..render.projection import pack_camera
 from ..render.types import ImageGradients, RenderOptions
 from ..resampling import LUMA
 from ..scene.camera import Camera
-from .multi_view import BLOCK_PX, BORDER_PX, MultiViewOptions, PhotoView
+from .losses import lens_of
+from .multi_view import (
+    BLOCK_PX,
+    BORDER_PX,
+    MultiViewLoss,
+    MultiViewMetrics,
+    MultiViewOptions,
+    PhotoView,
+)
 from .multi_view_kernels import KEPT, SAMPLES
 
 # -- Losses on images of a device: those of :mod:`.losses` and :mod:`.losses` as kernels
 #
 # Values and their gradients stay on the device; nothing is read back.
 
-
 _CAMERA_VALUES = 22
 
 
 def device_color_loss(
-    kernels: Kernels,
-    image: Tensor,
-    photo: Tensor,
-    mask: Tensor | None,
-    *,
-    lambda_dssim: float,
+    kernels: Kernels, image: Tensor, photo: Tensor, mask: Tensor | None, *, lambda_dssim: float,
     counts: tuple[int, int],
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Return loss, gradient on the image and mean squared error; see :func:`~.losses.color_loss`.
 
     Parameters
@@ -68,8 +67,7 @@ def device_color_loss(
         lambda_dssim = 0.0
     tiles_x, tiles_y = (-(-side // limits.TILE_PX) for side in (width, height))
     tiles = tiles_x * tiles_y
-    masked = mask if mask is not None else image.new_empty(0, dtype=torch.bool)
-    size = (masked, int(mask is not None), width, height, tiles_x)
+    size = (*_masked(mask, image), width, height, tiles_x)
     similar = lambda_dssim > 0.0
     maps = image.new_empty((3, 3, height, width) if similar else (0,))
     ssim: Tensor | float = 1.0
@@ -80,66 +78,35 @@ def device_color_loss(
     gradient, sums = torch.empty_like(image), image.new_empty((tiles, 2))
     values = 3 * max(1, pixels)
     kernels.launch(
-        "color_gradient",
-        tiles,
-        image,
-        photo,
-        *size,
-        maps,
-        int(similar),
-        (1.0 - lambda_dssim) / values,
-        -lambda_dssim / max(1, 3 * windows),
-        gradient,
-        sums,
-    )
+        "color_gradient", tiles, image, photo, *size, maps, int(similar),
+        (1.0 - lambda_dssim) / values, -lambda_dssim / max(1, 3 * windows), gradient, sums,
+    )  # fmt: skip
     absolute, squared = (sums.sum(0) / values).unbind()
     return (1.0 - lambda_dssim) * absolute + lambda_dssim * (1.0 - ssim), gradient, squared
 
 
 def device_normal_losses(
-    kernels: Kernels,
-    depth: Tensor,
-    geometric_normal: Tensor,
-    normal: Tensor,
-    alpha: Tensor,
-    camera: Camera,
-    mask: Tensor | None,
-    *,
-    lambda_depth_normal: float,
-    lambda_normal: float,
+    kernels: Kernels, depth: Tensor, geometric_normal: Tensor, normal: Tensor, alpha: Tensor,
+    camera: Camera, mask: Tensor | None, *, lambda_depth_normal: float, lambda_normal: float,
     pixels: int,
-) -> tuple[Tensor, ImageGradients]:
+) -> tuple[Tensor, ImageGradients]:  # fmt: skip
     """Return the weighted sum of both normal losses and its gradients on the four images.
 
     See :func:`~.losses.normal_losses`; ``pixels`` is the number that the mask leaves.
     """
     height, width = depth.shape
     count = height * width
-    packed = np.concatenate([camera.rotation.reshape(-1), _lens(camera)])
+    packed = np.concatenate([camera.rotation.reshape(-1), lens_of(camera)])
     blocks = -(-count // THREADS_PER_BLOCK)
     by_geometric, by_learned = torch.empty_like(geometric_normal), torch.empty_like(normal)
     by_alpha, by_depth = torch.empty_like(alpha), torch.empty_like(depth)
     spread, sums = depth.new_empty((4, height, width)), depth.new_empty((blocks, 3))
     kernels.launch_each(
-        "agree_normals",
-        count,
-        width,
-        height,
-        depth,
-        alpha,
-        geometric_normal,
-        normal,
-        mask if mask is not None else depth.new_empty(0, dtype=torch.bool),
-        int(mask is not None),
-        _packed(packed),
-        lambda_depth_normal / max(1, pixels),
-        lambda_normal / max(1, pixels),
-        by_geometric,
-        by_learned,
-        by_alpha,
-        spread,
-        sums,
-    )
+        "agree_normals", count, width, height, depth, alpha, geometric_normal, normal,
+        *_masked(mask, depth),
+        _packed(packed), lambda_depth_normal / max(1, pixels), lambda_normal / max(1, pixels),
+        by_geometric, by_learned, by_alpha, spread, sums,
+    )  # fmt: skip
     kernels.launch_each("gather_depth", count, width, height, spread, by_depth)
     geometric, learned, _ = (sums.sum(0) / max(1, pixels)).unbind()
     gradients = ImageGradients(
@@ -149,15 +116,9 @@ def device_normal_losses(
 
 
 def device_prior_loss(
-    kernels: Kernels,
-    depth: Tensor,
-    camera: Camera,
-    prior: tuple[Tensor, Tensor, Camera],
-    mask: Tensor | None,
-    *,
-    weight: float,
-    pixels: int,
-) -> tuple[Tensor, ImageGradients]:
+    kernels: Kernels, depth: Tensor, camera: Camera, prior: tuple[Tensor, Tensor, Camera],
+    mask: Tensor | None, *, weight: float, pixels: int,
+) -> tuple[Tensor, ImageGradients]:  # fmt: skip
     """Return the loss on depths that leave the confirmed ones, and its gradient on the depth.
 
     Parameters
@@ -172,26 +133,18 @@ def device_prior_loss(
     blocks = -(-height * width // THREADS_PER_BLOCK)
     sums = depth.new_empty(blocks)
     kernels.launch_each(
-        "prior_depths",
-        height * width,
-        width,
-        depth,
-        confirmed,
-        confidence,
-        int(confirmed.shape[1]),
-        int(confirmed.shape[0]),
-        mask if mask is not None else depth.new_empty(0, dtype=torch.bool),
-        int(mask is not None),
-        _packed(np.concatenate([_lens(camera), _lens(prior_camera)])),
-        weight / max(1, pixels),
-        by_depth,
-        sums,
-    )
+        "prior_depths", height * width, width, depth, confirmed, confidence,
+        int(confirmed.shape[1]), int(confirmed.shape[0]),
+        *_masked(mask, depth),
+        _packed(np.concatenate([lens_of(camera), lens_of(prior_camera)])), weight / max(1, pixels),
+        by_depth, sums,
+    )  # fmt: skip
     return sums.sum(), ImageGradients(depth=by_depth)
 
 
-def _lens(camera: Camera) -> np.ndarray:
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+def _masked(mask: Tensor | None, like: Tensor) -> tuple[Tensor, int]:
+    """Return a mask as kernels take it, and whether there is one."""
+    return (like.new_empty(0, dtype=torch.bool), 0) if mask is None else (mask, 1)
 
 
 def _packed(values: np.ndarray) -> CameraValues:
@@ -206,91 +159,20 @@ def _packed(values: np.ndarray) -> CameraValues:
 # number that the host waits for is that of the tile intersections of the depth query.
 
 
-class DeviceImages(Protocol):
-    """What the terms read of a rendered view; contiguous float32 tensors."""
-
-    @property
-    def depth(self) -> Tensor:
-        """(h, w)."""
-
-    @property
-    def geometric_normal(self) -> Tensor:
-        """(h, w, 3) blended, scene frame."""
-
-    @property
-    def alpha(self) -> Tensor:
-        """(h, w)."""
-
-
-@dataclass(frozen=True)
-class DeviceImageGradients:
-    """Gradient of the terms with respect to the images of the rendered view."""
-
-    depth: Tensor  # (h, w) float32
-    geometric_normal: Tensor  # (h, w, 3) float32
-
-
-@dataclass(frozen=True)
-class DeviceMultiViewLoss:
-    """The weighted sum of both terms and its gradients; all on the device."""
-
-    value: Tensor
-    """() float64."""
-    gradients: DeviceImageGradients
-    other: dict[str, Tensor] | None
-    """On means, log_scales, quats and opacity_logits of all Gaussians, through the other view's
-    depth; ``None`` where the geometric term has no weight."""
-    figures: DeviceMultiViewMetrics
-
-
-@dataclass(frozen=True)
-class DeviceMultiViewMetrics:
-    """Values of the terms and pixel counts, () tensors; see ``MultiViewMetrics``."""
-
-    photometric: Tensor
-    geometric: Tensor
-    chosen: Tensor
-    valid: Tensor
-    kept: Tensor
-
-
 def device_multi_view_losses(
-    kernels: Kernels,
-    images: DeviceImages,
-    gaussians: OrientedGaussians,
-    shown: PhotoView,
-    other: PhotoView,
-    settings: MultiViewOptions,
-    random: np.random.Generator,
-) -> DeviceMultiViewLoss:
-    """Compare a rendered view with the photo and the depth of another view.
+    kernels: Kernels, images: DeviceView, gaussians: OrientedGaussians, shown: PhotoView,
+    other: PhotoView, settings: MultiViewOptions, random: np.random.Generator,
+) -> MultiViewLoss:  # fmt: skip
+    """Compare a rendered view with the photo and the depth of another view, on a device.
 
     The definition, the sampled pixels and the numbers drawn are those of
     :func:`~.multi_view.multi_view_losses`. Bitwise reproducible on the same GPU.
 
-    Parameters
-    ----------
-    kernels : Kernels
-        Of the tensors' device.
-    images : DeviceImages
-        Rendered with depth.
-    gaussians : OrientedGaussians
-        Rendered Gaussians, scene frame.
-    shown, other : PhotoView
-        The rendered view's and another; sizes may differ.
-    settings : MultiViewOptions
-    random : numpy Generator
-        ``settings.pixels`` numbers are drawn, none where all pixels are taken.
-
     Raises
     ------
-    UsageError
-        If the size of a photo or mask differs from its camera's, or a photo is not uint8.
     ResourceError
         If the tile lists are too long to be indexed.
     """
-    _check(shown.camera, shown.photo, shown.mask, images.depth)
-    _check(other.camera, other.photo, other.mask)
     options = RenderOptions(sh_degree=0)
     grey, other_grey = (grey_on_device(kernels, view.photo) for view in (shown, other))
     # A null pointer is no mask.
@@ -329,26 +211,17 @@ def device_multi_view_losses(
         on_other = project_query_gradients(view, depths, grad_params)
     else:
         on_positions = torch.zeros_like(positions)
-    gradients = DeviceImageGradients(torch.zeros_like(depth), torch.zeros_like(normals))
-    kernels.launch_each(
-        "finish_pixels",
-        len(pixels),
-        pixels,
-        depth,
-        normals,
-        weights,
-        shares,
-        depth_slopes,
-        normal_slopes,
-        by_positions,
-        on_positions,
-        position_slopes,
-        gradients.depth,
-        gradients.geometric_normal,
+    gradients = ImageGradients(
+        depth=torch.zeros_like(depth), geometric_normal=torch.zeros_like(normals)
     )
-    figures = DeviceMultiViewMetrics(means[0], means[1], (pixels >= 0).sum(), counts[1], counts[0])
+    kernels.launch_each(
+        "finish_pixels", len(pixels), pixels, depth, normals, weights, shares, depth_slopes,
+        normal_slopes, by_positions, on_positions, position_slopes, gradients.depth,
+        gradients.geometric_normal,
+    )  # fmt: skip
+    figures = MultiViewMetrics(means[0], means[1], (pixels >= 0).sum(), counts[1], counts[0])
     value = factors[0] * means[0] + factors[1] * means[1]
-    return DeviceMultiViewLoss(value, gradients, on_other, figures)
+    return MultiViewLoss(value, gradients, on_other, figures)
 
 
 def grey_on_device(kernels: Kernels, photo: Tensor) -> Tensor:
@@ -361,26 +234,13 @@ def grey_on_device(kernels: Kernels, photo: Tensor) -> Tensor:
 
 
 def choose_on_device(
-    kernels: Kernels,
-    grey: Tensor,
-    depth: Tensor,
-    mask: Tensor,
-    count: int,
+    kernels: Kernels, grey: Tensor, depth: Tensor, mask: Tensor, count: int,
     random: np.random.Generator,
-) -> Tensor:
-    """Sample the pixels that ``pixel_choice.choose_pixels`` samples.
+) -> Tensor:  # fmt: skip
+    """Sample the pixels of :func:`~.multi_view.choose_pixels`, with the same random numbers.
 
-    Parameters
-    ----------
-    grey, depth : (h, w) float32
-    mask : (h, w) bool, or (0,) for none
-    random : numpy Generator
-        ``count`` numbers are drawn; none if ``count`` is not less than the number of pixels.
-
-    Returns
-    -------
-    (m,) int32
-        ``row * width + column`` or -1; m is ``count`` or, if smaller, the number of pixels.
+    ``mask`` is (h, w) bool, or (0,) for none. Returns (m,) int32, ``row * width + column`` or -1; m
+    is ``count`` or, if smaller, the number of pixels.
     """
     height, width = grey.shape
     takes_all = count >= grey.numel()
@@ -390,17 +250,9 @@ def choose_on_device(
     block = max(height, width) if takes_all else BLOCK_PX
     steepness = torch.empty(grey.numel(), device=grey.device)  # by place
     kernels.launch_each(
-        "measure_pixels",
-        grey.numel(),
-        width,
-        height,
-        block,
-        BORDER_PX,
-        grey,
-        depth,
-        mask,
+        "measure_pixels", grey.numel(), width, height, block, BORDER_PX, grey, depth, mask,
         steepness,
-    )
+    )  # fmt: skip
     usable = steepness >= 0.0
     if takes_all:
         places = torch.arange(len(steepness), dtype=torch.int32, device=grey.device)
@@ -434,17 +286,9 @@ class _Pair:
         positions = depth.new_empty((len(self.pixels), 2))
         slopes = torch.empty_like(positions, dtype=torch.float64)
         self.kernels.launch_each(
-            "lift_points",
-            len(self.pixels),
-            self.pixels,
-            self.width,
-            depth,
-            self.camera,
-            self.pair,
-            other_mask,
-            positions,
-            slopes,
-        )
+            "lift_points", len(self.pixels), self.pixels, self.width, depth, self.camera, self.pair,
+            other_mask, positions, slopes,
+        )  # fmt: skip
         return positions, slopes
 
     def reproject(self, positions: Tensor, found: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -454,67 +298,25 @@ class _Pair:
         noise, weights, by_found = found.new_empty((3, count), dtype=torch.float64).unbind()
         by_positions = found.new_empty((count, 2), dtype=torch.float64)
         self.kernels.launch_each(
-            "return_points",
-            count,
-            self.pixels,
-            self.width,
-            positions,
-            found,
-            self.camera,
-            self.pair,
-            noise,
-            weights,
-            by_found,
-            by_positions,
-        )
+            "return_points", count, self.pixels, self.width, positions, found, self.camera,
+            self.pair, noise, weights, by_found, by_positions,
+        )  # fmt: skip
         return noise, weights, by_found, by_positions
 
     def compare(
-        self,
-        noise: Tensor,
-        images: tuple[Tensor, Tensor, Tensor],
-        greys: tuple[Tensor, Tensor],
-        masks: tuple[Tensor, Tensor],
-        settings: MultiViewOptions,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        self, noise: Tensor, images: tuple[Tensor, Tensor, Tensor], greys: tuple[Tensor, Tensor],
+        masks: tuple[Tensor, Tensor], settings: MultiViewOptions,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
         """Return states (m,), errors (m,), their derivatives by depth (m,) and normal (m, 3)."""
         count, height = len(self.pixels), images[0].shape[0]
         states = torch.empty(count, dtype=torch.uint8, device=noise.device)
         errors, by_depth = noise.new_empty((2, count)).unbind()
         by_normals = noise.new_empty((count, 3))
         self.kernels.launch(
-            "compare_patches",
-            -(-count // WARPS),
-            count,
-            self.pixels,
-            noise,
-            self.width,
-            height,
-            *images,
-            self.camera,
-            self.pair,
-            *greys,
-            *masks,
-            int(settings.correlation == "squared"),
-            settings.patch_sizes,
-            ctypes.c_double(settings.max_rise),
-            ctypes.c_double(SAMPLES * settings.min_contrast**2),
-            states,
-            errors,
-            by_depth,
+            "compare_patches", -(-count // WARPS), count, self.pixels, noise, self.width, height,
+            *images, self.camera, self.pair, *greys, *masks, int(settings.correlation == "squared"),
+            settings.patch_sizes, ctypes.c_double(settings.max_rise),
+            ctypes.c_double(SAMPLES * settings.min_contrast**2), states, errors, by_depth,
             by_normals,
-        )
+        )  # fmt: skip
         return states, errors, by_depth, by_normals
-
-
-def _check(camera: Camera, photo: Tensor, mask: Tensor | None, depth: Tensor | None = None) -> None:
-    for name, image in (("photo", photo), ("mask", mask), ("image", depth)):
-        if image is not None and tuple(image.shape[:2]) != (camera.height, camera.width):
-            height, width = image.shape[:2]
-            raise UsageError(
-                f"The {name} is {width} x {height} px, the camera {camera.width} x "
-                f"{camera.height}.",
-                "Use the camera of the same level.",
-            )
-    if photo.dtype != torch.uint8:
-        raise UsageError(f"The photo is {photo.dtype}.", "Give uint8.")

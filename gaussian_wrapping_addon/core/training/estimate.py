@@ -30,7 +30,7 @@ from ..scene.camera import Camera
 from ..settings import TrainingSettings
 from ..stereo.depth_maps import least_divisor
 from .adam import adam_rows
-from .block_plan import BlockSettings
+from .block_plan import POLISH_ITERATIONS, coarse_settings
 from .schedule import Schedule
 from .start import start_budget
 
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 
 # -- Rendering speed of this machine, relative to the reference machine of the estimate -----------
-
 
 _logger = logging.getLogger(__name__)
 
@@ -136,20 +135,16 @@ def gpu_speed(index: int) -> float:
 
 def speeds(threads: int, device: str) -> tuple[float, float]:
     """Return the speeds of the processor and of the GPU that a training runs on (0: of none)."""
-    if device != "cpu":
-        return THREAD_SPEED * threads, _gpu_speed_or_reference(device)
-    return (machine_speed(threads) if renderer_is_compiled() else 1.0), 0.0
-
-
-def _gpu_speed_or_reference(device: str) -> float:
-    """Return a GPU's speed; 1 where it fails, which the training will meet as well, and tell."""
+    if device == "cpu":
+        return (machine_speed(threads) if renderer_is_compiled() else 1.0), 0.0
     try:
-        return gpu_speed(int(device.partition(":")[2] or 0))
+        on_gpu = gpu_speed(int(device.partition(":")[2] or 0))
     except (WrapError, RuntimeError) as error:
         if not is_device_failure(error):
             raise
         _logger.warning("%s could not be timed: %s", device, error)
-        return 1.0
+        on_gpu = 1.0  # the training will meet the failure as well, and tell
+    return THREAD_SPEED * threads, on_gpu
 
 
 def _scene(count: int, side_px: int) -> tuple[RawArrays, Camera]:
@@ -187,7 +182,6 @@ def _scene(count: int, side_px: int) -> tuple[RawArrays, Camera]:
 # with much background take longest per pixel. The reported range covers all of them. On a machine
 # with 14 waiting processes (3 trainings of 200 to 300 iterations, speed from its fastest pass)
 # the estimate was between 0.45 and 0.69 times the measured time, one of them above the range.
-
 
 ITERATION_S = 2.06e-3
 """Per iteration, whatever its size."""
@@ -289,7 +283,6 @@ class SceneFacts:
 class Machine:
     """Machine properties for the estimate; 0 bytes if unknown."""
 
-    threads: int
     speed: float = 1.0
     """Relative to the reference machine (:func:`~.estimate.machine_speed`)."""
     memory_bytes: int = 0
@@ -343,7 +336,7 @@ def scene_facts(scene: Scene) -> SceneFacts:
     )
 
 
-def this_machine(folder: Path, threads: int, speed: float = 1.0, gpu_speed: float = 0.0) -> Machine:
+def this_machine(folder: Path, speed: float = 1.0, gpu_speed: float = 0.0) -> Machine:
     """Return the resources free now; disk space is that of ``folder``, which need not exist yet."""
     existing = folder
     while not existing.exists() and existing != existing.parent:
@@ -352,7 +345,7 @@ def this_machine(folder: Path, threads: int, speed: float = 1.0, gpu_speed: floa
         free_bytes = shutil.disk_usage(existing).free
     except OSError:
         free_bytes = 0
-    return Machine(threads, speed, available_memory_bytes(), free_bytes, gpu_speed)
+    return Machine(speed, available_memory_bytes(), free_bytes, gpu_speed)
 
 
 def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float) -> np.ndarray:
@@ -397,38 +390,23 @@ def _trained_pixels(facts: SceneFacts, settings: TrainingSettings) -> float:
 
 
 def _seconds(
-    facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray, first: int = 0
+    facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray, first: int, on_gpu: bool
 ) -> float:
-    """Return the modelled time on the reference machine, from iteration ``first`` on."""
+    """Return the modelled time on the reference machine or GPU, from iteration ``first`` on."""
     schedule, pixels = _schedule(facts, settings), _trained_pixels(facts, settings)
-    last = settings.iterations - 1
+    compares = settings.multi_view != "off" and facts.photos > 1
     total_s = 0.0
-    for iteration, count in enumerate(counts.tolist()):
-        if iteration < first:
-            continue
-        planned = min(iteration, last)
+    for iteration, count in enumerate(counts[first:].tolist(), first):
+        planned = min(iteration, settings.iterations - 1)
         size = _window(pixels / schedule.divisor(planned) ** 2, settings.pixels_per_iteration)
+        if on_gpu:
+            total_s += GPU_ITERATION_S + size * GPU_PIXEL_S + count * GPU_GAUSSIAN_S
+            continue
         depth = schedule.uses_depth(planned)
         spent_s = size * PIXEL_S * (1.0 if depth else WITHOUT_DEPTH) + count * GAUSSIAN_S
-        compares = settings.multi_view != "off" and facts.photos > 1
         if compares and schedule.compares_views(planned):
             spent_s *= 1.0 + MULTI_VIEW_SHARE
         total_s += ITERATION_S + spent_s
-    return total_s
-
-
-def _gpu_seconds(
-    facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray, first: int
-) -> float:
-    """Return the modelled time on the reference GPU, from iteration ``first`` on."""
-    schedule, pixels = _schedule(facts, settings), _trained_pixels(facts, settings)
-    total_s = 0.0
-    for iteration, count in enumerate(counts.tolist()):
-        if iteration < first:
-            continue
-        divisor = schedule.divisor(min(iteration, settings.iterations - 1))
-        size = _window(pixels / divisor**2, settings.pixels_per_iteration)
-        total_s += GPU_ITERATION_S + size * GPU_PIXEL_S + count * GPU_GAUSSIAN_S
     return total_s
 
 
@@ -450,23 +428,11 @@ def _window(pixels: float, most: int) -> float:
 def estimate(
     scene_facts: SceneFacts, settings: TrainingSettings, machine: Machine, *, first: int = 0
 ) -> Estimate:
-    """Estimate the cost of a training.
+    """Estimate the cost of a training in one piece, from iteration ``first`` of a checkpoint on.
 
-    For settings left to the photos (``"auto"``), the range extends from "off" to "on".
-
-    Parameters
-    ----------
-    scene_facts : SceneFacts
-    settings : TrainingSettings
-    machine : Machine
-    first : int
-        Iterations already done by a checkpoint.
-
-    Returns
-    -------
-    Estimate
-        Times are those of the training alone, without camera poses, meshing and texture
-        (:data:`MESH_AND_TEXTURE_SHARE`).
+    For settings left to the photos (``"auto"``), the range extends from "off" to "on". Times are
+    those of the training alone, without camera poses, meshing and texture
+    (:data:`MESH_AND_TEXTURE_SHARE`).
     """
     decided = settings.multi_view == "auto"
     cheap = dataclasses.replace(settings, multi_view="off") if decided else settings
@@ -475,12 +441,14 @@ def estimate(
     matched = _matched_pixels(scene_facts, settings)
     matching_s = MATCHING_PIXEL_S * matched if first == 0 else 0.0
     if machine.gpu_speed:
-        iterating = [_gpu_seconds(scene_facts, settings, c, first) for c in (least, most)]
+        iterating = [_seconds(scene_facts, settings, c, first, True) for c in (least, most)]
         low_s = LOW * (iterating[0] / machine.gpu_speed + matching_s / machine.speed)
         high_s = HIGH * (iterating[1] / machine.gpu_speed + matching_s / machine.speed)
     else:
-        low_s = LOW * (_seconds(scene_facts, cheap, least, first) + matching_s) / machine.speed
-        high_s = HIGH * (_seconds(scene_facts, settings, most, first) + matching_s) / machine.speed
+        low_s = _seconds(scene_facts, cheap, least, first, False)
+        high_s = _seconds(scene_facts, settings, most, first, False)
+        low_s = LOW * (low_s + matching_s) / machine.speed
+        high_s = HIGH * (high_s + matching_s) / machine.speed
     count = math.ceil(float(most.max()))
     value_bytes = gaussian_bytes(settings)
     state_bytes = 3 * value_bytes + 20  # with both moments, filter, steps, statistics
@@ -540,7 +508,6 @@ def check_resources(expected: Estimate, machine: Machine) -> list[ReportWarning]
 
 # -- Estimate the cost of a training in blocks: coarse training, one block, joining ---------------
 
-
 PHOTOS_OVERLAP = 1.6
 """A block takes about so many times its share of the photos: those of its margin, and those that
 look into it from outside."""
@@ -553,20 +520,10 @@ along two axes, on one side each for the four blocks of a square."""
 def estimate_training(
     facts: SceneFacts, settings: TrainingSettings, machine: Machine, *, first: int = 0
 ) -> Estimate:
-    """Estimate the cost of a training, in blocks or in one piece.
+    """Estimate the cost of a training, in blocks or in one piece; see :func:`estimate`.
 
-    Parameters
-    ----------
-    facts, settings, machine
-        As for :func:`estimate`.
-    first : int
-        Iterations already done by a checkpoint of a training in one piece.
-
-    Returns
-    -------
-    Estimate
-        Of blocks the time of all of them together, one after another, and the memory of the largest
-        process.
+    Of blocks: the time of all of them together, one after another, and the memory of the largest
+    process.
 
     Raises
     ------
@@ -596,12 +553,11 @@ def block_estimates(
     facts: SceneFacts, settings: TrainingSettings, machine: Machine
 ) -> tuple[Estimate, Estimate, Estimate]:
     """Return the estimates of the coarse training, of one block, and of joining all."""
-    blocks = BlockSettings.of(settings)
-    share = min(1.0, PHOTOS_OVERLAP / blocks.blocks)
+    share = min(1.0, PHOTOS_OVERLAP / settings.blocks)
     photos = dataclasses.replace(
         facts,
         photos=max(1, math.ceil(share * facts.photos)),
-        points=math.ceil(facts.points / blocks.blocks),
+        points=math.ceil(facts.points / settings.blocks),
     )
     of_block = dataclasses.replace(
         settings,
@@ -610,21 +566,13 @@ def block_estimates(
         max_gaussians=gaussians_of_block(settings),
         dense_start="off",
     )
-    further = settings.extra_iterations + round(blocks.polish_iterations * settings.iterations)
+    further = settings.extra_iterations + round(POLISH_ITERATIONS * settings.iterations)
     joined = estimate(
         facts, dataclasses.replace(settings, extra_iterations=further, dense_start="off"), machine,
         first=settings.iterations,
     )  # fmt: skip
-    return (
-        estimate(facts, blocks.coarse(settings), machine),
-        estimate(photos, of_block, machine),
-        joined,
-    )
-
-
-def coarse_gaussians(settings: TrainingSettings) -> int:
-    """Return the largest number of Gaussians of the coarse training."""
-    return BlockSettings.of(settings).coarse(settings).max_gaussians
+    coarse = estimate(facts, coarse_settings(settings), machine)
+    return coarse, estimate(photos, of_block, machine), joined
 
 
 def gaussians_of_block(settings: TrainingSettings) -> int:

@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 
 from ..compiled import kernel
-from ..errors import UsageError
-from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
+from ..parallel import ArrayStore, run_rows
 
 # -- Adam for values of single photos: exposures, camera poses ------------------------------------
 #
 # A step moves the values of one photo only, so that each photo has its own moments and count of
 # steps, and the rate follows from how many turns a photo has.
-
 
 BETAS = (0.9, 0.99)
 """Decay rates of the moments. A photo has only some dozens of steps in a short run, and its
@@ -27,14 +25,9 @@ _STATE = ("first", "second", "steps")
 
 
 def photo_rate(
-    iteration: int,
-    iterations: int,
-    photos: int,
-    *,
-    travel: float,
-    bounds: tuple[float, float],
+    iteration: int, iterations: int, photos: int, *, travel: float, bounds: tuple[float, float],
     last_share: float,
-) -> float:
+) -> float:  # fmt: skip
     """Return the learning rate of an iteration.
 
     Parameters
@@ -54,18 +47,9 @@ def photo_rate(
 
 
 class PhotoAdam:
-    """Moments of the values of all photos.
+    """Moments, of type ``dtype``, of ``values`` values of each of ``count`` photos.
 
-    Parameters
-    ----------
-    count : int
-        Number of the scene's views.
-    values : int
-        Number of values per view.
-    dtype : numpy dtype
-        Of the moments.
-    epsilon : float
-        Added to the root of the second moment.
+    ``epsilon`` is added to the root of the second moment.
     """
 
     def __init__(self, count: int, values: int, dtype: type[np.floating], epsilon: float) -> None:
@@ -172,7 +156,6 @@ def backward_rows(
 # gains and of all offsets (at middle grey) are held at 0; otherwise colours and exposures could
 # drift against each other.
 
-
 SRGB_PEDESTAL = 0.055
 """Offset of the sRGB curve: display values plus this are a power of the light."""
 
@@ -209,13 +192,9 @@ def exposure_rate(iteration: int, iterations: int, photos: int) -> float:
     to :data:`LAST_SHARE` of that.
     """
     return photo_rate(
-        iteration,
-        iterations,
-        photos,
-        travel=TRAVEL,
-        bounds=(REFERENCE_RATE, LARGEST_RATE),
-        last_share=LAST_SHARE,
-    )
+        iteration, iterations, photos,
+        travel=TRAVEL, bounds=(REFERENCE_RATE, LARGEST_RATE), last_share=LAST_SHARE,
+    )  # fmt: skip
 
 
 class Exposure:
@@ -231,22 +210,12 @@ class Exposure:
         Initial log gains of display values plus :data:`SRGB_PEDESTAL`, as estimated by
         :mod:`.exposure_selection`; a short run then only refines them. Non-finite
         values count as 0.
-
-    Raises
-    ------
-    UsageError
-        A trained view does not exist, or the gains have the wrong shape.
     """
 
     def __init__(
         self, count: int, trained: Sequence[int], log_gains: np.ndarray | None = None
     ) -> None:
         self.trained = np.unique(np.asarray(trained, np.int64))
-        if len(self.trained) and (self.trained[0] < 0 or self.trained[-1] >= count):
-            raise UsageError(
-                f"Exposures of {count} views cannot hold view {int(self.trained[-1])}.",
-                "Number the views of the scene from 0.",
-            )
         self.values = np.zeros((count, 6), np.float32)
         """Log gains of red, green, blue, then offsets at :data:`PIVOT`; display values."""
         self.adam = PhotoAdam(count, 6, np.float32, EPSILON)
@@ -256,12 +225,7 @@ class Exposure:
         self.active = True
         """Whether steps change exposures."""
         if log_gains is not None:
-            start = np.asarray(log_gains, np.float64)
-            if start.shape != (count, 3):
-                raise UsageError(
-                    f"Gains to start from have the shape {start.shape}.", f"Give ({count}, 3)."
-                )
-            start = np.where(np.isfinite(start), start, 0.0)[self.trained]
+            start = np.where(np.isfinite(log_gains), log_gains, 0.0)[self.trained]
             self.values[self.trained, :3] = start
             self.values[self.trained, 3:] = (SRGB_PEDESTAL + PIVOT) * np.expm1(start)
         self.pin()
@@ -269,76 +233,38 @@ class Exposure:
     def corrected(
         self, view: int, color: np.ndarray, alpha: np.ndarray | None = None, *, threads: int = 0
     ) -> np.ndarray:
-        """Apply the photo's exposure to a render: ``exp(a) color + b``.
+        """Apply the photo's exposure to a render: ``exp(a) color + b``, valid until the next call.
 
-        Parameters
-        ----------
-        view : int
-        color : (h, w, 3) float32 or float64
-        alpha : (h, w), the same type, optional
-            The offset is then ``b alpha``, as for a colour blended over emptiness. For images that
-            are composited afterwards (:mod:`.background`).
-
-        Returns
-        -------
-        (h, w, 3), of the colour's type
-            Valid until the next call.
+        ``color`` is (h, w, 3) float32 or float64. With an ``alpha`` (h, w) the offset is
+        ``b alpha``, as for a colour blended over emptiness: for images that are composited
+        afterwards (:mod:`.background`).
         """
         color, alpha = self._arrays(color, alpha)
         out = self._store.take(f"corrected {color.dtype}", color.shape, color.dtype)
         gains, offsets = self.factors(view, color.dtype)
-
-        def run(begin: int, end: int) -> None:
-            apply_rows(begin, end, color, alpha, gains, offsets, out)
-
-        threads = threads or default_threads()
-        run_chunks(run, even_bounds(len(color), threads, 1), threads)
+        run_rows(apply_rows, len(color), threads, color, alpha, gains, offsets, out, chunks=1)
         return out
 
     def backward(
-        self,
-        view: int,
-        color: np.ndarray,
-        by_corrected: np.ndarray,
-        alpha: np.ndarray | None = None,
-        *,
-        threads: int = 0,
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+        self, view: int, color: np.ndarray, by_corrected: np.ndarray,
+        alpha: np.ndarray | None = None, *, threads: int = 0,
+    ) -> tuple[np.ndarray, np.ndarray | None]:  # fmt: skip
         """Return the gradients on colour and alpha; store that of the exposure for :meth:`step`.
 
-        Parameters
-        ----------
-        view, color, alpha
-            As passed to :meth:`corrected`.
-        by_corrected : (h, w, 3), of the colour's type
-            Gradient of the loss on the corrected image.
-
-        Returns
-        -------
-        by_color : (h, w, 3)
-            Valid until the next call.
-        by_alpha : (h, w) or None
-            ``None`` without alpha. Both are bitwise the same for any number of threads.
+        ``by_corrected`` (h, w, 3) is the gradient of the loss on the corrected image. The results,
+        (h, w, 3) and (h, w) or ``None`` without alpha, are valid until the next call, and bitwise
+        the same for any number of threads.
         """
         color, cover = self._arrays(color, alpha)
         by_out = np.ascontiguousarray(by_corrected, color.dtype)
-        if by_out.shape != color.shape:
-            raise UsageError(
-                f"Image {color.shape} and gradient {by_out.shape} differ in size.",
-                "Pass the gradient of the corrected image.",
-            )
         by_color = self._store.take(f"by color {color.dtype}", color.shape, color.dtype)
         by_alpha = self._store.take(f"by alpha {color.dtype}", cover.shape, color.dtype)
         gains, offsets = self.factors(view, color.dtype)
         sums = np.zeros((len(color), 6))
-
-        def run(begin: int, end: int) -> None:
-            backward_rows(
-                begin, end, color, cover, by_out, gains, offsets, by_color, by_alpha, sums
-            )
-
-        threads = threads or default_threads()
-        run_chunks(run, even_bounds(len(color), threads, 1), threads)
+        run_rows(
+            backward_rows, len(color), threads, color, cover, by_out, gains, offsets, by_color,
+            by_alpha, sums, chunks=1,
+        )  # fmt: skip
         self.gradient[:] = sums.sum(axis=0)
         # d/da of exp(a) (color - PIVOT alpha)
         self.gradient[:3] = gains * (self.gradient[:3] - PIVOT * self.gradient[3:])
@@ -368,10 +294,6 @@ class Exposure:
         value = self.values[view].astype(np.float64)
         gains = np.exp(value[:3])
         return gains.astype(dtype), (value[3:] + PIVOT * (1.0 - gains)).astype(dtype)
-
-    def spread(self) -> float:
-        """Return the standard deviation of the trained photos' log gains over all channels."""
-        return float(np.sqrt(np.mean(self.values[self.trained, :3].astype(np.float64) ** 2)))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of the arrays that the next iteration depends on, by name."""
@@ -407,19 +329,9 @@ class Exposure:
     @staticmethod
     def _arrays(color: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         color = np.ascontiguousarray(color)
-        if color.ndim != 3 or color.shape[2] != 3 or color.dtype not in _NO_ALPHA:
-            raise UsageError(
-                f"An image is {color.dtype} {color.shape}.", "Give (height, width, 3) floats."
-            )
         if alpha is None:
             return color, _NO_ALPHA[color.dtype]
-        cover = np.ascontiguousarray(alpha, color.dtype)
-        if cover.shape != color.shape[:2]:
-            raise UsageError(
-                f"Image {color.shape} and alpha {cover.shape} differ in size.",
-                "Pass the alpha of the same render.",
-            )
-        return color, cover
+        return color, np.ascontiguousarray(alpha, color.dtype)
 
 
 FIT_ROUNDS = 8
@@ -436,11 +348,13 @@ MIN_FIT_PIXELS = 64
 def fit_exposure(
     render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit gain and offset per channel of a render to a photo.
+    """Return gain and offset (3,) float64 that fit a render to a photo.
 
-    Least squares in closed form, reweighted with ``1 / max(|error|, 0.05)`` (Huber), with a weak
-    prior :data:`FIT_PRIOR_SQ` on a gain of 1. For photos whose exposure was not trained. Metrics on
-    the fitted pixels are too optimistic; report those of :func:`corrected_for_measuring`.
+    ``photo ~ gain render + offset`` for each channel, by least squares in closed form, reweighted
+    with ``1 / max(|error|, 0.05)`` (Huber), with a weak prior :data:`FIT_PRIOR_SQ` on a gain of 1;
+    1 and 0 for a channel with fewer than :data:`MIN_FIT_PIXELS` usable pixels. For photos whose
+    exposure was not trained. Metrics on the fitted pixels are too optimistic; report those of
+    :func:`corrected_for_measuring`.
 
     Parameters
     ----------
@@ -448,25 +362,9 @@ def fit_exposure(
     photo : (h, w, 3) uint8, or floats in [0, 1]
     mask : (h, w) bool, optional
         Pixels to use.
-
-    Returns
-    -------
-    gain, offset : (3,) float64
-        ``photo ~ gain render + offset``; 1 and 0 for a channel with fewer than
-        :data:`MIN_FIT_PIXELS` usable pixels.
-
-    Raises
-    ------
-    UsageError
-        If the shapes differ.
     """
     x, y = np.asarray(render, np.float64), np.asarray(photo)
     y = y / 255.0 if y.dtype == np.uint8 else y.astype(np.float64)
-    if x.shape != y.shape or (mask is not None and np.shape(mask) != x.shape[:2]):
-        raise UsageError(
-            f"Render {x.shape}, photo {y.shape} and mask differ in size.",
-            "Compare images of one camera.",
-        )
     gain, offset = np.ones(3), np.zeros(3)
     for channel in range(3):
         value = y[..., channel]
@@ -503,15 +401,8 @@ def corrected_for_measuring(
     reconstructed and not how well six numbers fit. They must be named as such: "PSNR after an
     exposure fitted crosswise on the image's halves".
 
-    Parameters
-    ----------
-    render, photo, mask
-        As for :func:`fit_exposure`. A half whose other half has too few pixels is not corrected.
-
-    Returns
-    -------
-    (h, w, 3) float32
-        In [0, 1].
+    Images are as for :func:`fit_exposure`, the result is (h, w, 3) float32 in [0, 1]. A half whose
+    other half has too few pixels is not corrected.
     """
     middle = np.shape(render)[1] // 2
     halves = (slice(None, middle), slice(middle, None))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,6 @@ from .model_selection import Decision, ModelSelection, decide, select_multi_view
 # object lit from one side and seen from both looks like an exposure if all points are taken
 # together. So the points are split spatially, gains are solved for each part alone, and the
 # consensus of the parts decides.
-
 
 NEEDED_SPREAD = 0.025
 """Robust spread of the log gains above which exposures are modelled. At middle grey such photos
@@ -89,28 +87,15 @@ class ExposureEvidence:
     spread: float
     """Robust standard deviation, over the photos, of the consensus log gain of the scene's parts;
     largest of the three channels."""
-    spread_together: float
-    """The same for gains from all points together, which one-sided shading raises too."""
-    error: float
-    """Median standard error of a log gain."""
     outliers: int
     """Number of photos whose gain is far from the median."""
     photos: int
     """Number of photos whose gain is known."""
-    points: int
-    """Number of points seen by two or more photos."""
     log_gains: np.ndarray
     """(views of the scene, 3) float64, median 0: initial values for training; 0 where unknown.
     Of display values plus :data:`.exposure.SRGB_PEDESTAL`."""
     evidence: str
     """One sentence for the report."""
-
-    def figures(self) -> dict[str, Any]:
-        """Return the numbers as plain JSON values."""
-        names = (
-            "needed", "known", "spread", "spread_together", "error", "outliers", "photos", "points"
-        )  # fmt: skip
-        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
@@ -126,21 +111,10 @@ class LogGains:
 
 
 def select_exposure(scene: Scene, photos: PhotoSource, views: Sequence[int]) -> ExposureEvidence:
-    """Decide from the colours of the sparse points whether to model exposures.
+    """Decide from the colours of the sparse points whether to model exposures of the views.
 
-    Parameters
-    ----------
-    scene : Scene
-    photos : PhotoStore
-        Sampled at a small size.
-    views : sequence of int
-        Views that are trained on.
-
-    Returns
-    -------
-    ExposureEvidence
-        ``known=False`` and ``needed=False`` with too few points: the mean brightness of photos is
-        no evidence, since they show different things.
+    With too few points, the evidence is ``known=False`` and ``needed=False``: the mean brightness
+    of photos is no evidence, since they show different things.
     """
     views = list(views)
     count = len(scene.views)
@@ -276,28 +250,14 @@ def exposure_evidence(
 ) -> ExposureEvidence:
     """Return the evidence from gains and their standard errors.
 
-    Parameters
-    ----------
-    found : LogGains
-        Gains of the photos ``views`` from all points.
-    parts : sequence of LogGains
-        The same from the points of each part of the scene.
-    views : sequence of int
-    count : int
-        Number of views of the scene.
-    points : int
-        Number of common points, for the report.
+    ``found`` are the gains of the photos ``views`` from all points, ``parts`` those from the points
+    of each part of the scene; the scene has ``count`` views, and ``points`` common points.
     """
     known = (found.points >= MIN_POINTS).all(axis=1)
     number = int(np.count_nonzero(known))
     if number < max(MIN_PHOTOS, MIN_KNOWN_SHARE * len(views)):
-        return _unknown(
-            count,
-            f"Unknown: only {number} of {len(views)} photos share enough sparse "
-            "points to be compared.",
-            photos=number,
-            points=points,
-        )
+        only = f"only {number} of {len(views)} photos share enough sparse points"
+        return _unknown(count, f"Unknown: {only} to be compared.", number)
     values = found.values[known] - np.median(found.values[known], axis=0)  # (known, 3)
     consensus = _consensus(parts, values, known)
     errors = found.errors[known]
@@ -317,9 +277,7 @@ def exposure_evidence(
         f"together {100 * _spread(values):.1f} %), and {outliers} photos differ by more than "
         f"{100 * OUTLIER_SPREADS * NEEDED_SPREAD:.1f} %."
     )
-    return ExposureEvidence(
-        needed, True, spread, _spread(values), error, outliers, number, points, log_gains, evidence
-    )
+    return ExposureEvidence(needed, True, spread, outliers, number, log_gains, evidence)
 
 
 def _consensus(parts: Sequence[LogGains], values: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -349,9 +307,8 @@ def _spread(values: np.ndarray) -> float:
     return float((1.4826 * np.median(np.abs(values), axis=0)).max())
 
 
-def _unknown(count: int, evidence: str, *, photos: int = 0, points: int = 0) -> ExposureEvidence:
-    zeros = np.zeros((count, 3))
-    return ExposureEvidence(False, False, 0.0, 0.0, 0.0, 0, photos, points, zeros, evidence)
+def _unknown(count: int, evidence: str, photos: int = 0) -> ExposureEvidence:
+    return ExposureEvidence(False, False, 0.0, 0, photos, np.zeros((count, 3)), evidence)
 
 
 def _median_of(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -381,23 +338,12 @@ def _median_gain(gain: np.ndarray, total: np.ndarray) -> np.ndarray:
 
 
 def first_decisions(
-    scene: Scene,
-    photos: PhotoSource,
-    views: Sequence[int],
-    neighbours: Mapping[int, np.ndarray],
-    settings: TrainingSettings,
-    image_size: Decision,
-) -> tuple[ModelSelection, Exposure | None]:
+    scene: Scene, photos: PhotoSource, views: Sequence[int], neighbours: Mapping[int, np.ndarray],
+    settings: TrainingSettings, image_size: Decision,
+) -> tuple[ModelSelection, Exposure | None]:  # fmt: skip
     """Decide on exposure and multi-view terms, and on growth where the settings do.
 
-    Parameters
-    ----------
-    views : sequence of int
-        Training views.
-    neighbours : mapping of int to (n,) int
-        Views beside each of them.
-    image_size : Decision
-        Made before.
+    ``views`` are those trained on, ``image_size`` was decided before.
     """
     found = select_exposure(scene, photos, views)
     selection = ModelSelection((image_size,)).with_decision(

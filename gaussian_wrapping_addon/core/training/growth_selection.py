@@ -13,7 +13,6 @@ from .model_selection import Decision
 
 # -- Choose the finest training image size: do photos hold detail that is lost at half size? ------
 
-
 DETAIL_RMS = 0.01
 """Detail, relative to full brightness, below which halving loses nothing: if half the size
 reproduces the photo with 40 dB, training, which reaches 20 to 35 dB, cannot tell them apart."""
@@ -191,7 +190,6 @@ def _blocks(values: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
 
 # -- Decide when to stop densification: error reduction per doubling of the Gaussians -------------
 
-
 MIN_GAIN_DB = 0.2
 """Growth stops if twice the Gaussians would lower the error of the training photos by less than
 this. Twice the Gaussians cost up to twice the time. Gains fall with each doubling; if each is about
@@ -277,7 +275,6 @@ class ErrorHistory:
 
         Parameters
         ----------
-        iteration, view, gaussians : int
         mean_squared : float
             Mean squared colour error of the photo, before the step.
         divisor : int

@@ -54,26 +54,18 @@ class Stepper:
 
     Parameters
     ----------
-    photos : PhotoStore
-    schedule : Schedule
     views : sequence of int
         Training views.
     neighbours : dict of int to (k,) array
         For each training view, the views that the multi-view terms compare it with.
     backend : Backend
         Computes; the samples drawn do not depend on it.
-    threads : int
     """
 
     def __init__(
-        self,
-        photos: PhotoSource,
-        schedule: Schedule,
-        views: Sequence[int],
-        neighbours: dict[int, np.ndarray],
-        backend: Backend,
-        threads: int,
-    ) -> None:
+        self, photos: PhotoSource, schedule: Schedule, views: Sequence[int],
+        neighbours: dict[int, np.ndarray], backend: Backend, threads: int,
+    ) -> None:  # fmt: skip
         self.photos, self.schedule, self.views = photos, schedule, list(views)
         self.settings, self.threads = schedule.settings, threads
         self.neighbours, self.backend = neighbours, backend
@@ -139,12 +131,8 @@ class Stepper:
         if other is not None:
             seen = backend.merged(seen, other, len(adam))
         if gathers:
-            part = (
-                sample.camera.width
-                * sample.camera.height
-                / (sample.whole.width * sample.whole.height)
-            )
-            whole = sample.whole
+            whole, shown = sample.whole, sample.camera
+            part = shown.width * shown.height / (whole.width * whole.height)
             backend.add_statistics(state.statistics, image, whole.width, whole.height, part)
         rates = schedule.rates(iteration, state.rate_factor)
         if not oriented:
@@ -203,13 +191,10 @@ class Stepper:
         """Return the colour loss, its gradients on colour and alpha, and the mean squared error."""
         empty = self.settings.mask_mode == "background"
         return self.backend.compare_colors(
-            image,
-            sample.shown,
-            self.settings.lambda_dssim,
+            image, sample.shown, self.settings.lambda_dssim,
             exposure=None if state.exposure is None else (state.exposure, sample.view),
-            background=draw_background(state.random) if empty else None,
-            over_emptiness=empty,
-        )
+            background=draw_background(state.random) if empty else None, over_emptiness=empty,
+        )  # fmt: skip
 
     def _compares_views(self, state: TrainingState, sample: _Sample) -> bool:
         if not state.model_selection.chose("multi_view") or len(self.neighbours[sample.view]) == 0:
@@ -222,15 +207,11 @@ class Stepper:
         choices = self.neighbours[sample.view]
         other = int(choices[int(state.random.integers(len(choices)))])
         return self.backend.compare_views(
-            image,
-            state.adam,
-            sample.camera,
-            sample.shown,
+            image, state.adam, sample.camera, sample.shown,
             self.photos.camera(other, sample.divisor),
-            self.backend.shown(self.photos, other, sample.divisor, None),
-            self.multi_view,
+            self.backend.shown(self.photos, other, sample.divisor, None), self.multi_view,
             state.random,
-        )
+        )  # fmt: skip
 
 
 def trimmed(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:

@@ -25,6 +25,7 @@ from ..render.types import Renderer, RenderOptions
 from ..render.view_renderer import ViewRenderer
 from ..scene.scene import PhotoSource, evenly_spaced
 from ..settings import TrainingSettings
+from .exposure import corrected_for_measuring
 from .state import HeldOutMetrics
 
 _logger = logging.getLogger(__name__)
@@ -46,9 +47,6 @@ GAP_PX = 4
 
 TOO_SMALL = "The photos are too small for LPIPS."
 
-Correction = Callable[[np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
-"""Maps a (h, w, 3) render to the exposure of a (h, w, 3) uint8 photo, within a mask."""
-
 
 def divisor_for(photos: PhotoSource, index: int, longest_px: int) -> int:
     """Return the smallest divisor that brings a photo's long side to at most ``longest_px``."""
@@ -58,70 +56,46 @@ def divisor_for(photos: PhotoSource, index: int, longest_px: int) -> int:
 
 
 def measure_held_out(
-    gaussians: OrientedGaussians,
-    photos: PhotoSource,
-    held_out: Sequence[int],
-    *,
-    threads: int,
-    renderer: Renderer | None = None,
-    exposure_correction: Correction | None = None,
-    check: Callable[[], None] | None = None,
-) -> float:
-    """Return the mean PSNR of a few held-out photos at a small size.
+    gaussians: OrientedGaussians, photos: PhotoSource, held_out: Sequence[int], *, threads: int,
+    renderer: Renderer | None = None, exposed: bool = False,
+) -> float:  # fmt: skip
+    """Return the mean PSNR of a few held-out photos at a small size, dB.
 
-    Depends on the Gaussians and photos alone, so it may enter a training's history.
+    NaN without held-out photos, or if masks cover all of them. Depends on the Gaussians and photos
+    alone, so it may enter a training's history.
 
     Parameters
     ----------
-    gaussians : OrientedGaussians
-        The tensors in training; neither copied nor changed.
-    photos : PhotoStore
     held_out : sequence of int
         Held-out views; :data:`MEASURED_VIEWS` of them, evenly spread, are measured.
-    threads : int
-        The result does not depend on it.
     renderer : Renderer, optional
         Renderer to reuse; not one whose last view still awaits its backward pass.
-    exposure_correction : callable, optional
-        Applied to each render before it is measured
-        (:func:`~.exposure.corrected_for_measuring`).
-    check : callable, optional
-        Called before each view; an exception ends the measurement.
-
-    Returns
-    -------
-    float
-        dB; NaN without held-out photos, or if masks cover all of them.
+    exposed : bool
+        Whether exposures are modelled: renders are brought to those of the photos before they are
+        measured (:func:`~.exposure.corrected_for_measuring`).
     """
     renderer = renderer or ViewRenderer()
     raw = RawArrays.from_gaussians(gaussians)
     figures = []
     for view in evenly_spaced(held_out, MEASURED_VIEWS):
-        if check is not None:
-            check()
         divisor = divisor_for(photos, view, MEASURED_PX)
         mask = photos.mask(view, divisor)
         if mask is not None and not mask.any():
             continue
-        image = _rendered(renderer, raw, photos, view, divisor, threads, exposure_correction)
+        image = _rendered(renderer, raw, photos, view, divisor, threads, exposed)
         figures.append(min(psnr(image, photos.photo(view, divisor), mask), BEST_PSNR))
     return float(np.mean(figures)) if figures else float("nan")
 
 
 def _rendered(
-    renderer: Renderer,
-    raw: RawArrays,
-    photos: PhotoSource,
-    view: int,
-    divisor: int,
-    threads: int,
-    correction: Correction | None,
-) -> np.ndarray:
+    renderer: Renderer, raw: RawArrays, photos: PhotoSource, view: int, divisor: int, threads: int,
+    exposed: bool,
+) -> np.ndarray:  # fmt: skip
     options = RenderOptions(depth=False, threads=threads)
     image = renderer.render(raw, photos.camera(view, divisor), options).color
-    if correction is None:
+    if not exposed:
         return image
-    return correction(image, photos.photo(view, divisor), photos.mask(view, divisor))
+    return corrected_for_measuring(image, photos.photo(view, divisor), photos.mask(view, divisor))
 
 
 class LiveView:
@@ -129,35 +103,22 @@ class LiveView:
 
     Parameters
     ----------
-    photos : PhotoStore
-        The training's own; its cache is shared.
     held_out : sequence of int
-        Held-out views. The middle one is shown.
+        Held-out views. The middle one is shown, or ``otherwise`` without any.
     folder : Path
-        Receives :data:`PREVIEW_FILE`, :data:`PIXELS_FILE` and
-        :data:`~.preview_points.POINTS_FILE`, each replaced atomically.
+        Receives :data:`PREVIEW_FILE`, :data:`PIXELS_FILE` and :data:`~.preview_points.POINTS_FILE`,
+        each replaced atomically.
     settings : TrainingSettings
         ``preview_every_s`` is the time between two updates; 0 disables them.
-    threads : int
-    renderer : Renderer, optional
-        By default one on the processor.
-    otherwise : int
-        View to show where none is held out.
     clock : callable
         Seconds; the first update comes ``preview_every_s`` after the start.
     """
 
     def __init__(
-        self,
-        photos: PhotoSource,
-        held_out: Sequence[int],
-        folder: Path,
-        settings: TrainingSettings,
-        threads: int,
-        clock: Callable[[], float] = time.monotonic,
-        renderer: Renderer | None = None,
-        otherwise: int = 0,
-    ) -> None:
+        self, photos: PhotoSource, held_out: Sequence[int], folder: Path,
+        settings: TrainingSettings, threads: int, clock: Callable[[], float] = time.monotonic,
+        renderer: Renderer | None = None, otherwise: int = 0,
+    ) -> None:  # fmt: skip
         self._photos, self._held_out, self._folder = photos, list(held_out), folder
         self._every_s, self._threads, self._clock = settings.preview_every_s, threads, clock
         self.renderer = renderer or ViewRenderer()
@@ -170,13 +131,9 @@ class LiveView:
         return self._every_s > 0 and self._clock() - self._updated_s >= self._every_s
 
     def update(
-        self,
-        gaussians: OrientedGaussians,
-        iteration: int,
-        exposure_correction: Correction | None = None,
-        *,
-        force: bool = False,
-    ) -> dict[str, float] | None:
+        self, gaussians: OrientedGaussians, iteration: int,
+        exposed: bool = False, *, force: bool = False,
+    ) -> dict[str, float] | None:  # fmt: skip
         """Write the preview and measure the held-out photos, if due or ``force`` is set.
 
         Returns
@@ -189,25 +146,21 @@ class LiveView:
             return None
         figures = {}
         quality = measure_held_out(
-            gaussians,
-            self._photos,
-            self._held_out,
-            threads=self._threads,
-            renderer=self.renderer,
-            exposure_correction=exposure_correction,
-        )
+            gaussians, self._photos, self._held_out, threads=self._threads, renderer=self.renderer,
+            exposed=exposed,
+        )  # fmt: skip
         if np.isfinite(quality):
             figures = {"held_out_psnr": quality, "held_out_iteration": float(iteration)}
-        self._write(gaussians, exposure_correction)
+        self._write(gaussians, exposed)
         # Taken after the work, so that slow updates do not run back to back.
         self._updated_s = self._clock()
         return figures
 
-    def _write(self, gaussians: OrientedGaussians, correction: Correction | None) -> None:
+    def _write(self, gaussians: OrientedGaussians, exposed: bool) -> None:
         divisor = divisor_for(self._photos, self._shown_view, (PREVIEW_PX - GAP_PX) // 2)
         raw = RawArrays.from_gaussians(gaussians)
         image = _rendered(
-            self.renderer, raw, self._photos, self._shown_view, divisor, self._threads, correction
+            self.renderer, raw, self._photos, self._shown_view, divisor, self._threads, exposed
         )
         picture = side_by_side(self._photos.photo(self._shown_view, divisor), image)
         try:
@@ -245,24 +198,13 @@ def png(picture: np.ndarray) -> bytes:
 
 
 def held_out_metrics(
-    gaussians: OrientedGaussians,
-    photos: PhotoSource,
-    names: Mapping[int, str],
-    progress: Progress,
-    *,
-    threads: int,
-    renderer: Renderer | None = None,
-    exposure_correction: Correction | None = None,
-) -> tuple[list[HeldOutMetrics], str]:
-    """Return the metrics of held-out photos, and the reason if they have no LPIPS.
+    gaussians: OrientedGaussians, photos: PhotoSource, names: Mapping[int, str], progress: Progress,
+    *, threads: int, renderer: Renderer | None = None, exposed: bool = False,
+) -> tuple[list[HeldOutMetrics], str]:  # fmt: skip
+    """Return the metrics of held-out photos, given by view and name, and why they have no LPIPS.
 
-    Parameters
-    ----------
-    names : mapping of int to str
-        Names of the held-out views.
-    exposure_correction : callable, optional
-        Where exposures are modelled: fits that of each half of a photo on the other half, as it
-        was never trained.
+    Where exposures are modelled (``exposed``), that of each half of a photo is fitted on the other
+    half, as it was never trained.
     """
     figures = []
     lpips, reason = lpips_if_ready() if names else (None, "")
@@ -272,7 +214,7 @@ def held_out_metrics(
         mask = photos.mask(view, 1)
         if mask is not None and not mask.any():
             continue
-        image = _rendered(renderer, raw, photos, view, 1, threads, exposure_correction)
+        image = _rendered(renderer, raw, photos, view, 1, threads, exposed)
         scores = score_images(image, photos.photo(view, 1), mask, lpips=lpips, threads=threads)
         figures.append(HeldOutMetrics(name, scores.psnr, scores.ssim, scores.lpips))
     if not figures or any(figure.lpips is not None for figure in figures):

@@ -4,21 +4,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..compiled import inline, kernel, part
-from ..errors import UsageError
 from ..image_metrics import compare, has_windows
-from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
+from ..parallel import ArrayStore, default_threads, run_rows
 from ..render.types import ImageGradients, VisibleGradients
 from ..scene.camera import Camera
 from ..stereo.depth_maps import DepthPrior
 
 # -- Opacity prior: what photos leave open is opaque ----------------------------------------------
-
 
 FAINT, SURE = 0.2, 0.5
 """Opacity up to which a Gaussian is left to the photos, and from which the prior counts fully."""
@@ -36,21 +33,20 @@ def add_opacity_prior(
     Parameters
     ----------
     gradients : VisibleGradients
-        The gradient is added to ``opacity_logits``, but for Gaussians whose opacity no pixel
-        asks about.
+        The gradient is added to ``opacity_logits``, but for Gaussians whose opacity no pixel asks
+        about.
     opacity_logits : (n,) float32
         Raw, of all Gaussians.
     shares : (v,) float32
-        Shares of the image in the footprints of the Gaussians that the gradient belongs to
-        (:func:`~.losses.footprint_shares`).
+        Of the Gaussians that the gradient belongs to (:func:`footprint_shares`).
     weight : float
         Setting ``lambda_opacity``.
 
     Returns
     -------
     float
-        Mean over the pixels of the sum over Gaussians of ``4 k(o)``, where ``k`` is the integral
-        of a ramp from 0 at :data:`FAINT` to 1 at :data:`SURE`.
+        Mean over the pixels of the sum over Gaussians of ``4 k(o)``, where ``k`` is the integral of
+        a ramp from 0 at :data:`FAINT` to 1 at :data:`SURE`.
     """
     # The optimizer takes a 0 for a Gaussian not seen.
     area = shares * (gradients.opacity_logits != 0.0)
@@ -65,18 +61,10 @@ def add_opacity_prior(
 
 
 def footprint_shares(boxes: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """Return the share of an image that lies in each Gaussian's box.
+    """Return the share of an image that lies in each Gaussian's box, (v,) float32.
 
-    Parameters
-    ----------
-    boxes : (v, 4) float32
-        Footprints on the screen: x0, y0, x1, y1 in pixels.
-    size_px : (int, int)
-        Width and height of the image; area outside it does not count.
-
-    Returns
-    -------
-    (v,) float32
+    ``boxes`` (v, 4) float32 are footprints on the screen: x0, y0, x1, y1 in pixels. ``size_px`` is
+    the width and height of the image; area outside it does not count.
     """
     width, height = size_px
     box = np.clip(boxes, 0.0, np.array([width, height, width, height], np.float32))  # (v, 4)
@@ -87,7 +75,7 @@ def footprint_shares(boxes: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
 def add_footprint_regulariser(
     gradients: VisibleGradients, log_scales: np.ndarray, shares: np.ndarray, weight: float
 ) -> float:
-    """Add the gradient of ``weight`` times the mean number of Gaussians over a pixel.
+    """Add the gradient of ``weight`` times the mean number of Gaussians over a pixel; return it.
 
     Blending costs time for every Gaussian whose footprint contains a pixel, visible or occluded.
     Photos alone do not penalise this: half-transparent layers that overlap a hundredfold look the
@@ -103,13 +91,6 @@ def add_footprint_regulariser(
         Raw, of all Gaussians.
     shares : (v,) float32
         Of the Gaussians that the gradient belongs to (:func:`footprint_shares`).
-    weight : float
-        Loss of one Gaussian over every pixel.
-
-    Returns
-    -------
-    float
-        Mean number of Gaussians over a pixel.
     """
     squares = np.exp(2.0 * log_scales[gradients.ids])  # (v, 3)
     squares *= (2.0 * weight * shares / squares.sum(1))[:, None]
@@ -119,14 +100,18 @@ def add_footprint_regulariser(
 
 # -- Loss on rendered depths that leave those that stereo confirmed (docs/method.md, section 3.6)
 
-
 TOLERANCE_SHARE = 0.01
 """Relative difference in depth up to which the loss is quadratic; beyond, it is linear."""
 
 OUTLIER_SHARE = 0.03
 """Relative difference from which the photos are believed: stereo misses what is thin."""
 
-_NO_MASK = np.zeros((0, 0), np.bool_)
+NO_MASK = np.zeros((0, 0), np.bool_)
+
+
+def kernel_mask(mask: np.ndarray | None) -> np.ndarray:
+    """Return a mask as kernels take it: contiguous (h, w) bool, or (0, 0) for none."""
+    return NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
 
 
 @kernel(fast=False, fused=True)
@@ -170,15 +155,9 @@ def _prior_rows(
 
 
 def depth_prior_loss(
-    depth: np.ndarray,
-    camera: Camera,
-    prior: DepthPrior,
-    mask: np.ndarray | None = None,
-    *,
-    weight: float,
-    threads: int = 0,
-    store: ArrayStore | None = None,
-) -> tuple[float, ImageGradients]:
+    depth: np.ndarray, camera: Camera, prior: DepthPrior, mask: np.ndarray | None = None, *,
+    weight: float, threads: int = 0, store: ArrayStore | None = None,
+) -> tuple[float, ImageGradients]:  # fmt: skip
     """Return ``weight mean(c h(|d / d_prior - 1| / 0.01))`` and its gradient on the depth.
 
     Parameters
@@ -191,41 +170,26 @@ def depth_prior_loss(
         Of any size; the nearest pixel counts, as interpolation would join what edges separate.
     mask : (h, w) bool, optional
         False pixels count in no term.
-
-    Returns
-    -------
-    loss : float
-    gradients : ImageGradients
-        On the depth alone.
     """
-    threads = threads or default_threads()
+    store = store or ArrayStore()
     depth = np.ascontiguousarray(depth)
-    by_depth = (
-        np.empty_like(depth)
-        if store is None
-        else store.take("by depth of the prior", depth.shape, depth.dtype)
-    )
-    flat_mask = _NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
+    by_depth = store.take("by depth of the prior", depth.shape, depth.dtype)
+    flat_mask = kernel_mask(mask)
     pixels = max(1, depth.size if mask is None else int(np.count_nonzero(flat_mask)))
     sums = np.zeros(len(depth))
-    lens, prior_lens = _lens(camera), _lens(prior.camera)
-
-    def run(begin: int, end: int) -> None:
-        _prior_rows(
-            begin, end, depth, lens, prior.depth, prior.confidence, prior_lens, flat_mask,
-            weight / pixels, sums, by_depth,
-        )  # fmt: skip
-
-    run_chunks(run, even_bounds(len(depth), threads, 1), threads)
+    run_rows(
+        _prior_rows, len(depth), threads, depth, lens_of(camera), prior.depth, prior.confidence,
+        lens_of(prior.camera), flat_mask, weight / pixels, sums, by_depth, chunks=1,
+    )  # fmt: skip
     return float(sums.sum()), ImageGradients(depth=by_depth)
 
 
-def _lens(camera: Camera) -> np.ndarray:
+def lens_of(camera: Camera) -> np.ndarray:
+    """Return fx, fy, cx, cy of a camera, (4,) float64."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
 # -- Compiled normal losses: normals of a depth map and their agreement with blended normals ------
-
 
 MIN_NORMAL_SQ = 1e-30
 """Cross products whose squared length (scene units^4) is below this give no normal."""
@@ -497,16 +461,9 @@ def agreement_rows(  # type: ignore[no-untyped-def]
             count = min(BLOCK_PX, width - first)
             _load_planes(i, first, count, depth, alpha, mask, geometric, learned, planes)
             g, o, n = _agree(
-                first,
-                count,
-                y,
-                camera,
-                rotation,
-                max_jump,
-                weight_geometric,
-                weight_learned,
+                first, count, y, camera, rotation, max_jump, weight_geometric, weight_learned,
                 planes,
-            )
+            )  # fmt: skip
             total_geometric += g
             total_learned += o
             found += n
@@ -531,37 +488,14 @@ def agreement_rows(  # type: ignore[no-untyped-def]
 # See docs/method.md, section 3.
 
 
-@dataclass
-class ColorMetrics:
-    """Image metrics from the colour loss, over unmasked values."""
-
-    l1: float
-    mean_squared: float
-    ssim: float
-
-
-@dataclass
-class NormalMetrics:
-    """Terms of the normal losses: means of ``1 - cos`` over all pixels."""
-
-    depth_normal: float
-    normal: float
-    valid_share: float
-    """Share of the pixels where the depth has a normal."""
-
-
 def color_loss(
-    image: np.ndarray,
-    photo: np.ndarray,
-    mask: np.ndarray | None = None,
-    *,
-    lambda_dssim: float = 0.2,
-    threads: int = 0,
-    store: ArrayStore | None = None,
-) -> tuple[float, np.ndarray, ColorMetrics]:
-    """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and metrics.
+    image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None, *,
+    lambda_dssim: float = 0.2, threads: int = 0, store: ArrayStore | None = None,
+) -> tuple[float, np.ndarray, float]:  # fmt: skip
+    """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and the mean squared error.
 
-    See docs/method.md, section 3.1.
+    See docs/method.md, section 3.1. The loss is 0 if the mask leaves no pixel; the gradient has the
+    image's type and, with a ``store``, is valid until the next call.
 
     Parameters
     ----------
@@ -572,30 +506,21 @@ def color_loss(
         False pixels count in no term.
     lambda_dssim : float
         Weight of the SSIM term; 0 is used if no window of SSIM fits or is unmasked.
-    store : ArrayStore, optional
-        Memory for the gradient, which is then valid until the next call.
-
-    Returns
-    -------
-    loss : float
-        0 if the mask leaves no pixel.
-    gradient : (h, w, 3), of the image's type
-    figures : ColorMetrics
 
     Raises
     ------
     UsageError
         If the shapes differ.
     """
-    threads = threads or default_threads()
+    threads, store = threads or default_threads(), store or ArrayStore()
     if not has_windows(image.shape, mask):
         lambda_dssim = 0.0
     weights = (1.0 - lambda_dssim, -lambda_dssim)
-    out = _take(store, "by color", image)
+    out = store.take("by color", image.shape, image.dtype)
     found = compare(image, photo, mask, weights=weights, threads=threads, out=out)
     assert found.gradient is not None
     value = (1.0 - lambda_dssim) * found.absolute + lambda_dssim * (1.0 - found.similarity)
-    return value, found.gradient, ColorMetrics(found.absolute, found.squared, found.similarity)
+    return value, found.gradient, found.squared
 
 
 def normals_from_depth(
@@ -621,41 +546,27 @@ def normals_from_depth(
     valid : (h, w) bool
         The pixel is not on the border and all five pixels of the cross have depth.
     """
-    threads = threads or default_threads()
-    _check_size(depth, camera)
     depth = np.ascontiguousarray(depth)
     local = np.empty((*depth.shape, 3), depth.dtype)  # camera frame
     valid = np.empty(depth.shape, np.bool_)
-    packed = _pack(camera)
-
-    def run(begin: int, end: int) -> None:
-        normal_rows(begin, end, depth, packed, max_jump, local, valid)
-
-    run_chunks(run, even_bounds(len(depth), threads, 2), threads)
+    given = (depth, lens_of(camera), max_jump, local, valid)
+    run_rows(normal_rows, len(depth), threads, *given, chunks=2)
     return local @ camera.rotation.astype(local.dtype), valid
 
 
 def normal_losses(
-    depth: np.ndarray,
-    geometric_normal: np.ndarray,
-    normal: np.ndarray,
-    alpha: np.ndarray,
-    camera: Camera,
-    mask: np.ndarray | None = None,
-    *,
-    lambda_depth_normal: float = 0.05,
-    lambda_normal: float = 0.03,
-    max_jump: float = 0.0,
-    threads: int = 0,
+    depth: np.ndarray, geometric_normal: np.ndarray, normal: np.ndarray, alpha: np.ndarray,
+    camera: Camera, mask: np.ndarray | None = None, *, lambda_depth_normal: float = 0.05,
+    lambda_normal: float = 0.03, threads: int = 0,
     store: ArrayStore | None = None,
-) -> tuple[float, ImageGradients, NormalMetrics]:
-    """Return ``lambda_DN L_DN + lambda_N L_N``, its gradients and both means.
+) -> tuple[float, ImageGradients]:  # fmt: skip
+    """Return ``lambda_DN L_DN + lambda_N L_N`` and its gradients on all images but the colour.
 
     See docs/method.md, sections 3.2 and 3.3.
 
     ``L_DN = mean(valid (1 - n_geo / alpha . n_depth))`` and ``L_N = mean(valid (1 - N . n_depth))``
     over all pixels of the image (of the mask), with the normals of :func:`normals_from_depth`.
-    Gradients flow through all terms.
+    Gradients flow through all terms; with a ``store``, they are valid until the next call.
 
     Parameters
     ----------
@@ -667,69 +578,28 @@ def normal_losses(
         Of the same size, scene frame.
     mask : (h, w) bool, optional
         False pixels count in no term.
-    store : ArrayStore, optional
-        Memory for the gradients, which are then valid until the next call.
-
-    Returns
-    -------
-    loss : float
-    gradients : ImageGradients
-        On all four images; none on the colour.
-    figures : NormalMetrics
-
-    Raises
-    ------
-    UsageError
-        If the camera's size is not the image's.
     """
-    threads = threads or default_threads()
-    _check_size(depth, camera)
+    store = store or ArrayStore()
     height, width = depth.shape
     z, cover = np.ascontiguousarray(depth), np.ascontiguousarray(alpha)
     geometric = np.ascontiguousarray(geometric_normal).reshape(height, -1)  # (h, 3 w)
     learned = np.ascontiguousarray(normal).reshape(height, -1)
-    flat_mask = _NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
+    flat_mask = kernel_mask(mask)
     pixels = max(1, height * width if mask is None else int(np.count_nonzero(flat_mask)))
     sums = np.empty((height, 3))
     by_geometric, by_learned = (
-        _take(store, name, geometric) for name in ("by geometric normal", "by normal")
+        store.take(name, geometric.shape, geometric.dtype)
+        for name in ("by geometric normal", "by normal")
     )
-    by_depth, by_alpha = (_take(store, name, z) for name in ("by depth", "by alpha"))
-    packed, rotation = _pack(camera), np.ascontiguousarray(camera.rotation)
-
-    def run(begin: int, end: int) -> None:
-        agreement_rows(
-            begin, end, z, packed, rotation, flat_mask, geometric, learned, cover, max_jump,
-            lambda_depth_normal / pixels, lambda_normal / pixels, sums,
-            by_depth, by_geometric, by_learned, by_alpha,
-        )  # fmt: skip
-
-    run_chunks(run, even_bounds(height, threads, 1), threads)
-    depth_normal, oriented, share = (sums.sum(0) / pixels).tolist()
+    by_depth, by_alpha = (store.take(name, z.shape, z.dtype) for name in ("by depth", "by alpha"))
+    run_rows(
+        agreement_rows, height, threads, z, lens_of(camera), np.ascontiguousarray(camera.rotation),
+        flat_mask, geometric, learned, cover, 0.0, lambda_depth_normal / pixels,
+        lambda_normal / pixels, sums, by_depth, by_geometric, by_learned, by_alpha, chunks=1,
+    )  # fmt: skip
+    depth_normal, oriented, _ = (sums.sum(0) / pixels).tolist()
     value = lambda_depth_normal * depth_normal + lambda_normal * oriented
-    gradients = ImageGradients(
+    return value, ImageGradients(
         normal=by_learned.reshape(height, width, 3),
-        geometric_normal=by_geometric.reshape(height, width, 3),
-        alpha=by_alpha,
-        depth=by_depth,
-    )
-    return value, gradients, NormalMetrics(depth_normal, oriented, share)
-
-
-def _take(store: ArrayStore | None, name: str, like: np.ndarray) -> np.ndarray:
-    if store is None:
-        return np.empty(like.shape, like.dtype)
-    return store.take(name, like.shape, like.dtype)
-
-
-def _check_size(depth: np.ndarray, camera: Camera) -> None:
-    height, width = depth.shape
-    if (height, width) != (camera.height, camera.width):
-        raise UsageError(
-            f"The depth map is {width} x {height} px, the camera {camera.width} x {camera.height}.",
-            "Use the camera that rendered it.",
-        )
-
-
-def _pack(camera: Camera) -> np.ndarray:
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        geometric_normal=by_geometric.reshape(height, width, 3), alpha=by_alpha, depth=by_depth,
+    )  # fmt: skip

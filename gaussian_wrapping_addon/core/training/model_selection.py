@@ -23,7 +23,6 @@ from .camera_poses import LEAST_VIEWS, CameraPoses
 # of the model is enabled by evidence from the photos, records that evidence, and can be
 # overridden by a setting.
 
-
 ON, OFF = "on", "off"
 
 
@@ -147,15 +146,9 @@ def decide(
 def select_multi_view(neighbours: Sequence[np.ndarray], setting: str = "auto") -> Decision:
     """Decide whether the multi-view terms are used (docs/method.md, section 3.4).
 
-    They compare a photo with one taken from a nearby pose, and are on if any photo has such a
-    neighbour: photos without one skip them at no cost. Without any neighbour they stay off,
-    whatever the setting, as there is nothing to compare.
-
-    Parameters
-    ----------
-    neighbours : sequence of (k,) int arrays
-        Neighbours of each training view.
-    setting : str
+    They compare a photo with one taken from a nearby pose, and are on if any of the training views
+    has ``neighbours``: photos without one skip them at no cost. Without any neighbour they stay
+    off, whatever the setting, as there is nothing to compare.
     """
     count = len(neighbours)
     paired = sum(len(of_view) > 0 for of_view in neighbours)
@@ -180,7 +173,6 @@ def select_multi_view(neighbours: Sequence[np.ndarray], setting: str = "auto") -
 
 # -- Whether camera poses are refined (docs/method.md, section 1.8) -------------------------------
 
-
 LEAST_SHIFT_PX = 0.25
 """Median shift from which given poses count as inexact. Noise alone moves exact ones by 0.12."""
 
@@ -190,20 +182,18 @@ def start_poses(
 ) -> tuple[CameraPoses | None, ModelSelection]:
     """Return poses to refine, if any, and the decisions with this one where nothing is to measure.
 
-    Parameters
-    ----------
-    setting : str
-        ``"on"``, ``"off"``, or ``"auto"``: only after a dense start. From sparse points Gaussians
-        are in the wrong places at first, and cameras would follow them.
-    views : sequence of int
-        Training views.
+    The setting ``"auto"`` refines them only after a dense start: from sparse points Gaussians are
+    in the wrong places at first, and cameras would follow them.
     """
-    decision = None
+    missing = ""
+    if len(views) < LEAST_VIEWS:
+        missing = f"Not tried: fewer than {LEAST_VIEWS} photos to train on."
+    elif setting == "auto" and not model_selection.chose("dense_start"):
+        missing = "Not tried: training did not start on surfaces found by matching photos."
     if setting == "off":
-        decision = Decision.by_settings("refine_poses", "off")
-    elif missing := _missing(setting, views, model_selection):
+        return None, model_selection.with_decision(Decision.by_settings("refine_poses", "off"))
+    if missing:
         decision = Decision("refine_poses", setting, "off", missing, measured=False)
-    if decision is not None:
         return None, model_selection.with_decision(decision)
     given = np.array([view.camera.cam_from_world for view in scene.views], np.float64)
     if setting == "on":
@@ -211,26 +201,11 @@ def start_poses(
     return CameraPoses(given, views), model_selection
 
 
-def _missing(setting: str, views: Sequence[int], model_selection: ModelSelection) -> str:
-    """Return what poses cannot be refined for, or nothing."""
-    if len(views) < LEAST_VIEWS:
-        return f"Not tried: fewer than {LEAST_VIEWS} photos to train on."
-    if setting == "auto" and not model_selection.chose("dense_start"):
-        return "Not tried: training did not start on surfaces found by matching photos."
-    return ""
-
-
 def select_poses(poses: CameraPoses, cameras: Mapping[int, Camera], means: np.ndarray) -> Decision:
     """Decide whether refined poses differ from those given, and give them up if not.
 
     Poses that photos move at random only are better as they were: what moves them is noise.
-
-    Parameters
-    ----------
-    cameras : mapping of int to Camera
-        Of the training photos.
-    means : (n, 3) array
-        Of the Gaussians, scene frame.
+    ``cameras`` are the training photos', ``means`` (n, 3) the Gaussians', scene frame.
     """
     shift_px = float(np.median(poses.shifts_px(cameras, means)))
     needed = shift_px >= LEAST_SHIFT_PX

@@ -12,8 +12,7 @@ import numpy as np
 
 from .. import limits
 from ..compiled import kernel
-from ..errors import UsageError
-from ..parallel import ArrayStore, default_threads, even_bounds, run_chunks
+from ..parallel import ArrayStore, run_rows
 from ..render.depth_query import (
     QueryResult,
     QueryView,
@@ -26,12 +25,11 @@ from ..render.types import ImageGradients, RenderOptions, VisibleGradients
 from ..render.view_renderer import ViewPass
 from ..resampling import LUMA
 from ..scene.camera import Camera
-from ..settings import CORRELATIONS, TrainingSettings
-from .adam import add_image_gradients, merge_gradients
+from ..settings import TrainingSettings
+from .losses import kernel_mask
 from .multi_view_kernels import BROKEN, KEPT, SAMPLES, compare_range, lift_range, return_range
 
 # -- Select neighbouring cameras for the multi-view terms (docs/method.md, section 3.4) -----------
-
 
 _MOST_POINTS = 2000
 """Most points for estimating the overlap of two images, subsampled from those given."""
@@ -39,39 +37,24 @@ _FEW_POINTS = 10
 """The overlap criterion is skipped for cameras that see fewer of them."""
 
 
-@dataclass(frozen=True)
-class NeighbourLimits:
-    """Criteria for candidate cameras; lengths in scene units.
+_MAX_ANGLE_DEG = 30.0
+"""Between the optical axes.
 
-    40 photos around an object are 16 to 28 degrees and 0.25 to 0.4 scene radii apart: with the
-    method's 0.3 radii 23 of 40 have no neighbour, with these all have; on a
-    capture of 50 to 80 photos every camera has eight, the nearest of which are the method's. In a
-    room, where axes differ by 28 to 101 degrees, 32 of 40 have none, with these all have. Angles
-    beyond 30 degrees would add pairs with too different views of a patch, and no camera needs them.
-    """
-
-    max_angle_deg: float = 30.0
-    """Between the optical axes."""
-    min_distance: float = 0.002 * limits.SCENE_RADIUS
-    """Between the centres: without a baseline, depth is not constrained."""
-    max_distance: float = TrainingSettings.neighbour_distance * limits.SCENE_RADIUS
-    min_overlap: float = TrainingSettings.neighbour_overlap
-    """Share of the sparse points in a camera's image that must also lie in the other's image."""
-    most: int = 8
-    """Most neighbours of each camera; the nearest are kept."""
-
-    @classmethod
-    def of_settings(cls, settings: TrainingSettings) -> NeighbourLimits:
-        """Return the limits of a training's settings."""
-        return cls(
-            max_distance=settings.neighbour_distance * limits.SCENE_RADIUS,
-            min_overlap=settings.neighbour_overlap,
-        )
+40 photos around an object are 16 to 28 degrees and 0.25 to 0.4 scene radii apart: with the method's
+0.3 radii 23 of 40 have no neighbour, with these limits all have; on a capture of 50 to 80 photos
+every camera has eight, the nearest of which are the method's. In a room, where axes differ by 28 to
+101 degrees, 32 of 40 have none, with these all have. Angles beyond 30 degrees would add pairs with
+too different views of a patch, and no camera needs them.
+"""
+_MIN_DISTANCE = 0.002 * limits.SCENE_RADIUS
+"""Between the centres, scene units: without a baseline, depth is not constrained."""
+_MOST_NEIGHBOURS = 8
+"""Of each camera; the nearest are kept."""
 
 
 def find_neighbours(
     cameras: Sequence[Camera],
-    limits: NeighbourLimits | None = None,
+    settings: TrainingSettings | None = None,
     *,
     points: np.ndarray | None = None,
 ) -> list[np.ndarray]:
@@ -85,7 +68,9 @@ def find_neighbours(
     ----------
     cameras : sequence of Camera
         Scene frame.
-    limits : NeighbourLimits, optional
+    settings : TrainingSettings, optional
+        ``neighbour_distance`` in scene radii, and ``neighbour_overlap``: the share of the sparse
+        points in a camera's image that must also lie in the other's.
     points : (n, 3) array, optional
         Sparse points, scene frame; without them the overlap criterion is skipped.
 
@@ -94,7 +79,8 @@ def find_neighbours(
     list of (k,) int64
         Indices into ``cameras``, for each camera; empty without candidates.
     """
-    limits = limits or NeighbourLimits()
+    settings = settings or TrainingSettings()
+    max_distance = settings.neighbour_distance * limits.SCENE_RADIUS
     if len(cameras) == 0:
         return []
     centers = np.stack([camera.center for camera in cameras])  # (c, 3)
@@ -106,15 +92,15 @@ def find_neighbours(
         # The arc sine of half the chord keeps small angles exact, the arc cosine does not.
         chord = np.linalg.norm(axes - axes[index], axis=1)
         angle_deg = np.degrees(2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0)))
-        good = (angle_deg < limits.max_angle_deg) & (distance > limits.min_distance)
-        good &= distance < limits.max_distance
+        good = (angle_deg < _MAX_ANGLE_DEG) & (distance > _MIN_DISTANCE)
+        good &= distance < max_distance
         good[index] = False
         here = seen[index]
         if here.sum() >= _FEW_POINTS:
-            good &= (seen & here).sum(1) >= limits.min_overlap * here.sum()
+            good &= (seen & here).sum(1) >= settings.neighbour_overlap * here.sum()
         candidates = np.flatnonzero(good)
         order = np.lexsort((candidates, angle_deg[candidates], distance[candidates]))
-        found.append(candidates[order[: limits.most]])
+        found.append(candidates[order[:_MOST_NEIGHBOURS]])
     return found
 
 
@@ -134,12 +120,10 @@ def _seen_points(cameras: Sequence[Camera], points: np.ndarray | None) -> np.nda
 
 # -- Sample the pixels for the multi-view terms: stratified, with more of them on texture ---------
 
-
 BORDER_PX = 2
 """Pixels closer to the border than this have patches that leave the image."""
 BLOCK_PX = 8
 """Pixels are traversed in blocks of this side, so that a stratum is a patch and not a line."""
-NO_MASK = np.zeros((0, 0), np.bool_)
 RED, GREEN, BLUE = LUMA
 
 
@@ -150,27 +134,16 @@ def grey_image(
 
     ``name`` is its key in ``store``.
     """
-    shape = photo.shape[:2]
-    grey = np.empty(shape, np.float32) if store is None else store.take(name, shape, np.float32)
+    grey = (store or ArrayStore()).take(name, photo.shape[:2], np.float32)
     scale = 1.0 / 255.0 if photo.dtype == np.uint8 else 1.0
-
-    def run(begin: int, end: int) -> None:
-        _grey_rows(begin, end, photo, scale, grey)
-
-    run_chunks(run, even_bounds(shape[0], threads, 2), threads)
+    run_rows(_grey_rows, len(photo), threads, photo, scale, grey, chunks=2)
     return grey
 
 
 def choose_pixels(
-    grey: np.ndarray,
-    depth: np.ndarray,
-    mask: np.ndarray | None,
-    count: int,
-    random: np.random.Generator,
-    *,
-    threads: int,
-    store: ArrayStore | None = None,
-) -> np.ndarray:
+    grey: np.ndarray, depth: np.ndarray, mask: np.ndarray | None, count: int,
+    random: np.random.Generator, *, threads: int, store: ArrayStore | None = None,
+) -> np.ndarray:  # fmt: skip
     """Sample up to ``count`` distinct pixels with depth, inside the mask; all, if it has no more.
 
     Stratified along blocks of pixels. The probability of a pixel is proportional to its brightness
@@ -194,18 +167,10 @@ def choose_pixels(
     height = len(grey)
     takes_all = count >= grey.size
     jitter = random.random(0 if takes_all else count)
-    steepness = (
-        np.empty(grey.shape, np.float32)
-        if store is None
-        else store.take("steepness", grey.shape, np.float32)
-    )
+    steepness = (store or ArrayStore()).take("steepness", grey.shape, np.float32)
     sums = np.empty((height, 2))
-    flat_mask = NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
-
-    def run(begin: int, end: int) -> None:
-        _steepness_rows(begin, end, grey, depth, flat_mask, steepness, sums)
-
-    run_chunks(run, even_bounds(height, threads, 2), threads)
+    given = (grey, depth, kernel_mask(mask), steepness, sums)
+    run_rows(_steepness_rows, height, threads, *given, chunks=2)
     steep, usable = sums.sum(0).tolist()
     if usable == 0:
         return np.zeros(0, np.int32)
@@ -232,14 +197,9 @@ def _grey_rows(begin: int, end: int, photo: np.ndarray, scale: float, grey: np.n
 
 @kernel(fast=False)
 def _steepness_rows(
-    begin: int,
-    end: int,
-    grey: np.ndarray,
-    depth: np.ndarray,
-    mask: np.ndarray,
-    steepness: np.ndarray,
-    sums: np.ndarray,
-) -> None:
+    begin: int, end: int, grey: np.ndarray, depth: np.ndarray, mask: np.ndarray,
+    steepness: np.ndarray, sums: np.ndarray,
+) -> None:  # fmt: skip
     """Write the length of the brightness gradient, -1 for pixels that cannot be chosen, and for
     each row their sum and number."""
     height, width = grey.shape
@@ -295,16 +255,6 @@ def _pick(
 # *Photometric*: the plane through the point should show the same patch in both photos. The other
 # view is not rendered: its depth is solved at the projected positions only.
 
-
-__all__ = [
-    "MultiViewLoss",
-    "MultiViewMetrics",
-    "MultiViewOptions",
-    "add_image_gradients",
-    "merge_gradients",
-    "multi_view_losses",
-]
-
 _GEOMETRY_COLUMNS = 13
 """Columns of the screen parameters that a depth depends on."""
 
@@ -327,55 +277,45 @@ class MultiViewOptions:
     weight: float = 1.0
     """Factor on both terms: n if they are evaluated in every n-th iteration."""
 
-    def __post_init__(self) -> None:
-        if self.correlation not in CORRELATIONS:
-            raise UsageError(
-                f"There is no correlation {self.correlation!r}.",
-                f"Choose one of {', '.join(CORRELATIONS)}.",
-            )
-
     @classmethod
     def of_settings(cls, settings: TrainingSettings) -> MultiViewOptions:
         """Return the options of a training's settings."""
         return cls(
-            settings.lambda_photometric,
-            settings.lambda_geometric,
-            settings.correlation,
-            settings.multi_view_pixels,
-            patch_sizes=settings.patch_sizes,
-            max_rise=settings.patch_rise,
-            min_contrast=settings.patch_contrast,
-            weight=float(settings.multi_view_every),
-        )
+            settings.lambda_photometric, settings.lambda_geometric, settings.correlation,
+            settings.multi_view_pixels, settings.patch_sizes, settings.patch_rise,
+            settings.patch_contrast, float(settings.multi_view_every),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class MultiViewMetrics:
-    """Values of the terms and pixel counts."""
+    """Values of the terms and pixel counts: numbers, or () tensors of a device."""
 
-    photometric: float
+    photometric: Any
     """Mean of ``w (1 - correlation)`` over the patches kept; 0 without any."""
-    geometric: float
+    geometric: Any
     """Mean of ``w noise`` over the valid pixels, pixels; 0 without any."""
-    chosen: int
+    chosen: Any
     """Number of sampled pixels."""
-    valid: int
+    valid: Any
     """Pixels that reproject to within a pixel."""
-    kept: int
+    kept: Any
     """Pixels whose patches are compared."""
-    dropped: int
-    """Pixels and Gaussians skipped because of non-finite values."""
+    dropped: Any = 0
+    """Pixels and Gaussians skipped because of non-finite values; not counted on a device."""
 
 
 @dataclass(frozen=True)
 class MultiViewLoss:
-    """The weighted sum of both terms and its gradients."""
+    """The weighted sum of both terms and its gradients, arrays or tensors of a device."""
 
-    value: float
+    value: Any
+    """float, or () float64 tensor."""
     gradients: ImageGradients
     """On ``depth`` and ``geometric_normal`` of the rendered view; none on the others."""
-    other: VisibleGradients | None
-    """On the Gaussians, through the other view's depth; ``None`` without such a contribution."""
+    other: Any
+    """On the Gaussians, through the other view's depth: :class:`VisibleGradients`, or of a device a
+    dict of tensors by name; ``None`` without such a contribution."""
     figures: MultiViewMetrics
 
 
@@ -390,62 +330,31 @@ class PhotoView:
 
 
 def multi_view_losses(
-    image: ViewPass,
-    gaussians: RawArrays,
-    shown: PhotoView,
-    other: PhotoView,
-    settings: MultiViewOptions,
-    random: np.random.Generator,
-    *,
-    threads: int = 0,
+    image: ViewPass, gaussians: RawArrays, shown: PhotoView, other: PhotoView,
+    settings: MultiViewOptions, random: np.random.Generator, *, threads: int = 0,
     store: ArrayStore | None = None,
-) -> MultiViewLoss:
+) -> MultiViewLoss:  # fmt: skip
     """Compare a rendered view with the photo and the depth of another view.
 
     ``weight (lambda_photometric mean(w (1 - ncc)) + lambda_geometric mean(w noise))`` with
     ``w = exp(-noise)`` treated as constant (docs/method.md, section 3.4). A pixel is valid where
     both depths exist, both masks include it and the noise is below one pixel; its patch is kept
-    where the plane is not seen edge-on, all samples are inside both images and masks, neither patch
-    is flat, and ``1 - ncc < 0.9``.
+    where the plane is not seen edge-on, all samples are inside both images and masks, neither
+    patch is flat, and ``1 - ncc < 0.9``.
 
-    Parameters
-    ----------
-    image : ViewPass
-        Rendered with depth; any object with the same images will do.
-    gaussians : RawArrays
-        Rendered Gaussians, scene frame.
-    shown, other : PhotoView
-        The rendered view's and another; sizes may differ.
-    settings : MultiViewOptions
-    random : numpy Generator
-        ``settings.pixels`` numbers are drawn, none where all pixels are taken.
-    threads : int
-        The result does not depend on it.
-    store : ArrayStore, optional
-        Memory for the gradients on images, which are then valid until the next call.
-
-    Returns
-    -------
-    MultiViewLoss
-
-    Raises
-    ------
-    UsageError
-        If the size of a photo or mask differs from its camera's.
+    ``image`` is rendered with depth, of ``gaussians`` in the scene frame. ``settings.pixels``
+    numbers are drawn, none where all pixels are taken. The result does not depend on ``threads``;
+    with a ``store``, gradients on images are valid until the next call.
     """
-    threads = threads or default_threads()
-    store = ArrayStore() if store is None else store
-    camera, mask = shown.camera, shown.mask
-    _check_sizes(camera, image=image.depth, photo=shown.photo, mask=mask)
-    _check_sizes(other.camera, photo=other.photo, mask=other.mask)
+    store = store or ArrayStore()
     options = RenderOptions(sh_degree=0, threads=threads)
     grey = grey_image(shown.photo, "multi-view grey", threads=threads, store=store)
     pixels = choose_pixels(
-        grey, image.depth, mask, settings.pixels, random, threads=threads, store=store
+        grey, image.depth, shown.mask, settings.pixels, random, threads=threads, store=store
     )
-    pair = _ViewPair(image, camera, other.camera, pixels, options.near_z, threads)
-    kept_there = NO_MASK if other.mask is None else np.ascontiguousarray(other.mask, np.bool_)
-    positions, position_slopes = pair.lift(kept_there)
+    pair = _ViewPair(image, shown.camera, other.camera, pixels, options.near_z, threads)
+    other_mask = kernel_mask(other.mask)
+    positions, position_slopes = pair.lift(other_mask)
     by_depth = store.zeros("multi-view by depth", image.depth.shape, np.float32)
     by_normal = store.zeros("multi-view by normal", image.geometric_normal.shape, np.float32)
     on_images = ImageGradients(depth=by_depth, geometric_normal=by_normal)
@@ -461,20 +370,13 @@ def multi_view_losses(
     weights = np.where(valid, np.exp(-noise), 0.0)
     lambda_photometric = settings.weight * settings.lambda_photometric
     lambda_geometric = settings.weight * settings.lambda_geometric
-
+    other_grey = grey_image(other.photo, "multi-view other grey", threads=threads, store=store)
     states, errors, depth_slopes, normal_slopes = pair.compare(
-        noise,
-        grey,
-        grey_image(other.photo, "multi-view other grey", threads=threads, store=store),
-        NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_),
-        kept_there,
-        settings.correlation == "squared",
-        settings.patch_sizes,
-        settings.max_rise,
-        SAMPLES * settings.min_contrast**2,
+        noise, (grey, other_grey), (kernel_mask(shown.mask), other_mask), settings
     )
     kept = states == KEPT
-    photometric, geometric = _mean(weights * errors, kept), _mean(weights * _finite(noise), valid)
+    photometric = _mean(weights * errors, kept)
+    geometric = _mean(weights * np.where(valid, noise, 0.0), valid)
     share = lambda_photometric * weights / max(1, int(kept.sum()))
     pixel_depth = share * depth_slopes  # (m,)
     pixel_normal = share[:, None] * normal_slopes  # (m, 3)
@@ -488,13 +390,9 @@ def multi_view_losses(
     rows = pixels[sound]
     by_depth.reshape(-1)[rows] = pixel_depth[sound]
     by_normal.reshape(-1, 3)[rows] = pixel_normal[sound]
+    dropped = int((~sound | (states == BROKEN)).sum()) + broken
     figures = MultiViewMetrics(
-        photometric,
-        geometric,
-        len(pixels),
-        int(valid.sum()),
-        int(kept.sum()),
-        int((~sound | (states == BROKEN)).sum()) + broken,
+        photometric, geometric, len(pixels), int(valid.sum()), int(kept.sum()), dropped
     )
     value = lambda_photometric * photometric + lambda_geometric * geometric
     return MultiViewLoss(value, on_images, on_other, figures)
@@ -504,34 +402,24 @@ class _ViewPair:
     """Two views and the sampled pixels of the first, packed for the kernels."""
 
     def __init__(
-        self,
-        image: ViewPass,
-        camera: Camera,
-        other: Camera,
-        pixels: np.ndarray,
-        near_z: float,
+        self, image: ViewPass, camera: Camera, other: Camera, pixels: np.ndarray, near_z: float,
         threads: int,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.image, self.pixels, self.near_z, self.threads = image, pixels, near_z, threads
         self.rotation = np.ascontiguousarray(camera.rotation)
         self.camera, self.other = _pack(camera), _pack(other)
         turn = other.rotation @ camera.rotation.T  # (3, 3) other camera from this one
         shift = other.cam_from_world[:, 3] - turn @ camera.cam_from_world[:, 3]
         self.pose = np.concatenate([turn, shift[:, None]], 1)  # (3, 4)
-        self.bounds = even_bounds(len(pixels), threads)
 
     def lift(self, other_mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return positions in the other view (m, 2) float32, and their derivatives by depth."""
         count = len(self.pixels)
         positions, position_slopes = np.empty((count, 2), np.float32), np.empty((count, 2))
-
-        def run(begin: int, end: int) -> None:
-            lift_range(
-                begin, end, self.pixels, self.image.depth, self.camera, self.other, self.pose,
-                self.near_z, other_mask, positions, position_slopes,
-            )  # fmt: skip
-
-        run_chunks(run, self.bounds, self.threads)
+        run_rows(
+            lift_range, count, self.threads, self.pixels, self.image.depth, self.camera, self.other,
+            self.pose, self.near_z, other_mask, positions, position_slopes,
+        )  # fmt: skip
         return positions, position_slopes
 
     def reproject(
@@ -540,43 +428,27 @@ class _ViewPair:
         """Return noise (m,), its derivatives by the other view's depth (m,) and position (m, 2)."""
         count = len(self.pixels)
         noise, by_found, by_positions = np.empty(count), np.empty(count), np.empty((count, 2))
-        width = self.image.depth.shape[1]
-
-        def run(begin: int, end: int) -> None:
-            return_range(
-                begin, end, self.pixels, width, positions, found, self.camera, self.other,
-                self.pose, self.near_z, noise, by_found, by_positions,
-            )  # fmt: skip
-
-        run_chunks(run, self.bounds, self.threads)
+        run_rows(
+            return_range, count, self.threads, self.pixels, self.image.depth.shape[1], positions,
+            found, self.camera, self.other, self.pose, self.near_z, noise, by_found, by_positions,
+        )  # fmt: skip
         return noise, by_found, by_positions
 
     def compare(
-        self,
-        noise: np.ndarray,
-        grey: np.ndarray,
-        other_grey: np.ndarray,
-        mask: np.ndarray,
-        other_mask: np.ndarray,
-        squared: bool,
-        sizes: int,
-        max_rise: float,
-        min_spread: float,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        self, noise: np.ndarray, greys: tuple[np.ndarray, np.ndarray],
+        masks: tuple[np.ndarray, np.ndarray], settings: MultiViewOptions,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """Return states (m,), errors (m,), their derivatives by depth (m,) and normal (m, 3)."""
         count, image = len(self.pixels), self.image
         states, errors = np.empty(count, np.uint8), np.empty(count)
         by_depth, by_normals = np.empty(count), np.empty((count, 3))
-
-        def run(begin: int, end: int) -> None:
-            compare_range(
-                begin, end, self.pixels, noise, image.depth, image.geometric_normal, image.alpha,
-                self.rotation, self.camera, self.other, self.pose, self.near_z, grey, other_grey,
-                mask, other_mask, squared, sizes, max_rise, min_spread, states, errors, by_depth,
-                by_normals,
-            )  # fmt: skip
-
-        run_chunks(run, self.bounds, self.threads)
+        squared, min_spread = settings.correlation == "squared", SAMPLES * settings.min_contrast**2
+        run_rows(
+            compare_range, count, self.threads, self.pixels, noise, image.depth,
+            image.geometric_normal, image.alpha, self.rotation, self.camera, self.other, self.pose,
+            self.near_z, *greys, *masks, squared, settings.patch_sizes, settings.max_rise,
+            min_spread, states, errors, by_depth, by_normals,
+        )  # fmt: skip
         return states, errors, by_depth, by_normals
 
 
@@ -602,22 +474,6 @@ def _mean(values: np.ndarray, where: np.ndarray) -> float:
     return float(values[where].sum() / max(1, int(where.sum())))
 
 
-def _finite(noise: np.ndarray) -> np.ndarray:
-    return np.where(noise < np.inf, noise, 0.0)
-
-
 def _pack(camera: Camera) -> np.ndarray:
     values = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     return np.array(values, np.float64)
-
-
-def _check_sizes(camera: Camera, **arrays: np.ndarray | None) -> None:
-    wanted = (camera.height, camera.width)
-    for name, array in arrays.items():
-        if array is not None and array.shape[:2] != wanted:
-            height, width = array.shape[:2]
-            raise UsageError(
-                f"The {name} is {width} x {height} px, the camera {camera.width} x "
-                f"{camera.height}.",
-                "Use the camera of the same level.",
-            )

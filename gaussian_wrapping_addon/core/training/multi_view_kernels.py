@@ -40,18 +40,10 @@ def _masked(mask: Any, x: Any, y: Any) -> Any:
 
 @kernel(fast=False, fused=True)
 def lift_range(
-    begin: int,
-    end: int,
-    pixels: np.ndarray,
-    depth: np.ndarray,
-    camera: np.ndarray,
-    other: np.ndarray,
-    pose: np.ndarray,
-    near_z: float,
-    other_mask: np.ndarray,
-    positions: np.ndarray,
-    position_slopes: np.ndarray,
-) -> None:
+    begin: int, end: int, pixels: np.ndarray, depth: np.ndarray, camera: np.ndarray,
+    other: np.ndarray, pose: np.ndarray, near_z: float, other_mask: np.ndarray,
+    positions: np.ndarray, position_slopes: np.ndarray,
+) -> None:  # fmt: skip
     """Project pixels into the other view, with derivatives by their depth.
 
     Parameters
@@ -92,20 +84,10 @@ def lift_range(
 
 @kernel(fast=False, fused=True)
 def return_range(
-    begin: int,
-    end: int,
-    pixels: np.ndarray,
-    width: int,
-    positions: np.ndarray,
-    found: np.ndarray,
-    camera: np.ndarray,
-    other: np.ndarray,
-    pose: np.ndarray,
-    near_z: float,
-    noise: np.ndarray,
-    by_found: np.ndarray,
-    by_positions: np.ndarray,
-) -> None:
+    begin: int, end: int, pixels: np.ndarray, width: int, positions: np.ndarray, found: np.ndarray,
+    camera: np.ndarray, other: np.ndarray, pose: np.ndarray, near_z: float, noise: np.ndarray,
+    by_found: np.ndarray, by_positions: np.ndarray,
+) -> None:  # fmt: skip
     """Compute the reprojection error of pixels (the noise), with derivatives.
 
     Parameters

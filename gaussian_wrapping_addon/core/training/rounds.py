@@ -41,7 +41,6 @@ class Rounds:
 
     Parameters
     ----------
-    stepper : Stepper
     inside : callable, optional
         Tells which points lie in the regions that density control favours.
     progress : Progress
@@ -75,12 +74,9 @@ class Rounds:
             state.error_history.clear()  # colour errors rise when other terms are added
         if schedule.starts_orientation(iteration):
             start_orientation(
-                state.adam,
-                self._views(VOTE_DIVISOR),
-                self.stepper.renderer,
-                first_sign=self.settings.first_sign,
-                threads=self.threads,
-            )
+                state.adam, self._views(VOTE_DIVISOR), self.stepper.renderer,
+                first_sign=self.settings.first_sign, threads=self.threads,
+            )  # fmt: skip
         if self.settings.harmonics == "on":
             state.degree = schedule.sh_degree(iteration)
 
@@ -151,14 +147,10 @@ class Rounds:
             state.model_selection = state.model_selection.with_decision(evidence.decision(setting))
             stopped = setting == "auto" and not evidence.pays
         change = densify_and_prune(
-            state.adam,
-            state.statistics,
-            0 if stopped else limit,
-            state.random,
-            self._region_weights(state),
-            least_score=self.settings.densify_score,
+            state.adam, state.statistics, 0 if stopped else limit, state.random,
+            self._region_weights(state), least_score=self.settings.densify_score,
             min_opacity=self.settings.min_opacity,
-        )
+        )  # fmt: skip
         _logger.debug(
             "iteration %d: cloned %d, split %d, pruned %d Gaussians",
             state.iteration, change.cloned, change.split, change.pruned,
@@ -167,13 +159,9 @@ class Rounds:
     def _prune(self, state: TrainingState) -> None:
         """Remove the Gaussians that no training view needs."""
         needed = needed_by_a_view(
-            state.adam.gaussians().detached(),
-            self._views(PRUNE_DIVISOR),
-            self.stepper.renderer,
-            self.settings.prune_share,
-            self._region_weights(state),
-            threads=self.threads,
-        )
+            state.adam.gaussians().detached(), self._views(PRUNE_DIVISOR), self.stepper.renderer,
+            self.settings.prune_share, self._region_weights(state), threads=self.threads,
+        )  # fmt: skip
         gone = prune_contributors(state.adam, needed)
         _logger.info("iteration %d: pruned %d Gaussians", state.iteration, gone)
 

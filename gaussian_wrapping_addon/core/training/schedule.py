@@ -75,7 +75,6 @@ class Schedule:
 
     Parameters
     ----------
-    settings : TrainingSettings
     long_side_px : int
         Long side of the largest training image.
     finest : int

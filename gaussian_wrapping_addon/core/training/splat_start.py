@@ -4,12 +4,9 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,10 +24,10 @@ from ..render.types import RenderOptions
 from ..scene.camera import Camera, Similarity, quaternion_from_rotation
 from ..scene.scene import PhotoSource, Scene, evenly_spaced, usable_points
 from ..settings import TrainingSettings
+from .state import cancellable
 from .wrapping import orient
 
 # -- Similarity transforms of Gaussians: means, shapes, orientations and harmonics ----------------
-
 
 _DIRECTIONS = 64
 """Directions for the fit of rotated harmonics; 16 would do, more are better conditioned."""
@@ -39,20 +36,9 @@ _DIRECTIONS = 64
 def transform_gaussians(
     gaussians: OrientedGaussians, target_from_source: Similarity
 ) -> OrientedGaussians:
-    """Transform Gaussians to another frame.
+    """Transform Gaussians to another frame, float64; they look the same from transformed cameras.
 
-    They look the same from transformed cameras.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Source frame; lengths (``filter_3d`` too) in its units.
-    target_from_source : Similarity
-
-    Returns
-    -------
-    OrientedGaussians
-        float64, target frame.
+    Lengths of the source (``filter_3d`` too) are in its units.
     """
     wide = {name: t.detach().cpu().double() for name, t in gaussians.tensors()}
     similarity = target_from_source
@@ -70,9 +56,7 @@ def transform_gaussians(
     )
 
 
-def within_reach(
-    gaussians: OrientedGaussians,
-) -> tuple[OrientedGaussians, list[ReportWarning]]:
+def within_reach(gaussians: OrientedGaussians) -> tuple[OrientedGaussians, list[ReportWarning]]:
     """Leave out Gaussians of the scene frame that are too far away to be trained.
 
     Raises
@@ -104,27 +88,16 @@ def _rotated(quats: Tensor, turn: np.ndarray) -> Tensor:
 
 
 def rotate_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
-    """Rotate functions on the sphere, given by real spherical harmonics.
+    """Rotate functions on the sphere, given by real spherical harmonics (n, (degree + 1)^2, 3).
 
-    The coefficients are fitted to the function in :data:`_DIRECTIONS` directions, by least squares
-    for each degree; rotations do not mix degrees, so the fit is exact.
-
-    Parameters
-    ----------
-    sh : (n, (degree + 1)^2, 3)
-        Of degree 0 to 3.
-    rotation : (3, 3)
-        Rotation of the frame: the result at ``rotation @ d`` equals the input at ``d``.
-
-    Returns
-    -------
-    Tensor
-        Same shape and type as ``sh``.
+    The coefficients, of degree 0 to 3, are fitted to the function in :data:`_DIRECTIONS`
+    directions, by least squares for each degree; rotations do not mix degrees, so the fit is exact.
+    The result at ``rotation @ d`` equals the input at ``d``.
     """
     degree = math.isqrt(sh.shape[1]) - 1
     if torch.equal(rotation, torch.eye(3, dtype=rotation.dtype)):
         return sh
-    before = _directions()  # (m, 3)
+    before = torch.from_numpy(fibonacci_directions(_DIRECTIONS))  # (m, 3) unit vectors
     after = before @ rotation.double().T
     basis, turned = harmonics_basis(before, degree), harmonics_basis(after, degree)  # (m, k)
     out = sh.double().clone()
@@ -133,12 +106,6 @@ def rotate_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
         matrix = torch.linalg.lstsq(turned[:, band], basis[:, band]).solution  # (2l+1, 2l+1)
         out[:, band] = torch.einsum("ij,njc->nic", matrix, sh[:, band].double())
     return out.to(sh.dtype)
-
-
-@functools.cache
-def _directions() -> Tensor:
-    """Return (m, 3) evenly spread unit vectors: a spherical Fibonacci lattice."""
-    return torch.from_numpy(fibonacci_directions(_DIRECTIONS))
 
 
 def with_degree(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:
@@ -150,7 +117,6 @@ def with_degree(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:
 
 
 # -- Initialise a training from an existing splat: transform, cap, check against photos, orient
-
 
 ITERATIONS_SHARE = 0.3
 """Share of the preset's iterations: positions and colours exist, shapes and orientations do not."""
@@ -175,16 +141,6 @@ CLEAR_DB = 20.0
 _SMALL_DIVISOR = 4
 
 
-@dataclass(frozen=True)
-class SplatStart:
-    """Initial state of a training from a splat."""
-
-    gaussians: OrientedGaussians
-    """float32, scene frame; ``filter_3d`` of the training cameras at full size."""
-    warnings: tuple[ReportWarning, ...] = ()
-    facts: dict[str, Any] = field(default_factory=dict)
-
-
 def wrapping_settings(settings: TrainingSettings) -> TrainingSettings:
     """Return the settings of a short training from a splat.
 
@@ -192,53 +148,37 @@ def wrapping_settings(settings: TrainingSettings) -> TrainingSettings:
     wrapping rounds lie between 30 and 70 % of the iterations.
     """
     return dataclasses.replace(
-        settings,
-        iterations=max(1, round(ITERATIONS_SHARE * settings.iterations)),
-        growth="off",
-        refine_poses="off",
-        full_size="on",
-        prune_share=0.0,
-        depth_from=0.0,
-        densify_from=0.0,
-        densify_until=0.0,
-        orient_from=0.0,
-        wrap_from=0.3,
-        wrap_until=0.7,
-    )
+        settings, iterations=max(1, round(ITERATIONS_SHARE * settings.iterations)), growth="off",
+        refine_poses="off", full_size="on", prune_share=0.0, depth_from=0.0, densify_from=0.0,
+        densify_until=0.0, orient_from=0.0, wrap_from=0.3, wrap_until=0.7,
+    )  # fmt: skip
 
 
 def start_from_splat(
-    path: Path,
-    scene: Scene,
-    photos: PhotoSource,
-    view_indices: Sequence[int],
-    settings: TrainingSettings,
-    progress: Progress,
-    *,
-    threads: int = 0,
-) -> SplatStart:
+    path: Path, scene: Scene, photos: PhotoSource, view_indices: Sequence[int],
+    settings: TrainingSettings, progress: Progress, *, threads: int = 0,
+) -> tuple[OrientedGaussians, list[ReportWarning]]:  # fmt: skip
     """Read a splat in the world frame of the photos' cameras and prepare it for training.
 
     Parameters
     ----------
     path : Path
         3D Gaussian splatting PLY of any program.
-    scene : Scene
-        Scene of the photos.
-    photos : PhotoStore
     view_indices : sequence of int
         Training views.
     settings : TrainingSettings
         ``max_gaussians`` and ``sh_degree`` are respected.
-    progress : Progress
-        Checked for cancellation at every view.
 
     Returns
     -------
-    SplatStart
+    gaussians : OrientedGaussians
+        float32, scene frame; ``filter_3d`` of the training cameras at full size.
+    warnings : list of ReportWarning
 
     Raises
     ------
+    Cancelled
+        Before the next view.
     ParseError
         The file is not a splat.
     DatasetError
@@ -251,7 +191,7 @@ def start_from_splat(
     moved, far = within_reach(transform_gaussians(wanted, scene.world_from_scene.inverse()))
     cameras = [photos.camera(i, 1) for i in view_indices]
     gaussians = fit_filter(moved, cameras, variance_px=settings.filter_variance, threads=threads)
-    warnings, facts = [*splat.warnings, *far], dict(splat.facts)
+    warnings = [*splat.warnings, *far]
     if len(gaussians) > settings.max_gaussians:
         text = (
             f"The splat has {len(gaussians)} Gaussians; the {settings.max_gaussians} with the "
@@ -263,11 +203,9 @@ def start_from_splat(
         # A stable order makes ties depend on the file alone.
         kept = np.sort(np.argsort(-weights, kind="stable")[: settings.max_gaussians])
         gaussians = gaussians.select(torch.from_numpy(kept))
-    facts["splat_kept"] = len(gaussians)
     matched, unlike = _compare_with_photos(
         gaussians, photos, view_indices, progress, threads=threads
     )
-    facts["splat_psnr"] = round(matched, 2)
     if unlike:
         raise DatasetError(
             f"The splat {path.name} does not match the photos (PSNR {matched:.1f} dB): its "
@@ -276,8 +214,9 @@ def start_from_splat(
             "splat alone, without photos.",
         )
     if not splat.oriented:
-        gaussians = orient(gaussians, _voters(photos, view_indices, progress), threads=threads)
-    return SplatStart(gaussians, tuple(warnings), facts)
+        voters = (photos.camera(i, _divisor(photos, i)) for i in view_indices)
+        gaussians = orient(gaussians, cancellable(voters, progress), threads=threads)
+    return gaussians, warnings
 
 
 def baked(gaussians: OrientedGaussians) -> OrientedGaussians:
@@ -299,24 +238,12 @@ def fit_filter(
     variance_px: float = TrainingSettings.filter_variance,
     threads: int = 0,
 ) -> OrientedGaussians:
-    """Return Gaussians that look with the cameras' 3D filter like the given ones without.
+    """Return Gaussians that look with the cameras' 3D filter like the given ones without, float32.
 
     Where that is impossible (an axis shorter than :data:`FILTER_MULTIPLE` filters, a thin and
-    opaque Gaussian), the axis gets that length and the opacity the highest possible value.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Scene frame, with a filter of 0.
-    cameras : sequence of Camera
-        Training cameras at full size.
-    variance_px : float
-        Variance of the filter, squared pixels.
-
-    Returns
-    -------
-    OrientedGaussians
-        float32, with the filter of the cameras.
+    opaque Gaussian), the axis gets that length and the opacity the highest possible value. The
+    Gaussians given, scene frame, have a filter of 0; the cameras are those of training at full
+    size, and ``variance_px`` is the variance of their filter, squared pixels.
     """
     wide = {name: t.detach().double() for name, t in gaussians.tensors()}
     means = wide["means"].numpy()
@@ -345,15 +272,6 @@ def _divisor(photos: PhotoSource, index: int) -> int:
     return _SMALL_DIVISOR if min(camera.width, camera.height) >= 32 * _SMALL_DIVISOR else 1
 
 
-def _voters(
-    photos: PhotoSource, view_indices: Sequence[int], progress: Progress
-) -> Iterator[Camera]:
-    """Yield small cameras of all views, checking for cancellation before each."""
-    for index in view_indices:
-        progress.check()
-        yield photos.camera(index, _divisor(photos, index))
-
-
 def _mean_weights(
     gaussians: OrientedGaussians, cameras: Sequence[Camera], progress: Progress, *, threads: int
 ) -> np.ndarray:
@@ -370,13 +288,9 @@ def _mean_weights(
 
 
 def _compare_with_photos(
-    gaussians: OrientedGaussians,
-    photos: PhotoSource,
-    view_indices: Sequence[int],
-    progress: Progress,
-    *,
-    threads: int,
-) -> tuple[float, bool]:
+    gaussians: OrientedGaussians, photos: PhotoSource, view_indices: Sequence[int],
+    progress: Progress, *, threads: int,
+) -> tuple[float, bool]:  # fmt: skip
     """Return the median PSNR against some photos, dB, and whether the splat does not match them.
 
     It does not if the PSNR is below :data:`MATCH_DB`, or, below :data:`CLEAR_DB`, if it is no

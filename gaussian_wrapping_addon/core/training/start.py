@@ -80,7 +80,6 @@ class Handover:
 # Sky and the far distance have no parallax. Without Gaussians there, training explains them by
 # fog before the things. See docs/method.md, section 11.9.
 
-
 REACH_FACTOR = 4.0
 """Radius of the shell over the distance of the farthest points but one in a hundred."""
 
@@ -95,7 +94,6 @@ def far_shell(
 
     Parameters
     ----------
-    depth_maps : sequence of DepthMap
     points : (n, 3) float64
         Points known so far, scene frame; they cover the cells that they project into.
     wanted : int
@@ -112,8 +110,11 @@ def far_shell(
     radius = max(LEAST_REACH, REACH_FACTOR * reach)
     directions, colors, angles = [], [], []
     for depth_map in depth_maps:
-        row, column, color = _open_cells(depth_map, points)
-        camera = depth_map.camera
+        camera, unexplained = depth_map.camera, open_cells(depth_map)
+        _, row, column = cells_of(points, depth_map)
+        unexplained[row, column] = False
+        row, column = np.nonzero(unexplained)
+        color = by_cell(depth_map.color.astype(np.float64))[row, column]
         at = (np.stack([column, row], 1) + 0.5) * CELL_PX  # (m, 2) pixels
         rays = camera.rays_at(at) @ camera.rotation
         directions.append(onto_sphere(camera.center, rays, radius))
@@ -139,23 +140,9 @@ def far_shell(
 def _shell(direction: np.ndarray, color: np.ndarray, step: float, radius: float) -> DensePoints:
     count = len(direction)
     return DensePoints(
-        radius * direction,
-        -direction,
-        np.clip(color + 0.5, 0, 255).astype(np.uint8),
-        np.full(count, radius * step),
-        np.zeros(count, np.float32),
-    )
-
-
-def _open_cells(
-    depth_map: DepthMap, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows, columns and mean colours (m, 3) of the cells that nothing explains."""
-    found = open_cells(depth_map)
-    _, row, column = cells_of(points, depth_map)
-    found[row, column] = False
-    row, column = np.nonzero(found)
-    return row, column, by_cell(depth_map.color.astype(np.float64))[row, column]
+        radius * direction, -direction, np.clip(color + 0.5, 0, 255).astype(np.uint8),
+        np.full(count, radius * step), np.zeros(count, np.float32),
+    )  # fmt: skip
 
 
 def onto_sphere(center: np.ndarray, rays: np.ndarray, radius: float) -> np.ndarray:
@@ -167,7 +154,6 @@ def onto_sphere(center: np.ndarray, rays: np.ndarray, radius: float) -> np.ndarr
 
 
 # -- Initial Gaussians on the surfaces that stereo finds (docs/method.md, section 11) -------------
-
 
 _logger = logging.getLogger(__name__)
 
@@ -214,43 +200,24 @@ class DenseStart:
 
 
 def dense_start(
-    scene: Scene,
-    photos: PhotoSource,
-    views: Sequence[int],
-    setting: str,
-    progress: Progress,
-    *,
-    side_px: int,
-    max_gaussians: int,
-    sh_degree: int,
-    seed: int,
-    threads: int,
-) -> DenseStart:
-    """Match the photos and return flat Gaussians on the surfaces found.
+    scene: Scene, photos: PhotoSource, views: Sequence[int], setting: str, progress: Progress, *,
+    side_px: int, max_gaussians: int, sh_degree: int, seed: int, threads: int,
+) -> DenseStart:  # fmt: skip
+    """Match the photos of the training views and return flat Gaussians on the surfaces found.
 
-    Parameters
-    ----------
-    scene : Scene
-    photos : PhotoSource
-    views : sequence of int
-        Training views.
-    setting : str
-        ``"auto"`` needs :data:`LEAST_CONFIRMED` of the pixels; ``"on"`` takes what there is.
-    progress : Progress
-    side_px : int
-        Longest side at which photos are matched.
-    max_gaussians : int
-        Limit of the growth; the start leaves room below it.
+    The setting ``"auto"`` needs :data:`LEAST_CONFIRMED` of the pixels; ``"on"`` takes what there
+    is. Photos are matched at a longest side of ``side_px``; the start leaves room below
+    ``max_gaussians``, the limit of the growth.
     """
     points, colors = _usable(scene)
-    maps = matched_photos(
-        scene, photos, views, progress, side_px=side_px, seed=seed, threads=threads
-    )
+    maps = estimate_depth_maps(
+        photos, views, points, progress, side_px=side_px, seed=seed, threads=threads
+    )  # none where there is too little to match
     confirmed = _confirmed_share(maps)
     decision = _decision(setting, confirmed, len(maps))
     if decision.chosen != "on":
         return DenseStart(None, {}, decision)
-    maps = on_planes(scene, maps, progress, seed=seed)
+    maps = fill_plain_parts(maps, points, progress, seed=seed)
     wanted = start_budget(max_gaussians)
     found = fuse(maps, wanted)
     guesses = fill_gaps(maps, found, round(GUESS_SHARE * wanted))
@@ -263,7 +230,11 @@ def dense_start(
         "dense start: %d points, %d guesses, %d far away, %d Gaussians",
         len(found), len(guesses), len(shell), len(gaussians) + len(shell),
     )  # fmt: skip
-    gaussians = gaussians.joined(_shell_gaussians(shell, sh_degree))
+    far = gaussians_at(
+        shell.positions, shell.colors / 255.0, SIZE_SHARE * shell.sizes, sh_degree,
+        normals=shell.normals, flatness=FLATNESS, opacities=OPACITY,
+    )  # fmt: skip
+    gaussians = gaussians.joined(far)
     if len(gaussians) > max_gaussians:
         random = np.random.default_rng([seed, 4])
         kept = np.sort(random.choice(len(gaussians), max_gaussians, replace=False))
@@ -274,30 +245,6 @@ def dense_start(
 def start_budget(max_gaussians: int) -> int:
     """Return how many points on confirmed depths are wanted below a limit of Gaussians."""
     return max(1, min(MOST_POINTS, round(BUDGET_SHARE * max_gaussians)))
-
-
-def matched_photos(
-    scene: Scene,
-    photos: PhotoSource,
-    views: Sequence[int],
-    progress: Progress,
-    *,
-    side_px: int,
-    seed: int,
-    threads: int,
-) -> list[DepthMap]:
-    """Return the depth maps of the training views; empty where there is too little to match."""
-    points, _ = _usable(scene)
-    return estimate_depth_maps(
-        photos, views, points, progress, side_px=side_px, seed=seed, threads=threads
-    )
-
-
-def on_planes(
-    scene: Scene, maps: Sequence[DepthMap], progress: Progress, *, seed: int
-) -> list[DepthMap]:
-    """Return the depth maps with planes through their plain parts."""
-    return fill_plain_parts(maps, _usable(scene)[0], progress, seed=seed)
 
 
 def _usable(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -330,13 +277,9 @@ def _decision(setting: str, confirmed: float, count: int) -> Decision:
 
 
 def _gaussians(
-    found: DensePoints,
-    guesses: DensePoints,
-    points: np.ndarray,
-    colors: np.ndarray,
-    cameras: Sequence[Camera],
-    sh_degree: int,
-) -> OrientedGaussians:
+    found: DensePoints, guesses: DensePoints, points: np.ndarray, colors: np.ndarray,
+    cameras: Sequence[Camera], sh_degree: int,
+) -> OrientedGaussians:  # fmt: skip
     """Return flat Gaussians of both kinds, and round ones at sparse points away from them."""
     dense = np.concatenate([found.positions, guesses.positions])
     tree = cKDTree(dense)
@@ -354,13 +297,6 @@ def _gaussians(
         flatness=np.repeat([FLATNESS, GUESS_FLATNESS, 1.0], counts),
         opacities=np.repeat([OPACITY, GUESS_OPACITY, 0.1], counts),
     )
-
-
-def _shell_gaussians(shell: DensePoints, sh_degree: int) -> OrientedGaussians:
-    return gaussians_at(
-        shell.positions, shell.colors / 255.0, SIZE_SHARE * shell.sizes, sh_degree,
-        normals=shell.normals, flatness=FLATNESS, opacities=OPACITY,
-    )  # fmt: skip
 
 
 # -- The Gaussians a training starts from: at dense points from stereo, or at the sparse points
@@ -443,12 +379,12 @@ class PointStart:
         priors = load_priors(self.folder, cameras, key)
         if priors is None:
             _logger.info("the confirmed depths are not there: matching the photos again")
-            scene, quiet = self._start_scene(), progress.span(0.0, 0.0)
-            maps = matched_photos(
-                scene, self.photos, self.views, quiet, side_px=self.settings.match_px,
+            (points, _), quiet = _usable(self._start_scene()), progress.span(0.0, 0.0)
+            maps = estimate_depth_maps(
+                self.photos, self.views, points, quiet, side_px=self.settings.match_px,
                 seed=self.seed, threads=self.threads,
             )  # fmt: skip
-            priors = priors_of(self.views, on_planes(scene, maps, quiet, seed=self.seed))
+            priors = priors_of(self.views, fill_plain_parts(maps, points, quiet, seed=self.seed))
             save_priors(self.folder, priors, key)
         return priors
 

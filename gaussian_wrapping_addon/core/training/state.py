@@ -34,7 +34,6 @@ from .model_selection import ModelSelection
 
 # -- Cancellation inside the loops of a training that render many views per iteration -------------
 
-
 Item = TypeVar("Item")
 
 
@@ -70,25 +69,25 @@ class CancellablePhotos:
         self._photos, self._progress = photos, progress
 
     def camera(self, index: int, divisor: int = 1) -> Camera:
-        """Return the camera at a pyramid level."""
         return self._photos.camera(index, divisor)
 
     def photo(self, index: int, divisor: int = 1) -> np.ndarray:
-        """Return (h, w, 3) uint8, or raise :class:`~.errors.Cancelled`."""
         self._progress.check()
         return self._photos.photo(index, divisor)
 
     def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
-        """Return (h, w) bool or ``None``, or raise :class:`~.errors.Cancelled`."""
         self._progress.check()
         return self._photos.mask(index, divisor)
 
 
 # -- Training state: everything that the next iteration depends on --------------------------------
 
-
 _MOMENTS = ("first", "second")
 _STATISTICS = ("gradient", "gradient_abs", "views")
+_NUMBERS = {
+    "iteration": int, "rate_factor": float, "restarts": int, "error_average": float,
+    "loss_average": float, "seconds": float, "degree": int,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -185,16 +184,10 @@ class TrainingState:
     def to_json(self) -> dict[str, Any]:
         """Return the rest of the state as plain JSON values."""
         values: dict[str, Any] = {
+            **{name: getattr(self, name) for name in _NUMBERS},
             "random": self.random.bit_generator.state,
-            "iteration": self.iteration,
             "order": list(self.order),
-            "rate_factor": self.rate_factor,
-            "restarts": self.restarts,
-            "error_average": self.error_average,
-            "loss_average": self.loss_average,
             "history": [dict(entry) for entry in self.history],
-            "seconds": self.seconds,
-            "degree": self.degree,
             "needs": self.model_selection.to_json(),
             "warnings": [warning.to_json() for warning in self.warnings],
         }
@@ -239,19 +232,13 @@ class TrainingState:
         for name in _STATISTICS:
             old = getattr(statistics, name)
             setattr(statistics, name, _require(old, arrays[f"statistics.{name}"], count).copy())
-        state = cls(adam, statistics, np.random.Generator(np.random.PCG64()))
         generator = np.random.PCG64()
         generator.state = values["random"]
-        state.random = np.random.Generator(generator)
-        state.iteration = int(values["iteration"])
+        state = cls(adam, statistics, np.random.Generator(generator))
+        for name, kind in _NUMBERS.items():
+            setattr(state, name, kind(values[name]))
         state.order = [int(i) for i in values["order"]]
-        state.rate_factor = float(values["rate_factor"])
-        state.restarts = int(values["restarts"])
-        state.error_average = float(values["error_average"])
-        state.loss_average = float(values["loss_average"])
         state.history = [{k: float(v) for k, v in entry.items()} for entry in values["history"]]
-        state.seconds = float(values["seconds"])
-        state.degree = int(values["degree"])
         state.model_selection = ModelSelection.from_json(values["needs"])
         state.warnings = list(read_warnings(values["warnings"]))
         exposure = _part(arrays, "exposure.")
@@ -274,7 +261,6 @@ def _require(like: np.ndarray, array: np.ndarray, count: int) -> np.ndarray:
 
 
 # -- Training checkpoints: arrays in an npz; the rest, and its hash, in a JSON file written last
-
 
 _logger = logging.getLogger(__name__)
 
@@ -335,16 +321,10 @@ def save_checkpoint(folder: Path, state: TrainingState, key: str) -> Path:
     data = stream.getvalue()
     path = folder / f"checkpoint-{state.iteration:09d}.json"
     write_bytes(path.with_suffix(".npz"), data)
-    values = {
-        "version": VERSION,
-        "fingerprint": key,
-        "sha256": hashlib.sha256(data).hexdigest(),
-        "state": state.to_json(),
-    }
+    checksum = hashlib.sha256(data).hexdigest()
+    values = {"version": VERSION, "fingerprint": key, "sha256": checksum, "state": state.to_json()}
     write_json(path, values)
-    for old in _listed(folder)[KEPT:]:
-        old.unlink(missing_ok=True)
-        old.with_suffix(".npz").unlink(missing_ok=True)
+    remove_checkpoints(folder, KEPT)
     return path
 
 
@@ -372,9 +352,9 @@ def load_checkpoint(folder: Path, key: str) -> TrainingState | None:
     return None
 
 
-def remove_checkpoints(folder: Path) -> None:
-    """Delete all checkpoints of a finished run."""
-    for path in _listed(folder):
+def remove_checkpoints(folder: Path, kept: int = 0) -> None:
+    """Delete the checkpoints of a finished run, or all but the newest ones."""
+    for path in _listed(folder)[kept:]:
         path.unlink(missing_ok=True)
         path.with_suffix(".npz").unlink(missing_ok=True)
 

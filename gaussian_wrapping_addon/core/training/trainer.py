@@ -7,7 +7,7 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -37,13 +37,13 @@ from ..stereo.depth_maps import DepthPrior
 from .backend import Backend
 from .camera_poses import PosedPhotos
 from .cpu_backend import CpuBackend
-from .exposure import Exposure, corrected_for_measuring
+from .exposure import Exposure
 from .exposure_selection import first_decisions
 from .growth_selection import photo_detail, select_image_size
 from .iteration import NotFinite, Stepper, trimmed
-from .live_view import Correction, LiveView, divisor_for, held_out_metrics, measure_held_out
+from .live_view import LiveView, divisor_for, held_out_metrics, measure_held_out
 from .model_selection import Decision, start_poses
-from .multi_view import NeighbourLimits, find_neighbours
+from .multi_view import find_neighbours
 from .rounds import Inside, Rounds
 from .schedule import SMALLEST_SIDE_PX, Schedule
 from .splat_start import start_from_splat, wrapping_settings
@@ -53,6 +53,7 @@ from .state import (
     Snapshot,
     TrainingResult,
     TrainingState,
+    cancellable,
     fingerprint,
     load_checkpoint,
     save_checkpoint,
@@ -64,7 +65,6 @@ from .state import (
 # coarse sphere in the colours that the photos have in these directions looks right more often. It
 # comes after the training, which needs the black: only before black must a surface become opaque
 # to look right. See docs/method.md, section 11.11.
-
 
 _logger = logging.getLogger(__name__)
 
@@ -91,28 +91,12 @@ OPACITY = 0.95
 
 
 def with_backdrop(
-    gaussians: OrientedGaussians,
-    photos: PhotoSource,
-    views: Sequence[int],
-    renderer: Renderer | None = None,
-    *,
-    threads: int = 0,
-    check: Callable[[], None] | None = None,
-) -> OrientedGaussians:
+    gaussians: OrientedGaussians, photos: PhotoSource, views: Iterable[int],
+    renderer: Renderer | None = None, *, threads: int = 0,
+) -> OrientedGaussians:  # fmt: skip
     """Return trained Gaussians with a sphere behind them, open where the photos see through.
 
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Trained, scene frame.
-    photos : PhotoSource
-    views : sequence of int
-        Training views.
-    renderer : Renderer, optional
-        Overwrites its last view; by default one on the processor.
-    threads : int
-    check : callable, optional
-        Called before each view; an exception ends the work.
+    ``views`` are the training views. A renderer given overwrites its last view.
     """
     farthest = float(gaussians.means.norm(dim=1).max()) if len(gaussians) else 0.0
     radius = max(LEAST_REACH, REACH_FACTOR * farthest)
@@ -123,8 +107,6 @@ def with_backdrop(
     raw, renderer = RawArrays.from_gaussians(gaussians.detached()), renderer or ViewRenderer()
     options = RenderOptions(depth=False, threads=threads)
     for view in views:
-        if check is not None:
-            check()
         camera = photos.camera(view, divisor_for(photos, view, LONGEST_PX))
         image = renderer.render(raw, camera, options)
         rays = (camera.rays() @ camera.rotation).reshape(-1, 3)  # (p, 3) scene frame
@@ -161,16 +143,8 @@ def with_backdrop(
 class DeviceRecovery:
     """Brings states to the backend that computes, and to another where that fails.
 
-    Parameters
-    ----------
-    stepper : Stepper
-        Its backend is replaced by the processor's where the device is given up.
-    photos : PosedPhotos
-        Follow the poses of the state in use.
-    live : LiveView
-        Renders where the stepper computes.
-    threads : int
-        Of the processor.
+    The stepper's backend is then replaced by the processor's, and the live view renders where it
+    computes; the photos follow the poses of the state in use.
     """
 
     def __init__(self, stepper: Stepper, photos: PosedPhotos, live: LiveView, threads: int) -> None:
@@ -208,14 +182,8 @@ class DeviceRecovery:
     ) -> TrainingState:
         """Go back to what a failing device has left: with less of its memory, or without it.
 
-        Parameters
-        ----------
-        error : Exception
-            How it failed.
-        snapshot : Snapshot
-            The last one; a driver that was reset takes it along.
-        again : callable
-            Returns the state of the last checkpoint, or of a new start.
+        That is the last snapshot, unless a driver that was reset took it along: then ``again``
+        returns the state of the last checkpoint, or of a new start.
         """
         backend = self.stepper.backend
         smaller = is_memory_failure(error) and backend.use_less_memory()
@@ -257,7 +225,6 @@ def _note(state: TrainingState, device: str, error: Exception, onward: str) -> N
 
 # -- Training loop: from photos and cameras to oriented Gaussians, resumable at any iteration -----
 
-
 SNAPSHOT_EVERY = 100
 """Iterations between checks that all values are finite; each one takes a snapshot."""
 
@@ -274,19 +241,10 @@ RESTART_RATE = 0.5
 
 
 def train(
-    scene: Scene,
-    photos: PhotoSource,
-    settings: TrainingSettings,
-    folder: Path,
-    progress: Progress,
-    *,
-    seed: int = 0,
-    threads: int = 0,
-    start_splat: Path | None = None,
-    inside: Inside | None = None,
-    backend: Backend | None = None,
-    handover: Handover | None = None,
-) -> TrainingResult:
+    scene: Scene, photos: PhotoSource, settings: TrainingSettings, folder: Path, progress: Progress,
+    *, seed: int = 0, threads: int = 0, start: Path | Handover | None = None,
+    inside: Inside | None = None, backend: Backend | None = None,
+) -> TrainingResult:  # fmt: skip
     """Train oriented Gaussians on the photos of a scene.
 
     Resumes from the newest checkpoint in ``folder``; the result is then bit for bit that of an
@@ -296,31 +254,24 @@ def train(
 
     Parameters
     ----------
-    scene : Scene
     photos : PhotoStore
         Photos, masks and cameras of the scene's views.
-    settings : TrainingSettings
     folder : Path
         Receives checkpoints and preview pictures.
     progress : Progress
         Updated every few iterations; checked for cancellation in each one.
     seed, threads : int
         0 threads uses every core. The result does not depend on ``threads``.
-    start_splat : Path, optional
+    start : Path or Handover, optional
         PLY of Gaussians in the world frame of the photos to start from; the training is then short
-        and does not densify (:func:`~.splat_start.wrapping_settings`).
+        and does not densify (:func:`~.splat_start.wrapping_settings`). Or what another training of
+        the scene has found; nothing is started or decided then, and the result's ``poses`` are
+        ``None``.
     inside : callable, optional
         Tells for points (n, 3), scene frame, where ``settings.region_weight`` applies.
     backend : Backend, optional
         Where to train; by default on the processor. A checkpoint goes on on any. One that fails
         (memory, driver) is replaced by the processor, with a warning in the result.
-    handover : Handover, optional
-        What another training of the scene has found; nothing is started or decided then. The
-        result's ``poses`` are ``None``.
-
-    Returns
-    -------
-    TrainingResult
 
     Raises
     ------
@@ -340,10 +291,9 @@ def train(
     try:
         with decoded_in(photos, folder):
             run = _Trainer(
-                scene, photos, settings, folder, seed, threads, start_splat, inside, progress,
-                backend, handover,
-            )  # fmt: skip
-            return run.run(progress)
+                scene, photos, settings, folder, seed, threads, start, inside, progress, backend
+            )
+            return run.run()
     finally:
         torch.set_num_threads(before)
 
@@ -352,25 +302,20 @@ class _Trainer:
     """One training run. Its attributes follow from the inputs; all else is in the state."""
 
     def __init__(
-        self,
-        scene: Scene,
-        photos: PhotoSource,
-        settings: TrainingSettings,
-        folder: Path,
-        seed: int,
-        threads: int,
-        start_splat: Path | None = None,
-        inside: Inside | None = None,
-        progress: Progress | None = None,
+        self, scene: Scene, photos: PhotoSource, settings: TrainingSettings, folder: Path,
+        seed: int, threads: int, start: Path | Handover | None = None,
+        inside: Inside | None = None, progress: Progress | None = None,
         backend: Backend | None = None,
-        handover: Handover | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
+        handover = start if isinstance(start, Handover) else None
+        start_splat = start if isinstance(start, Path) else None
         if start_splat is not None:
             settings = wrapping_settings(settings)
         settings = dataclasses.replace(settings, mask_mode=scene.mask_mode(settings.mask_mode))
         self.scene, self.settings = scene, settings
         self.posed = PosedPhotos(photos)
-        self.photos = CancellablePhotos(self.posed, progress or Progress())
+        self.progress = progress or Progress()
+        self.photos = CancellablePhotos(self.posed, self.progress)
         self.folder, self.seed, self.threads = folder, seed, threads
         self.start_splat, self.inside, self.handover = start_splat, inside, handover
         if handover is not None and handover.views is not None:
@@ -382,8 +327,7 @@ class _Trainer:
             raise DatasetError("No photo is left to train on.", "Add photos or check the masks.")
         sizes = [photos.camera(i, 1) for i in self.views]
         side_px = max(max(c.width, c.height) for c in sizes)
-        limits = NeighbourLimits.of_settings(settings)
-        found = find_neighbours(sizes, limits, points=scene.points)
+        found = find_neighbours(sizes, settings, points=scene.points)
         numbers = np.array(self.views)
         self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
         self.image_decision, finest = self._image_size(side_px)
@@ -418,26 +362,26 @@ class _Trainer:
 
     # -- the run ----------------------------------------------------------------------------------
 
-    def run(self, progress: Progress) -> TrainingResult:
+    def run(self) -> TrainingResult:
         """Start or resume, iterate to the end, measure the held-out photos."""
         handover = self.handover
         taken_over = "" if handover is None else handover.digest
         key = fingerprint(self.scene, self.settings, self.seed, self.start_splat, taken_over)
-        progress.update(0.0, "preparing the Gaussians")
+        self.progress.update(0.0, "preparing the Gaussians")
         rounds = Rounds(
-            self.stepper, self.inside, progress,
+            self.stepper, self.inside, self.progress,
             None if handover is None else handover.filter_views,
         )  # fmt: skip
         state = load_checkpoint(self.folder, key)
         if state is None:
-            state = self._start(rounds, key, progress)
+            state = self._start(rounds, key)
         else:
             _logger.info("resuming at iteration %d", state.iteration)
-            self.stepper.priors = self._saved_priors(state, key, progress)
+            self.stepper.priors = self._saved_priors(state, key)
 
         def again() -> TrainingState:
             found = load_checkpoint(self.folder, key)
-            return self._start(rounds, key, progress) if found is None else found
+            return self._start(rounds, key) if found is None else found
 
         snapshot = self.recovery.begun(state)
         begun_s = saved_s = time.monotonic()
@@ -445,14 +389,14 @@ class _Trainer:
         total, consistent = self.schedule.total, True
         try:
             while state.iteration < total:
-                progress.check()
+                self.progress.check()
                 try:
                     try:
                         rounds.before_step(state)
                         consistent = False
                         self.stepper.step(state)
                         rounds.after_step(state)
-                        self._record(state, progress)
+                        self._record(state)
                         consistent = True
                         if state.iteration % SNAPSHOT_EVERY == 0 or state.iteration == total:
                             if not state.adam.is_finite():
@@ -462,7 +406,7 @@ class _Trainer:
                         state.seconds = spent_s + now_s - begun_s
                         if state.iteration % REPORT_EVERY == 0 or state.iteration == total:
                             speed = (state.iteration - begun_at) / max(now_s - begun_s, 1e-9)
-                            self._report(state, progress, speed)
+                            self._report(state, speed)
                         if now_s - saved_s >= self.settings.checkpoint_every_s:
                             if not state.adam.is_finite():
                                 raise NotFinite()
@@ -490,40 +434,30 @@ class _Trainer:
         save_checkpoint(self.folder, state, key)
         while True:
             try:
-                return self._result(rounds, state, spent_s + time.monotonic() - begun_s, progress)
+                return self._result(rounds, state, spent_s + time.monotonic() - begun_s)
             except (WrapError, RuntimeError) as error:
                 if not self.recovery.is_device_failure(error):
                     raise
                 # Both the snapshot and the checkpoint are of the last iteration.
                 state = self.recovery.without_device(error, snapshot, again)
 
-    def _result(
-        self, rounds: Rounds, state: TrainingState, seconds: float, progress: Progress
-    ) -> TrainingResult:
+    def _result(self, rounds: Rounds, state: TrainingState, seconds: float) -> TrainingResult:
         """Finish the Gaussians and measure the held-out photos."""
-        gaussians = self._finished(rounds, state, progress)
-        self.live.update(gaussians, state.iteration, self._correction(state), force=True)
+        gaussians = self._finished(rounds, state)
+        self.live.update(gaussians, state.iteration, state.exposure is not None, force=True)
         names = {view: self.scene.views[view].camera.name for view in self.held_out}
         held_out, lpips_note = held_out_metrics(
-            gaussians, self.photos, names, progress,
+            gaussians, self.photos, names, self.progress,
             threads=self.threads, renderer=self.stepper.renderer,
-            exposure_correction=self._correction(state),
+            exposed=state.exposure is not None,
         )  # fmt: skip
         return TrainingResult(
-            gaussians,
-            self.schedule.total,
-            tuple(state.history),
-            tuple(held_out),
-            seconds,
-            tuple(state.warnings),
-            lpips_note,
-            state.model_selection,
-            state.exposure is not None,
-            None if state.poses is None else state.poses.moved(),
-            self.stepper.backend.name,
-        )
+            gaussians, self.schedule.total, tuple(state.history), tuple(held_out), seconds,
+            tuple(state.warnings), lpips_note, state.model_selection, state.exposure is not None,
+            None if state.poses is None else state.poses.moved(), self.stepper.backend.name,
+        )  # fmt: skip
 
-    def _start(self, rounds: Rounds, key: str, progress: Progress) -> TrainingState:
+    def _start(self, rounds: Rounds, key: str) -> TrainingState:
         if self.handover is not None:
             return self._taken_over(self.handover, rounds)
         warnings: list[ReportWarning] = []
@@ -533,14 +467,15 @@ class _Trainer:
             warnings.append(ReportWarning("few-photos", text, "Take more photos, from all around."))
         decision = None
         if self.start_splat is None:
-            gaussians, decision, self.stepper.priors = self._point_start().gaussians(key, progress)
+            found = self._point_start().gaussians(key, self.progress)
+            gaussians, decision, self.stepper.priors = found
         else:
-            start = start_from_splat(
-                self.start_splat, self.scene, self.photos, self.views, self.settings, progress,
+            gaussians, of_splat = start_from_splat(
+                self.start_splat, self.scene, self.photos, self.views, self.settings,
+                self.progress,
                 threads=self.threads,
             )  # fmt: skip
-            gaussians = start.gaussians
-            warnings += start.warnings
+            warnings += of_splat
         state = TrainingState.start(gaussians, self.seed)
         state.warnings = warnings
         if self.start_splat is not None:
@@ -569,9 +504,7 @@ class _Trainer:
         rounds.filter(state)
         return state
 
-    def _finished(
-        self, rounds: Rounds, state: TrainingState, progress: Progress
-    ) -> OrientedGaussians:
+    def _finished(self, rounds: Rounds, state: TrainingState) -> OrientedGaussians:
         """Return the trained Gaussians; those of a dense start with a backdrop."""
         gaussians = trimmed(rounds.filtered(state), state.degree)
         if self._is_part:
@@ -580,10 +513,10 @@ class _Trainer:
             return gaussians
         if not state.model_selection.chose("dense_start"):
             return gaussians  # the large Gaussians of a sparse start reach beyond the photos
+        views = cancellable(self.views, self.progress)
         return with_backdrop(
-            gaussians, self.photos, self.views, self.stepper.renderer,
-            threads=self.threads, check=progress.check,
-        )  # fmt: skip
+            gaussians, self.photos, views, self.stepper.renderer, threads=self.threads
+        )
 
     def _point_start(self) -> PointStart:
         return PointStart(
@@ -591,16 +524,14 @@ class _Trainer:
             self.schedule.divisor(0), self.schedule.growth_limit(), self.seed, self.threads,
         )  # fmt: skip
 
-    def _saved_priors(
-        self, state: TrainingState, key: str, progress: Progress
-    ) -> dict[int, DepthPrior]:
+    def _saved_priors(self, state: TrainingState, key: str) -> dict[int, DepthPrior]:
         """Return the confirmed depths of a resumed training."""
         if self.handover is not None:
             return dict(self.handover.priors)
         start = self._point_start()
         if not (state.model_selection.chose("dense_start") and start.uses_priors):
             return {}
-        return start.saved_priors(key, progress)
+        return start.saved_priors(key, self.progress)
 
     def _restart(self, state: TrainingState, snapshot: Snapshot) -> TrainingState:
         """Restore the last snapshot with lower rates and another view order, at most once."""
@@ -629,7 +560,7 @@ class _Trainer:
 
     # -- figures ----------------------------------------------------------------------------------
 
-    def _record(self, state: TrainingState, progress: Progress) -> None:
+    def _record(self, state: TrainingState) -> None:
         """Append to the history, at fixed iterations."""
         last = state.iteration == self.schedule.total
         if state.iteration % SNAPSHOT_EVERY and not last:
@@ -638,8 +569,8 @@ class _Trainer:
         if (state.iteration % MEASURE_EVERY == 0 or last) and self.held_out:
             quality = measure_held_out(
                 state.adam.gaussians(), self.photos, self.held_out, threads=self.threads,
-                renderer=self.stepper.renderer, check=progress.check,
-                exposure_correction=self._correction(state),
+                renderer=self.stepper.renderer,
+                exposed=state.exposure is not None,
             )  # fmt: skip
             if math.isfinite(quality):
                 figures["held_out_psnr"] = quality
@@ -653,22 +584,19 @@ class _Trainer:
             "gaussians": float(len(state.adam)),
         }
 
-    def _correction(self, state: TrainingState) -> Correction | None:
-        return None if state.exposure is None else corrected_for_measuring
-
-    def _report(self, state: TrainingState, progress: Progress, speed: float) -> None:
+    def _report(self, state: TrainingState, speed: float) -> None:
         total, figures = self.schedule.total, self._figures(state)
         figures |= {"iterations": float(total), "iterations_per_s": speed}
         if self.live.is_due():
             live_figures = self.live.update(
-                state.adam.gaussians(), state.iteration, self._correction(state)
+                state.adam.gaussians(), state.iteration, state.exposure is not None
             )
             self.live_figures = live_figures or self.live_figures
         figures |= self.live_figures
         held_out = ""
         if "held_out_psnr" in self.live_figures:
             held_out = f" · held-out {self.live_figures['held_out_psnr']:.1f} dB"
-        progress.update(
+        self.progress.update(
             state.iteration / total,
             f"iteration {state.iteration}/{total} · loss {state.loss_average:.4f} · "
             f"PSNR {figures['psnr']:.1f} dB{held_out} · {len(state.adam)} Gaussians · "

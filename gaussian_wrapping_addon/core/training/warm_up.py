@@ -72,16 +72,8 @@ def compile_kernels(
 ) -> None:
     """Run a training of a few seconds that calls every kernel that ``settings`` may use.
 
-    Failures are only logged: the training itself compiles what is missing and reports errors.
-
-    Parameters
-    ----------
-    settings : TrainingSettings
-        Settings of "auto" count as "on".
-    folder : Path
-        Holds a temporary folder.
-    progress : Progress
-        Checked for cancellation; receives no updates.
+    Settings of "auto" count as "on". Failures are only logged: the training itself compiles what is
+    missing and reports errors. ``folder`` holds a temporary folder meanwhile.
 
     Raises
     ------

@@ -22,34 +22,19 @@ from .losses import normals_from_depth
 
 # -- Orientation without training: the shortest axis, with its sign by a vote of the cameras ------
 
-
 FIRST_SIGN = TrainingSettings.first_sign
 """Magnitude of the sign parameter after the vote of views of a splat."""
 
 
 def voted_orientation(
-    gaussians: OrientedGaussians,
-    cameras: Iterable[Camera],
-    renderer: Renderer | None = None,
-    *,
-    first_sign: float = FIRST_SIGN,
-    threads: int = 0,
-) -> np.ndarray:
-    """Return orientation parameters for Gaussians whose orientation was not trained.
+    gaussians: OrientedGaussians, cameras: Iterable[Camera], renderer: Renderer | None = None, *,
+    first_sign: float = FIRST_SIGN, threads: int = 0,
+) -> np.ndarray:  # fmt: skip
+    """Return orientation parameters, direction and sign (n, 4), where orientation was not trained.
 
-    The direction is the shortest axis. Each camera votes for the side that it sees, weighted by the
-    Gaussian's blending weight; the sign parameter is +-``first_sign``, or 0 if no camera sees it
-    (docs/method.md, section 1.3).
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        float32; in the frame of the cameras.
-
-    Returns
-    -------
-    (n, 4) float32
-        Direction and sign parameter.
+    The direction is the shortest axis. Each camera, in the frame of the Gaussians, votes for the
+    side that it sees, weighted by the Gaussian's blending weight; the sign parameter is
+    +-``first_sign``, or 0 if no camera sees it (docs/method.md, section 1.3).
     """
     gaussians = gaussians.detached()
     shortest = torch.argmin(gaussians.log_scales, dim=1)  # (n,)
@@ -78,7 +63,6 @@ def orient(
 
 # -- Wrapping: initial orientations, and clones of opposite orientation where normals disagree ----
 
-
 SHIFT = 0.1
 """Original and clone are each moved by this many standard deviations along the normal."""
 
@@ -100,19 +84,13 @@ class WrapView:
 
 
 def start_orientation(
-    adam: Adam,
-    views: Iterable[WrapView],
-    renderer: Renderer | None = None,
-    *,
-    first_sign: float = FIRST_SIGN,
-    threads: int = 0,
-) -> None:
-    """Initialise missing orientations: the shortest axis, with its sign by a vote of the views.
+    adam: Adam, views: Iterable[WrapView], renderer: Renderer | None = None, *,
+    first_sign: float = FIRST_SIGN, threads: int = 0,
+) -> None:  # fmt: skip
+    """Give the Gaussians without orientation that of :func:`voted_orientation`.
 
-    Each view votes for the side that it sees, weighted by the Gaussian's blending weight; the sign
-    parameter becomes +-``first_sign``, or stays 0 if no view sees the Gaussian (docs/method.md,
-    section 1.3). Gaussians that are oriented already, those of a splat, keep their orientation,
-    and so do frozen ones.
+    Gaussians that are oriented already, those of a splat, keep their orientation, and so do frozen
+    ones.
     """
     gaussians = adam.gaussians()
     length = np.linalg.norm(gaussians.detached().normals().numpy(), axis=1)  # (n,)
@@ -164,29 +142,21 @@ def normal_errors(
 
 
 def wrap(adam: Adam, errors: np.ndarray, share: float, limit: int) -> int:
-    """Clone the Gaussians of largest normal error with the opposite orientation.
+    """Clone the Gaussians of largest normal error with the opposite orientation; return how many.
 
-    See docs/method.md, section 4.2.
-
-    Original and clone are shrunk along the normal to half the volume and each moved by 0.1 standard
-    deviations along it, the clone backwards. Gaussians without orientation are skipped, and frozen
-    ones, which neither share nor limit counts.
+    See docs/method.md, section 4.2. Original and clone are shrunk along the normal to half the
+    volume and each moved by 0.1 standard deviations along it, the clone backwards; clones start
+    with zero moments. Gaussians without orientation are skipped, and frozen ones, which neither
+    share nor limit counts.
 
     Parameters
     ----------
-    adam : Adam
-        Rebuilt; clones start with zero moments.
     errors : (n,) float64
         From :func:`normal_errors`.
     share : float
         Largest share of the Gaussians to clone.
     limit : int
         Largest number of Gaussians.
-
-    Returns
-    -------
-    int
-        Number of clones.
     """
     gaussians = adam.gaussians().detached()
     count = len(gaussians)

@@ -48,7 +48,7 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
         training = wrapping_settings(training)
     threads = job.settings.threads or default_threads()
     timed = device.is_cuda or renderer_is_compiled()
-    machine = this_machine(Path.cwd(), threads, *speeds(threads, device.device))
+    machine = this_machine(Path.cwd(), *speeds(threads, device.device))
     expected = estimate_training(facts, training, machine)
     low, high = MESH_AND_TEXTURE_SHARE
     points = f"{facts.points} sparse points" if facts.points else "camera poses still to be solved"

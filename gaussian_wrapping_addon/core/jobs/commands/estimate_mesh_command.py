@@ -95,7 +95,7 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
             "Draw the region around something that was photographed.",
         )
     vacancy = VacancyField(arrays, cameras, threads=threads)
-    memory_bytes = free_bytes(folder.root, threads)
+    memory_bytes = free_bytes(folder.root)
     if meshing.method == "pivots":
         by_pivots = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
         by_pivots.refuse(memory_bytes)

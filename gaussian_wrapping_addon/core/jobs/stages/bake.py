@@ -113,7 +113,7 @@ def _bake(
     textured = bake_onto(
         given, scene, source, request.texture, BakeChoices(request.uvs, request.faces),
         stage_folder, progress.span(0.02, 0.9),
-        threads=threads, dense=dense, free_bytes=free_bytes(stage_folder, threads),
+        threads=threads, dense=dense, free_bytes=free_bytes(stage_folder),
     )  # fmt: skip
     files = stage_folder / "files"
     progress.update(0.9, "writing the files")

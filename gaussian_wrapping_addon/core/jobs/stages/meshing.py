@@ -374,7 +374,7 @@ def mesh_in_stage(
     )
     for line in expected.lines():
         _logger.info("region %s, estimated %s", region.name, line)
-    memory_bytes = free_bytes(stage_folder, field.threads)
+    memory_bytes = free_bytes(stage_folder)
     tiled = meshing.tiles != "off" and (
         meshing.tiles != "auto" or bool(expected.tiles_for(memory_bytes))
     )
@@ -452,7 +452,6 @@ def mesh_by_pivots_in_stage(
     progress: Progress,
     *,
     seed: int,
-    threads: int,
     depth_samples: DepthSamples | None,
 ) -> tuple[SurfaceMesh, dict[str, Any]]:
     """Estimate the mesh of a region by pivots, then make it; see :func:`mesh_in_stage`."""
@@ -461,7 +460,7 @@ def mesh_by_pivots_in_stage(
     expected = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
     for line in expected.lines():
         _logger.info("region %s, estimated %s", region.name, line)
-    memory_bytes = free_bytes(stage_folder, threads)
+    memory_bytes = free_bytes(stage_folder)
     expected.refuse(memory_bytes)
     mesh = mesh_by_pivots(
         vacancy, arrays, vacancy.cameras, region, meshing, progress, seed=seed,
@@ -520,11 +519,11 @@ def estimate_region_mesh(
     )
 
 
-def free_bytes(folder: Path, threads: int) -> int:
+def free_bytes(folder: Path) -> int:
     """Return how much memory a mesh may use on this machine; 0 if unknown."""
     from ...training.estimate import MEMORY_SHARE_LEFT, this_machine
 
-    return int(MEMORY_SHARE_LEFT * this_machine(folder, threads).memory_bytes)
+    return int(MEMORY_SHARE_LEFT * this_machine(folder).memory_bytes)
 
 
 def remove_tiles(stage_folder: Path) -> None:
@@ -681,8 +680,7 @@ def run_mesh(
             alone = meshing.pivot_samples == "none"
             mesh, expected = mesh_by_pivots_in_stage(
                 stage_folder, vacancy, inputs.arrays, region, meshing, progress.span(0.15, 0.9),
-                seed=job.settings.seed, threads=inputs.field.threads,
-                depth_samples=None if alone else sampled(),
+                seed=job.settings.seed, depth_samples=None if alone else sampled(),
             )  # fmt: skip
             _note(mesh, warnings)
         else:

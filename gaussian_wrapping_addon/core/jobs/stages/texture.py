@@ -89,7 +89,7 @@ def run_texture(
         coarse_from = 0.7 if texture.lods else 0.9
         textured = texture_mesh(
             mesh, scene, source, texture, stage_folder, progress.span(0.0, coarse_from),
-            threads=threads, dense=dense, free_bytes=free_bytes(stage_folder, threads),
+            threads=threads, dense=dense, free_bytes=free_bytes(stage_folder),
         )  # fmt: skip
         region_path = meshed.folder / "region.json"
         region = parse_region(read_json(region_path), region_path)

@@ -306,21 +306,21 @@ class BlockStages:
         self, folder: Path, progress: Progress, inside: Inside | None
     ) -> dict[str, Any]:
         from ...scene.scene import with_poses
-        from ...training.block_plan import plan_blocks, save_plan, train_coarse
+        from ...training.block_plan import coarse_settings, plan_blocks, save_plan, train_coarse
         from ...training.state import remove_checkpoints
 
-        settings, blocks = self._settings, self._blocks
-        coarse_settings, scene = blocks.coarse(settings), self.scene
+        settings, scene = self._settings, self.scene
+        less = coarse_settings(settings)
         backend = self._backend()
         coarse = train_coarse(
-            scene, _photos(scene, coarse_settings), coarse_settings, folder,
+            scene, _photos(scene, less), less, folder,
             progress.span(0.0, 0.9), seed=self.job.settings.seed, threads=self.threads,
             inside=inside, backend=backend,
         )  # fmt: skip
         if coarse.poses is not None:
             scene = with_poses(scene, coarse.poses)
         plan = plan_blocks(
-            coarse, scene, _photos(scene, settings), settings, blocks, progress.span(0.9, 1.0),
+            coarse, scene, _photos(scene, settings), settings, progress.span(0.9, 1.0),
             threads=self.threads,
         )  # fmt: skip
         save_plan(self.root, plan)
@@ -372,16 +372,18 @@ class BlockStages:
         self, index: int, folder: Path, progress: Progress, inside: Inside | None
     ) -> dict[str, Any]:
         from ...gaussians.files import save_gaussians
-        from ...training.blocks import train_block
+        from ...training.blocks import block_training
         from ...training.state import remove_checkpoints
+        from ...training.trainer import train
 
         plan, settings = self._plan, self._settings
         scene = self._refined(plan)
-        result = train_block(
-            plan, index, scene, _photos(scene, settings), settings, folder, progress,
-            seed=self.job.settings.seed, threads=self.threads,
-            priors=self._priors(plan, scene, plan.blocks[index].views), inside=inside,
-            backend=self._backend(),
+        priors = self._priors(plan, scene, plan.blocks[index].views)
+        shorter, handover = block_training(plan, index, settings, priors)
+        result = train(
+            scene, _photos(scene, settings), shorter, folder, progress,
+            seed=self.job.settings.seed, threads=self.threads, inside=inside,
+            backend=self._backend(), start=handover,
         )  # fmt: skip
         save_gaussians(folder / GAUSSIANS_NAME, result.gaussians)
         remove_checkpoints(folder)
@@ -448,7 +450,8 @@ class BlockStages:
             A block is not finished.
         """
         from ...gaussians.files import load_gaussians
-        from ...training.blocks import join_blocks
+        from ...training.blocks import joint_training
+        from ...training.trainer import train
 
         stages = self.finished()
         if len(stages) < self._settings.blocks + 1:
@@ -465,10 +468,15 @@ class BlockStages:
                 yield load_gaussians(stage.folder / GAUSSIANS_NAME)
 
         with within_memory("Joining the blocks"):
-            result = join_blocks(
-                plan, parts(), scene, _photos(scene, settings), settings, self._blocks, folder,
-                progress, seed=self.job.settings.seed, threads=self.threads,
-                priors=self._priors(plan, scene, plan.views), backend=self._backend(),
+            photos, backend = _photos(scene, settings), self._backend()
+            last, handover = joint_training(
+                plan, parts(), photos, settings, progress.span(0.0, 0.05), backend.renderer,
+                threads=self.threads, priors=self._priors(plan, scene, plan.views),
+            )  # fmt: skip
+            result = train(
+                scene, photos, last, folder, progress.span(0.05, 1.0),
+                seed=self.job.settings.seed, threads=self.threads, backend=backend,
+                start=handover,
             )  # fmt: skip
         earlier = [w for stage in stages for w in read_warnings(stage.done.get("warnings"))]
         return dataclasses.replace(
@@ -489,12 +497,6 @@ class BlockStages:
     def _settings(self) -> TrainingSettings:
         return self.job.settings.training
 
-    @property
-    def _blocks(self) -> Any:
-        from ...training.block_plan import BlockSettings
-
-        return BlockSettings.of(self._settings)
-
     @cached_property
     def _plan(self) -> BlockPlan:
         from ...training.block_plan import PLAN_NAME, load_plan
@@ -512,9 +514,9 @@ class BlockStages:
     def _priors(
         self, plan: BlockPlan, scene: Scene, views: tuple[int, ...]
     ) -> dict[int, DepthPrior]:
-        from ...training.block_plan import confirmed_depths
+        from ...training.block_plan import coarse_settings, confirmed_depths
 
-        settings = self._blocks.coarse(self._settings)
+        settings = coarse_settings(self._settings)
         folder = self.root / f"{COARSE}-{COARSE_KEY}"
         photos = _photos(scene, settings)
         return confirmed_depths(plan.coarse, folder, photos, settings, plan.views, views)
@@ -621,9 +623,9 @@ def run_coarse(
     ResourceError
         The disk is too full, or memory does not suffice.
     """
-    from ...training.estimate import coarse_gaussians
+    from ...training.block_plan import coarse_settings
 
-    most = coarse_gaussians(job.settings.training)
+    most = coarse_settings(job.settings.training).max_gaussians
     blocks = _opened(folder, job, cameras, most, version, threads, device)
     if isinstance(blocks, Stage):
         return blocks
@@ -731,7 +733,7 @@ def _train(
         photos = PhotoStore(scene, settings.max_image_px)
         return train(
             scene, photos, settings, stage_folder, progress,
-            seed=job.settings.seed, threads=threads, start_splat=start_splat_of(job), inside=inside,
+            seed=job.settings.seed, threads=threads, start=start_splat_of(job), inside=inside,
             backend=chosen_backend(
                 device.device, threads, or_processor=job.settings.device == "auto"
             ),

@@ -81,7 +81,7 @@ def estimated_cost(
         training = wrapping_settings(training)
     compile_if_needed(job, stage_folder, progress, threads, device)
     progress.update(0.0, "timing this machine")
-    machine = this_machine(stage_folder, threads, *speeds(threads, device.device))
+    machine = this_machine(stage_folder, *speeds(threads, device.device))
     done = [int(path.stem.rpartition("-")[2]) for path in checkpoints(stage_folder)]
     first = max(done, default=0)
     expected = estimate_training(scene_facts(scene), training, machine, first=first)
