@@ -87,11 +87,11 @@ def one_view() -> str:
         view = ViewRenderer().render(RawArrays.from_gaussians(adam.gaussians()), camera, options)
         images = (view.color, view.normal, view.geometric_normal, view.alpha, view.depth)
         found.append(digest(images))
-        value, by_color, figures = color_loss(view.color, photos.photo(0), None, threads=THREADS)
-        other, by_normals, _ = normal_losses(
+        value, by_color, squared = color_loss(view.color, photos.photo(0), None, threads=THREADS)
+        other, by_normals = normal_losses(
             view.depth, view.geometric_normal, view.normal, view.alpha, camera, threads=THREADS
         )
-        found.append(digest(value, by_color, figures, other, by_normals))
+        found.append(digest(value, by_color, squared, other, by_normals))
         gradients = view.backward(dataclasses.replace(by_normals, color=by_color))
         found.append(digest(gradients, view.statistics))
         rates = Schedule(TRAINING, 40).rates(0, 1.0)

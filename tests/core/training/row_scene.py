@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,16 +15,19 @@ from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.scene.camera import Similarity
-from gaussian_wrapping_addon.core.scene.scene import Scene, View
+from gaussian_wrapping_addon.core.scene.scene import PhotoSource, Scene, View
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training.block_plan import (
     BlockPlan,
-    BlockSettings,
     CoarseTraining,
     plan_blocks,
 )
+from gaussian_wrapping_addon.core.training.blocks import block_training, joint_training
 from gaussian_wrapping_addon.core.training.model_selection import Decision, ModelSelection
+from gaussian_wrapping_addon.core.training.state import TrainingResult
+from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.render.scenes import look_at
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, surface_color
 
@@ -93,6 +98,29 @@ def known_coarse() -> CoarseTraining:
 def two_blocks(blocks: int = 2) -> BlockPlan:
     """Return a plan of the row, divided along x."""
     scene, photos = row_scene()
-    return plan_blocks(
-        known_coarse(), scene, photos, SETTINGS, BlockSettings(blocks), Progress(), threads=1
+    return plan_blocks(known_coarse(), scene, photos, divided(blocks), Progress(), threads=1)
+
+
+def divided(blocks: int = 2, **changes: Any) -> TrainingSettings:
+    """Return the settings of a training in so many blocks."""
+    return dataclasses.replace(SETTINGS, blocks=blocks, **changes)
+
+
+def train_block(
+    plan: BlockPlan, index: int, scene: Scene, photos: PhotoSource, settings: TrainingSettings,
+    folder: Path, progress: Progress, **more: Any,
+) -> TrainingResult:  # fmt: skip
+    """Train a block as a job does, without confirmed depths."""
+    shorter, handover = block_training(plan, index, settings)
+    return train(scene, photos, shorter, folder, progress, start=handover, **more)
+
+
+def join_blocks(
+    plan: BlockPlan, parts: list[OrientedGaussians], scene: Scene, photos: PhotoSource,
+    settings: TrainingSettings, folder: Path, progress: Progress, **more: Any,
+) -> TrainingResult:  # fmt: skip
+    """Join blocks as a job does, without confirmed depths."""
+    last, handover = joint_training(
+        plan, parts, photos, settings, progress.span(0.0, 0.05), ViewRenderer(), threads=1
     )
+    return train(scene, photos, last, folder, progress.span(0.05, 1.0), start=handover, **more)

@@ -21,18 +21,18 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.projection import RawArrays
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
+from gaussian_wrapping_addon.core.training import block_plan
 from gaussian_wrapping_addon.core.training.block_plan import (
     ARRAYS_NAME,
     PLAN_NAME,
     BlockPlan,
-    BlockSettings,
     chosen_photos,
     load_plan,
     plan_blocks,
     save_plan,
 )
 from gaussian_wrapping_addon.core.training.exposure import Exposure
-from tests.core.training.row_scene import SETTINGS, known_coarse, row_scene, two_blocks
+from tests.core.training.row_scene import SETTINGS, divided, known_coarse, row_scene, two_blocks
 from tests.core.training.small_scene import sphere_gaussians
 
 # -- Plans of blocks: cells, photos, what is trained and what stands still ------------------------
@@ -86,15 +86,14 @@ def test_cells_and_their_photos_lie_along_the_row(blocks: int) -> None:
     assert 0 < len(plan.blocks[0].views) < len(plan.views)
 
 
-def test_a_plan_is_the_same_each_time_and_on_any_number_of_threads() -> None:
+def test_a_plan_is_the_same_each_time_and_on_any_number_of_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     scene, photos = row_scene()
-    again = plan_blocks(
-        known_coarse(), scene, photos, SETTINGS, BlockSettings(2), Progress(), threads=2
-    )
+    again = plan_blocks(known_coarse(), scene, photos, divided(), Progress(), threads=2)
     assert again.digest == two_blocks().digest
-    other = plan_blocks(
-        known_coarse(), scene, photos, SETTINGS, BlockSettings(2, margin=0.3), Progress(), threads=1
-    )
+    monkeypatch.setattr(block_plan, "MARGIN", 0.3)
+    other = plan_blocks(known_coarse(), scene, photos, divided(), Progress(), threads=1)
     assert other.digest != again.digest
     assert all(
         set(narrow.trained) < set(wide.trained)
@@ -107,9 +106,7 @@ def test_sky_around_the_scene_makes_no_margin_wider() -> None:
     ball = sphere_gaussians(300)
     sky = ball.replaced(means=100.0 * ball.means, log_scales=ball.log_scales + np.log(100.0))
     coarse = dataclasses.replace(known, gaussians=known.gaussians.joined(sky))
-    plan = plan_blocks(
-        coarse, scene, photos, SETTINGS, BlockSettings(2), Progress(), threads=1
-    )  # fmt: skip
+    plan = plan_blocks(coarse, scene, photos, divided(), Progress(), threads=1)
     without = two_blocks(2)
     # It fills most of what the photos show.
     renderer, options = ViewRenderer(), RenderOptions(depth=False, statistics=True)
@@ -125,13 +122,13 @@ def test_sky_around_the_scene_makes_no_margin_wider() -> None:
         assert len(block.views) < len(plan.views)
 
 
-def test_what_the_photos_of_a_block_hardly_show_stands_still() -> None:
+def test_what_the_photos_of_a_block_hardly_show_stands_still(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Pruning and growth look at the block's photos alone: it would be lost."""
+    monkeypatch.setattr(block_plan, "COVERAGE", 0.5)
     scene, photos = row_scene()
-    plan = plan_blocks(
-        known_coarse(), scene, photos, SETTINGS, BlockSettings(2, coverage=0.5), Progress(),
-        threads=1,
-    )  # fmt: skip
+    plan = plan_blocks(known_coarse(), scene, photos, divided(), Progress(), threads=1)
     raw, renderer = RawArrays.from_gaussians(plan.coarse.gaussians), ViewRenderer()
     options = RenderOptions(depth=False, sh_degree=0, threads=1, statistics=True)
     weights = {}
@@ -168,15 +165,9 @@ def test_limits_of_blocks_add_up_to_that_of_the_whole() -> None:
 def test_what_cannot_be_divided_is_refused_and_planning_can_be_cancelled() -> None:
     scene, photos = row_scene()
     with pytest.raises(UsageError, match="22 blocks: 21 photos"):
-        plan_blocks(known_coarse(), scene, photos, SETTINGS, BlockSettings(22), Progress())
-    for wrong in ({"blocks": 0}, {"margin": -0.1}, {"coverage": float("nan")}, {"blocks": 1025}):
-        with pytest.raises(UsageError):
-            BlockSettings(**wrong)
+        plan_blocks(known_coarse(), scene, photos, divided(22), Progress())
     with pytest.raises(Cancelled):
-        plan_blocks(
-            known_coarse(), scene, photos, SETTINGS, BlockSettings(2),
-            Progress("plan", None, lambda: True),
-        )  # fmt: skip
+        plan_blocks(known_coarse(), scene, photos, divided(), Progress("plan", None, lambda: True))
 
 
 # -- Files of a plan: read again as written, refused when damaged or mixed up ---------------------

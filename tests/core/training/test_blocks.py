@@ -18,19 +18,18 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.settings import TrainingSettings
+from gaussian_wrapping_addon.core.training import blocks as block_module
 from gaussian_wrapping_addon.core.training import density, trainer
 from gaussian_wrapping_addon.core.training.backend import Backend
 from gaussian_wrapping_addon.core.training.block_plan import (
     BlockPlan,
-    BlockSettings,
+    coarse_settings,
     plan_blocks,
     train_coarse,
 )
 from gaussian_wrapping_addon.core.training.blocks import (
     block_settings,
-    join_blocks,
     joined_blocks,
-    train_block,
 )
 from gaussian_wrapping_addon.core.training.exposure import Exposure
 from gaussian_wrapping_addon.core.training.model_selection import Decision
@@ -39,7 +38,7 @@ from gaussian_wrapping_addon.core.training.state import TrainingResult, Training
 from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.device_kernels import DEVICES
 from tests.core.training.device_training import backend_of
-from tests.core.training.row_scene import SETTINGS, row_scene, two_blocks
+from tests.core.training.row_scene import SETTINGS, join_blocks, row_scene, train_block, two_blocks
 from tests.core.training.test_trainer import StopAt, assert_same
 
 # -- Training of a block: what stands still, interruptions, what is taken over --------------------
@@ -258,13 +257,15 @@ def test_parts_that_do_not_fit_are_refused() -> None:
         joined_blocks(plan, [other, parts[1]])
 
 
-def test_more_gaussians_than_allowed_leave_those_that_show_most(tmp_path: Path) -> None:
+def test_more_gaussians_than_allowed_leave_those_that_show_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(block_module, "POLISH_ITERATIONS", 0.0)
     plan, (scene, photos) = two_blocks(), row_scene()
     settings = dataclasses.replace(SETTINGS, max_gaussians=300)
     result = join_blocks(
-        plan, untrained(plan), scene, photos, settings, BlockSettings(2, polish_iterations=0.0),
-        tmp_path, Progress(), threads=1,
-    )  # fmt: skip
+        plan, untrained(plan), scene, photos, settings, tmp_path, Progress(), threads=1
+    )
     assert len(result.gaussians) == 300
     # The photos look from the sides, so what faces along the row or inwards is what goes.
     dropped = ~np.isin(plan.coarse.gaussians.means[:, 0], result.gaussians.means[:, 0])
@@ -272,14 +273,16 @@ def test_more_gaussians_than_allowed_leave_those_that_show_most(tmp_path: Path) 
     assert facing[dropped].mean() < 0.75 * facing[~dropped].mean()
 
 
-def test_joined_gaussians_are_trained_together_and_can_be_interrupted(tmp_path: Path) -> None:
+def test_joined_gaussians_are_trained_together_and_can_be_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plan, (scene, photos) = two_blocks(), row_scene()
-    blocks = BlockSettings(2, polish_iterations=0.5)
+    monkeypatch.setattr(block_module, "POLISH_ITERATIONS", 0.5)
 
     def joined(folder: str, progress: Progress | None = None, **changes: int) -> TrainingResult:
         (tmp_path / folder).mkdir(exist_ok=True)
         return join_blocks(
-            plan, untrained(plan), scene, photos, dataclasses.replace(SETTINGS, **changes), blocks,
+            plan, untrained(plan), scene, photos, dataclasses.replace(SETTINGS, **changes),
             tmp_path / folder, progress or Progress(), seed=1, threads=1,
         )  # fmt: skip
 
@@ -290,20 +293,16 @@ def test_joined_gaussians_are_trained_together_and_can_be_interrupted(tmp_path: 
     with pytest.raises(Cancelled):
         joined("parts", StopAt(70).progress())
     assert_same(whole.gaussians, joined("parts").gaussians)
-    still = join_blocks(
-        plan, untrained(plan), scene, photos, SETTINGS, BlockSettings(2, polish_iterations=0.0),
-        tmp_path, Progress(), threads=1,
-    )  # fmt: skip
+    longer = joined("parts", extra_iterations=10)
+    assert longer.iterations == 100
+    monkeypatch.setattr(block_module, "POLISH_ITERATIONS", 0.0)
+    still = joined("still")
     before = joined_blocks(plan, untrained(plan))
     assert torch.equal(still.gaussians.means, before.means)
     assert not torch.equal(whole.gaussians.means, before.means)
     assert whole.held_out_psnr > still.held_out_psnr
-    # Measured without an optimizer, and so without a checkpoint.
     assert [f.name for f in still.held_out] == [f.name for f in whole.held_out]
     assert still.iterations == SETTINGS.iterations
-    assert not list(tmp_path.glob("checkpoint*"))
-    longer = joined("parts", extra_iterations=10)
-    assert longer.iterations == 100
 
 
 @pytest.mark.proof
@@ -314,15 +313,15 @@ def test_two_blocks_are_as_good_as_one_training(tmp_path: Path) -> None:
         SETTINGS, iterations=500, max_gaussians=4000, densify_every=40, growth="auto",
         wrapping="off", sh_degree=0,
     )  # fmt: skip
-    blocks = BlockSettings(2)
+    settings = dataclasses.replace(settings, blocks=2)
     for name in ("whole", "coarse", "0", "1", "joined"):
         (tmp_path / name).mkdir()
     progress = Progress()
     whole = train(scene, photos, settings, tmp_path / "whole", progress, seed=2, threads=1)
     coarse = train_coarse(
-        scene, photos, blocks.coarse(settings), tmp_path / "coarse", progress, seed=2, threads=1
+        scene, photos, coarse_settings(settings), tmp_path / "coarse", progress, seed=2, threads=1
     )
-    plan = plan_blocks(coarse, scene, photos, settings, blocks, progress, threads=1)
+    plan = plan_blocks(coarse, scene, photos, settings, progress, threads=1)
     parts = [
         train_block(
             plan, index, scene, photos, settings, tmp_path / str(index), progress, seed=2, threads=1
@@ -330,16 +329,7 @@ def test_two_blocks_are_as_good_as_one_training(tmp_path: Path) -> None:
         for index in range(2)
     ]
     joined = join_blocks(
-        plan,
-        parts,
-        scene,
-        photos,
-        settings,
-        blocks,
-        tmp_path / "joined",
-        progress,
-        seed=2,
-        threads=1,
+        plan, parts, scene, photos, settings, tmp_path / "joined", progress, seed=2, threads=1
     )
     assert len(joined.gaussians) <= settings.max_gaussians
 

@@ -12,7 +12,7 @@ import pytest
 from gaussian_wrapping_addon.core.errors import ResourceError, UsageError
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.stereo.depth_maps import least_divisor
-from gaussian_wrapping_addon.core.training.block_plan import BlockSettings
+from gaussian_wrapping_addon.core.training.block_plan import coarse_settings
 from gaussian_wrapping_addon.core.training.estimate import (
     MATCHING_PIXEL_BYTES,
     MATCHING_PIXEL_S,
@@ -32,7 +32,7 @@ from gaussian_wrapping_addon.core.training.start import start_budget
 
 FACTS = SceneFacts(40, 640 * 480, 640, 3000)
 PLAIN = TrainingSettings(multi_view="off", growth="on", wrapping="on")
-MACHINE = Machine(2)
+MACHINE = Machine()
 
 STANDARD = TrainingSettings(iterations=3000, max_gaussians=80_000, max_image_px=640)
 
@@ -43,7 +43,7 @@ MEASURED = ((1.0, 335, 36_600), (0.357, 688, 52_506), (0.447, 561, 38_845))
 
 @pytest.mark.parametrize(("speed", "seconds", "gaussians"), MEASURED)
 def test_the_range_holds_measured_trainings(speed: float, seconds: int, gaussians: int) -> None:
-    found = estimate(FACTS, STANDARD, Machine(2, speed))
+    found = estimate(FACTS, STANDARD, Machine(speed))
     assert found.seconds_low < seconds < found.seconds_high
     assert gaussians <= found.gaussians <= STANDARD.max_gaussians
 
@@ -89,7 +89,7 @@ def test_extra_iterations_cost_what_the_last_ones_cost() -> None:
 
 
 def test_a_faster_machine_takes_less() -> None:
-    fast, slow = (estimate(FACTS, PLAIN, Machine(2, speed)) for speed in (2.0, 0.5))
+    fast, slow = (estimate(FACTS, PLAIN, Machine(speed)) for speed in (2.0, 0.5))
     assert slow.seconds_low == pytest.approx(4 * fast.seconds_low)
     assert slow.memory_bytes == fast.memory_bytes
 
@@ -129,7 +129,7 @@ def test_matching_adds_time_and_memory_once() -> None:
 
 def test_a_full_disk_is_refused_and_little_memory_is_told() -> None:
     found = estimate(FACTS, PLAIN, MACHINE)
-    plenty = Machine(2, 1.0, 10 * found.memory_bytes, 10 * found.disk_bytes)
+    plenty = Machine(1.0, 10 * found.memory_bytes, 10 * found.disk_bytes)
     assert check_resources(found, plenty) == []
     assert check_resources(found, MACHINE) == []  # a system that tells nothing
     with pytest.raises(ResourceError, match="free") as caught:
@@ -141,7 +141,7 @@ def test_a_full_disk_is_refused_and_little_memory_is_told() -> None:
 
 
 def test_photos_take_what_is_theirs_and_the_rest_is_read_on_demand() -> None:
-    machine = Machine(2, 1.0, 4 * 2**30)
+    machine = Machine(1.0, 4 * 2**30)
     few = estimate(FACTS, PLAIN, machine)
     assert few.photos.fits
     assert few.photos.all_bytes == round(FACTS.photos * FACTS.pixels * 3 * (1 + 1 / 4 + 1 / 16))
@@ -156,8 +156,8 @@ def test_photos_take_what_is_theirs_and_the_rest_is_read_on_demand() -> None:
 
 
 def test_this_machine_reads_what_is_free_also_for_folders_to_come(tmp_path: Path) -> None:
-    machine = this_machine(tmp_path / "not" / "yet", 3, 1.5)
-    assert (machine.threads, machine.speed) == (3, 1.5)
+    machine = this_machine(tmp_path / "not" / "yet", 1.5)
+    assert machine.speed == 1.5
     assert machine.disk_free_bytes > 0
     assert machine.memory_bytes >= 0
 
@@ -199,7 +199,10 @@ def test_more_blocks_make_smaller_processes() -> None:
     assert block == sorted(block, reverse=True)
     assert block[3] < 0.2 * block[0]
     assert coarse == sorted(coarse, reverse=True)
-    assert [BlockSettings(n).coarse_share for n in (2, 4, 8, 16)] == [0.5, 0.5, 0.25, 0.125]
+    assert [
+        coarse_settings(replace(LARGE, blocks=n)).max_gaussians / LARGE.max_gaussians
+        for n in (2, 4, 8, 16)
+    ] == [0.5, 0.5, 0.25, 0.125]
 
 
 def test_more_blocks_than_photos_are_refused_before_anything_is_trained() -> None:

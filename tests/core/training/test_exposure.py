@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.image_metrics import psnr
 from gaussian_wrapping_addon.core.resampling import as_unit_floats as as_floats
 from gaussian_wrapping_addon.core.training.exposure import (
@@ -106,10 +105,6 @@ def test_correction_is_the_affine_map_for_any_number_of_threads() -> None:
         kept.append((by_color.copy(), exposure.gradient.copy()))
     assert np.array_equal(kept[0][0], kept[1][0])
     assert np.array_equal(kept[0][1], kept[1][1])
-    with pytest.raises(UsageError, match="alpha"):
-        exposure.corrected(3, color, alpha[1:])
-    with pytest.raises(UsageError, match="gradient"):
-        exposure.backward(3, color, color[1:])
 
 
 def altered(truth: np.ndarray, light: np.ndarray) -> np.ndarray:
@@ -150,7 +145,9 @@ def test_known_gains_are_found_and_the_mean_is_pinned() -> None:
         assert np.abs(out - photos[view]).max() < 0.012
     assert np.abs(exposure.values[:count].astype(np.float64).mean(axis=0)).max() < 1e-8
     assert not exposure.values[count].any()
-    assert exposure.spread() == pytest.approx(float(np.sqrt((logs**2).mean())), rel=0.05)
+    assert float(np.sqrt(np.mean(exposure.values[exposure.trained, :3] ** 2))) == pytest.approx(
+        float(np.sqrt((logs**2).mean())), rel=0.05
+    )
 
 
 def test_start_gains_are_those_of_the_srgb_curve() -> None:
@@ -225,10 +222,6 @@ def test_what_does_not_fit_is_refused() -> None:
         Exposure.restore({**arrays, "trained": np.array([7])})
     with pytest.raises(KeyError):
         Exposure.restore({k: v for k, v in arrays.items() if k != "steps"})
-    with pytest.raises(UsageError, match="view 3"):
-        Exposure(3, [0, 3])
-    with pytest.raises(UsageError, match="shape"):
-        Exposure(3, [0], np.zeros((2, 3)))
 
 
 def test_rates_grow_for_short_runs_and_fall() -> None:
@@ -265,8 +258,6 @@ def test_fit_of_what_says_nothing_is_neutral() -> None:
     gain, offset = fit_exposure(np.full((24, 31, 3), 0.5), np.full((24, 31, 3), 0.6))
     np.testing.assert_allclose(gain, 1)
     np.testing.assert_allclose(offset, 0.1)
-    with pytest.raises(UsageError, match="size"):
-        fit_exposure(render, render[1:])
 
 
 def test_measuring_fits_one_half_and_corrects_the_other() -> None:

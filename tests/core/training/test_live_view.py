@@ -30,7 +30,7 @@ from gaussian_wrapping_addon.core.training.live_view import (
     LiveView,
     measure_held_out,
 )
-from gaussian_wrapping_addon.core.training.state import cancellable
+from gaussian_wrapping_addon.core.training.state import CancellablePhotos, cancellable
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
 
 SETTINGS = TrainingSettings(preview_every_s=10.0)
@@ -103,14 +103,15 @@ def test_measuring_is_the_mean_over_the_held_out_photos_within_their_masks() -> 
     assert math.isnan(measure_held_out(gaussians, masked, [], threads=1))
 
 
-def test_a_correction_is_applied_before_measuring() -> None:
+def test_a_correction_is_applied_before_measuring(monkeypatch: pytest.MonkeyPatch) -> None:
     _, photos = sphere_scene()
 
     def perfect(_image: np.ndarray, photo: np.ndarray, _mask: object) -> np.ndarray:
         return photo / 255.0
 
-    options = {"threads": 1, "exposure_correction": perfect}
-    assert measure_held_out(sphere_gaussians(20), photos, [0, 4], **options) == 100.0
+    monkeypatch.setattr(live_view, "corrected_for_measuring", perfect)
+    found = measure_held_out(sphere_gaussians(20), photos, [0, 4], threads=1, exposed=True)
+    assert found == 100.0
 
 
 def test_looking_changes_no_gaussian(tmp_path: Path) -> None:
@@ -148,9 +149,8 @@ def test_cancelling_is_noticed_before_the_next_view_is_rendered() -> None:
             return photos.photo(index, divisor)
 
     progress = Progress(is_cancelled=lambda: len(rendered) >= 2)
+    watched = CancellablePhotos(Watched(), progress)
     with pytest.raises(Cancelled):
-        measure_held_out(
-            sphere_gaussians(20), Watched(), [0, 1, 2, 3], threads=1, check=progress.check
-        )
+        measure_held_out(sphere_gaussians(20), watched, [0, 1, 2, 3], threads=1)
     assert rendered == [0, 1]
     assert list(cancellable([1, 2], Progress())) == [1, 2]

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core import limits
-from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.projection import RawArrays
 from gaussian_wrapping_addon.core.render.render import render
@@ -20,11 +19,10 @@ from gaussian_wrapping_addon.core.render.view_renderer import ViewPass, ViewRend
 from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.settings import TrainingSettings, preset
 from gaussian_wrapping_addon.core.training.adam import merge_gradients
+from gaussian_wrapping_addon.core.training.losses import NO_MASK
 from gaussian_wrapping_addon.core.training.multi_view import (
-    NO_MASK,
     MultiViewLoss,
     MultiViewOptions,
-    NeighbourLimits,
     PhotoView,
     choose_pixels,
     find_neighbours,
@@ -356,15 +354,9 @@ def test_bytes_are_read_like_floats() -> None:
     )
 
 
-def test_options_and_sizes() -> None:
+def test_options_of_settings() -> None:
     options = MultiViewOptions.of_settings(TrainingSettings(multi_view_every=3))
     assert options == MultiViewOptions(0.15, 0.02, "signed", 4000, weight=3.0)
-    with pytest.raises(UsageError, match="cubed"):
-        MultiViewOptions(correlation="cubed")
-    with pytest.raises(UsageError, match="photo is"):
-        losses(plane_gaussians(), other_photo=PHOTO)
-    with pytest.raises(UsageError, match="mask is"):
-        losses(plane_gaussians(), mask=np.ones((3, 3), np.bool_))
 
 
 # -- Multi-view kernels on an exact plane: zero errors, derivatives, skipped pixels ---------------
@@ -387,8 +379,8 @@ def compare(  # type: ignore[no-untyped-def]  # four arrays
 ):
     noise = np.zeros(len(pixels))
     pair = pair_of(view, pixels, threads)
-    rise, spread = TrainingSettings.patch_rise, SAMPLES * TrainingSettings.patch_contrast**2
-    return pair.compare(noise, grey, other_grey, mask, other_mask, squared, 1, rise, spread)
+    options = MultiViewOptions(correlation="squared" if squared else "signed", patch_sizes=1)
+    return pair.compare(noise, (grey, other_grey), (mask, other_mask), options)
 
 
 def test_true_plane_shows_both_photos_the_same() -> None:
@@ -604,7 +596,7 @@ def test_kernels_do_not_depend_on_the_number_of_threads() -> None:
 # -- Neighbouring cameras: limits, order, independence of other cameras ---------------------------
 
 RADIUS = limits.SCENE_RADIUS
-PUBLISHED = NeighbourLimits.of_settings(preset("paper").training)
+PUBLISHED = preset("paper").training
 
 
 def turned(x: float, angle_deg: float) -> Camera:
@@ -656,11 +648,6 @@ def test_a_camera_without_candidates_changes_no_other() -> None:
     together = find_neighbours([*lonely, *close])
     assert listed(together[:2]) == [[], []]
     assert [(found - 2).tolist() for found in together[2:]] == listed(alone)
-
-
-def test_few_are_kept_where_few_are_asked_for() -> None:
-    cameras = [turned(0.1 * i, 0) for i in range(6)]
-    assert find_neighbours(cameras, NeighbourLimits(most=2))[0].tolist() == [1, 2]
 
 
 def test_images_of_other_points_do_not_count() -> None:

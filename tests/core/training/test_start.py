@@ -196,9 +196,9 @@ def first_state(setting: str, folder: Path, events: list[ProgressEvent]) -> Trai
     few = dataclasses.replace(scene, views=scene.views[3:8])
     own = PhotosInMemory(few, photos.photos[3:8])
     settings = dataclasses.replace(SETTINGS, dense_start=setting)
-    run = trainer._Trainer(few, own, settings, folder, 0, 1)
     progress = Progress("train", events.append)
-    return run._start(Rounds(run.stepper, run.inside, progress), "key", progress)
+    run = trainer._Trainer(few, own, settings, folder, 0, 1, progress=progress)
+    return run._start(Rounds(run.stepper, run.inside, progress), "key")
 
 
 def test_the_training_starts_from_what_the_setting_says(tmp_path: Path) -> None:

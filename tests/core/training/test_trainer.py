@@ -23,7 +23,7 @@ from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import cpu_backend, iteration, live_view, rounds, trainer
 from gaussian_wrapping_addon.core.training.start import LEAST_REACH
-from gaussian_wrapping_addon.core.training.state import TrainingResult
+from gaussian_wrapping_addon.core.training.state import TrainingResult, cancellable
 from gaussian_wrapping_addon.core.training.trainer import train, with_backdrop
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
 from tests.synthetic import look_at
@@ -209,7 +209,7 @@ def test_a_start_from_an_oriented_splat_keeps_its_orientation(tmp_path: Path) ->
     settings = dataclasses.replace(
         SETTINGS, iterations=10, wrapping="on", wrap_rounds=0, full_size="on"
     )
-    result = train(scene, photos, settings, tmp_path, Progress(), threads=1, start_splat=path)
+    result = train(scene, photos, settings, tmp_path, Progress(), threads=1, start=path)
     assert len(result.gaussians) == 150
     outward = (result.gaussians.normals().detach() * truth.means).sum(1).numpy()
     assert (outward[::2] < 0).all(), "a few iterations turn no normal over"
@@ -337,7 +337,7 @@ def test_windows_that_a_mask_empties_say_nothing(tmp_path: Path) -> None:
         SETTINGS, iterations=30, pixels_per_iteration=450, holdout_every=0, exposure="off"
     )
     run = trainer._Trainer(scene, store, settings, tmp_path, 0, 1)
-    state = run._start(rounds.Rounds(run.stepper, None, Progress()), "key", Progress())
+    state = run._start(rounds.Rounds(run.stepper, None, Progress()), "key")
     for _ in range(30):
         run.stepper.step(state)
     numbers = {row[1] % iteration._MAX_WINDOWS for row in state.error_history._rows}
@@ -494,8 +494,6 @@ def test_photos_of_nothing_give_no_colours() -> None:
 
 
 def test_it_can_be_cancelled() -> None:
-    def check() -> None:
-        raise Cancelled()
-
+    views = cancellable(range(3), Progress(is_cancelled=lambda: True))
     with pytest.raises(Cancelled):
-        with_backdrop(wall(), Photos(AT_WALL), range(3), threads=1, check=check)
+        with_backdrop(wall(), Photos(AT_WALL), views, threads=1)

@@ -44,12 +44,12 @@ from gaussian_wrapping_addon.core.scene.scene import load_saved_scene
 from gaussian_wrapping_addon.core.settings import JobSettings, TrainingSettings
 from gaussian_wrapping_addon.core.training import blocks as block_module
 from gaussian_wrapping_addon.core.training.block_plan import (
-    BlockSettings,
+    coarse_settings,
     plan_blocks,
     train_coarse,
 )
-from gaussian_wrapping_addon.core.training.blocks import join_blocks, train_block
 from tests.core.jobs.block_jobs import TRAINING, cameras_of, row_job
+from tests.core.training.row_scene import join_blocks, train_block
 from tests.core.training.test_trainer import StopAt, assert_same
 
 KNOWN = {"version": STAGE_VERSIONS["train"], "threads": 1, "device": choose_device("cpu")}
@@ -66,21 +66,21 @@ def trained(folder: JobFolder, job: JobFile, progress: Progress | None = None) -
 
 def of_library(folder: JobFolder, root: Path, settings: TrainingSettings) -> OrientedGaussians:
     """Return what the library makes of the same scene and settings."""
-    scene, blocks = load_saved_scene(cameras_of(folder).folder), BlockSettings.of(settings)
+    scene = load_saved_scene(cameras_of(folder).folder)
     for name in ("coarse", "0", "1", "joined"):
         (root / name).mkdir(parents=True)
-    less = blocks.coarse(settings)
+    less = coarse_settings(settings)
     photos, progress = PhotoStore(scene, settings.max_image_px), Progress()
     coarse = train_coarse(
         scene, PhotoStore(scene, less.max_image_px), less, root / "coarse", progress, threads=1
     )
-    plan = plan_blocks(coarse, scene, photos, settings, blocks, progress, threads=1)
+    plan = plan_blocks(coarse, scene, photos, settings, progress, threads=1)
     parts = [
         train_block(plan, k, scene, photos, settings, root / str(k), progress, threads=1).gaussians
         for k in range(2)
     ]
     return join_blocks(
-        plan, parts, scene, photos, settings, blocks, root / "joined", progress, threads=1
+        plan, parts, scene, photos, settings, root / "joined", progress, threads=1
     ).gaussians
 
 
@@ -231,13 +231,13 @@ def test_all_priors_and_poses_of_the_coarse_training_reach_blocks_and_result(
     """A dense start leaves confirmed depths for each block; refined poses are the result's."""
     folder, job = row_job(tmp_path, dense_start="on", refine_poses="on")
     given: list[int] = []
-    original = block_module.train_block
+    original = block_module.block_training
 
-    def noted(plan: object, index: int, *rest: object, priors: dict[int, object], **more: object):
+    def noted(plan: object, index: int, settings: object, priors: dict[int, object]):
         given.append(len(priors))
-        return original(plan, index, *rest, priors=priors, **more)
+        return original(plan, index, settings, priors)
 
-    monkeypatch.setattr(block_module, "train_block", noted)
+    monkeypatch.setattr(block_module, "block_training", noted)
     stage = trained(folder, job)
     assert given == [of["photos"] for of in stage.done["blocks"]]
     assert stage.done["poses_refined"] is True
