@@ -150,12 +150,7 @@ class JobClient:
 
     @classmethod
     def start(
-        cls,
-        folder: Path,
-        job: JobFile,
-        *,
-        python: str | None = None,
-        keep_running: bool = False,
+        cls, folder: Path, job: JobFile, *, python: str | None = None, keep_running: bool = False
     ) -> JobClient:
         """Write the job into ``folder`` and start its worker.
 

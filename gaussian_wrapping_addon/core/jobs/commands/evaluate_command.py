@@ -139,11 +139,7 @@ _Mesh = tuple[Any, Any]
 
 
 def _against_truth(
-    given: dict[str, Any],
-    source: Path,
-    read: Callable[[], _Mesh],
-    threads: int,
-    progress: Progress,
+    given: dict[str, Any], source: Path, read: Callable[[], _Mesh], threads: int, progress: Progress
 ) -> tuple[_Mesh, dict[str, Any], list[str]]:
     """Return the mesh, its figures against the ground truth, and their table."""
     from ...evaluation.command import EvaluationRequest, evaluate_mesh, read_cameras, table
@@ -175,11 +171,7 @@ def _against_truth(
 
 
 def _against_photos(
-    given: dict[str, Any],
-    source: Path,
-    read: Callable[[], _Mesh],
-    threads: int,
-    progress: Progress,
+    given: dict[str, Any], source: Path, read: Callable[[], _Mesh], threads: int, progress: Progress
 ) -> tuple[_Mesh, dict[str, Any], list[str]]:
     """Return the mesh, its mesh-based rendering, and the figures as lines."""
     from .mesh_based_command import MeshBasedRequest, evaluate_mesh_based, table

@@ -39,12 +39,7 @@ ERROR_TAIL_BYTES = 2000
 
 
 def run_in_worker(
-    request: dict[str, Any],
-    *,
-    python: str,
-    module: str,
-    what: str,
-    grace_s: float = 2.0,
+    request: dict[str, Any], *, python: str, module: str, what: str, grace_s: float = 2.0
 ) -> int:
     """Run a command in the worker's Python, log its output, and return its exit code.
 

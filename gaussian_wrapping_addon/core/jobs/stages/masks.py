@@ -153,12 +153,7 @@ def coarse_settings(settings: TrainingSettings) -> TrainingSettings:
 
 
 def _coarse_training(
-    scene: Scene,
-    job: JobFile,
-    folder: Path,
-    progress: Progress,
-    threads: int,
-    device: DeviceChoice,
+    scene: Scene, job: JobFile, folder: Path, progress: Progress, threads: int, device: DeviceChoice
 ) -> OrientedGaussians:
     from ...gaussians.files import load_gaussians, save_gaussians
     from ...masks.making import with_background

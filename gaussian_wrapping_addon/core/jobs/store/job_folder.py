@@ -11,13 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ... import limits
-from ...errors import (
-    DISK_FULL_ERRNOS,
-    ParseError,
-    UsageError,
-    known_error,
-    unwritable_error,
-)
+from ...errors import DISK_FULL_ERRNOS, ParseError, UsageError, known_error, unwritable_error
 from ...files import (
     overwrite_json,
     read_bounded,

@@ -14,15 +14,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ... import limits
-from ...errors import (
-    DatasetError,
-    ParseError,
-    WrapError,
-)
-from ...files import (
-    read_json,
-    write_json,
-)
+from ...errors import DatasetError, ParseError, WrapError
+from ...files import read_json, write_json
 from ...names import JOB_MARKER
 from ...photos.finder import second_copies
 from ...photos.formats import PHOTO_SUFFIXES
