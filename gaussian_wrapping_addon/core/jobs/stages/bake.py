@@ -30,7 +30,7 @@ VERSION = 1
 
 def require_training(folder: JobFolder, job: JobFile, cameras: Stage) -> None:
     """Raise if a bake would have to train first."""
-    key = training_keys(STAGE_VERSIONS["train"], cameras.key, job)[0]
+    key, _ = training_keys(cameras.key, job)
     if read_done(folder.stages / f"train-{key}") is None:
         raise no_finished_training(folder.root)
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import json
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,6 +41,7 @@ from ..store.stage_folder import (
 
 if TYPE_CHECKING:
     from ...loading.real_world import UnitsRequest
+    from ...regions.shapes import Region
 
 
 # -- Frames stage: photos out of a video, kept in a stage folder of their own ---------------------
@@ -110,8 +112,7 @@ def run_frames(
         }
 
     def whole(stage_folder: Path) -> bool:
-        done = read_done(stage_folder) or {}
-        names = done.get("names")
+        names = (read_done(stage_folder) or {}).get("names")
         return isinstance(names, list) and all(
             isinstance(name, str) and (stage_folder / FRAMES_FOLDER / name).is_file()
             for name in names
@@ -119,15 +120,6 @@ def run_frames(
 
     stage = run_stage(folder.stages, "frames", request.key, progress, work, whole=whole)
     return stage.folder / FRAMES_FOLDER, stage.done
-
-
-def with_frame_facts(scene: Scene, done: dict[str, Any]) -> Scene:
-    """Return a scene of frames with what is known of their video."""
-    return replace(
-        scene,
-        warnings=(*read_warnings(done["warnings"]), *scene.warnings),
-        facts={**scene.facts, **done["facts"]},
-    )
 
 
 # -- Make a scene of a splat without photos: place virtual cameras around it and render them ------
@@ -269,22 +261,19 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
     UsageError
         A splat is to get metres by photos, or a video by GPS, which they have none of.
     """
-    from ...array_file import is_whole
     from ...loading.load import load_scene
     from ...loading.real_world import UnitsRequest
     from ...photos.photo_file import AS_WRITTEN, MaskReading
-    from ...scene.scene import MOST_POINTS_BYTES, POINTS_NAME, SCENE_NAME, save_scene
+    from ...scene.scene import save_scene
 
-    source = Path(job.source)
-    turntable = job.settings.turntable
-    equirectangular = job.settings.equirectangular
-    reading = MaskReading(job.settings.mask_invert == "on", job.settings.mask_grow_px)
-    settings = job.settings
+    source, settings = Path(job.source), job.settings
+    turntable, equirectangular = settings.turntable, settings.equirectangular
+    reading = MaskReading(settings.mask_invert == "on", settings.mask_grow_px)
     units = UnitsRequest(settings.georeference, settings.markers, settings.control_points)
     wanted = frames_request(job)
     photos = source_fingerprint(source) if wanted is None else wanted.key
     key = stage_key(
-        STAGE_VERSIONS["cameras"], job.source, photos, job.settings.seed,
+        STAGE_VERSIONS["cameras"], job.source, photos, settings.seed,
         *([] if turntable == "auto" else [turntable]),
         *([] if equirectangular == "auto" else ["equirectangular", equirectangular]),
         *([] if reading == AS_WRITTEN else [reading.invert, reading.grow_px]),
@@ -326,11 +315,12 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
                 progress = progress.span(FRAMES_SHARE, 1.0)
             scene = load_scene(
                 root, stage_folder, progress,
-                seed=job.settings.seed, threads=threads, turntable=turntable, reading=reading,
+                seed=settings.seed, threads=threads, turntable=turntable, reading=reading,
                 equirectangular=equirectangular, units=units, in_order=taken is not None,
             )  # fmt: skip
             if taken is not None:
-                scene = with_frame_facts(scene, taken)
+                warnings = (*read_warnings(taken["warnings"]), *scene.warnings)
+                scene = replace(scene, warnings=warnings, facts={**scene.facts, **taken["facts"]})
         save_scene(scene, stage_folder)
         return {
             "views": len(scene.views),
@@ -342,11 +332,7 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
     def whole(stage_folder: Path) -> bool:
         if wanted is not None and read_done(wanted.folder(folder.stages)) is None:
             return False  # its photos may lie there
-        try:
-            read_json(stage_folder / SCENE_NAME)
-        except (FileNotFoundError, ParseError):
-            return False
-        return is_whole(stage_folder / POINTS_NAME, MOST_POINTS_BYTES)
+        return is_whole_scene(stage_folder)
 
     return run_stage(folder.stages, "cameras", key, progress, work, whole=whole)
 
@@ -366,6 +352,28 @@ def _units_key(units: UnitsRequest) -> list[str]:
     return ["units", units.georeference, units.markers, content]
 
 
+def is_whole_scene(stage_folder: Path) -> bool:
+    """Return whether the files of a saved scene are there and whole."""
+    from ...array_file import is_whole
+    from ...scene.scene import MOST_POINTS_BYTES, POINTS_NAME, SCENE_NAME
+
+    try:
+        read_json(stage_folder / SCENE_NAME)
+    except (FileNotFoundError, ParseError):
+        return False
+    return is_whole(stage_folder / POINTS_NAME, MOST_POINTS_BYTES)
+
+
+def regions_listed(listed: str, scene: Scene) -> list[Region]:
+    """Return the regions of a setting that is a JSON list of region bodies, scene frame."""
+    from ...regions.scene_regions import parse_region, region_in_scene
+
+    return [
+        region_in_scene(parse_region(body, Path("job.json")), scene.world_from_scene)
+        for body in json.loads(listed)
+    ]
+
+
 def scene_stage_name(job: JobFile) -> str:
     """Return the name of the stages whose scene a job trains on."""
     return MASKED if job.settings.masks_are_made else "cameras"
@@ -382,7 +390,7 @@ def scene_of_finished_training(folder: JobFolder, job: JobFile) -> Stage | None:
     found: list[tuple[float, int, Stage]] = []
     for path in sorted(folder.stages.glob(f"{name}-*")):
         done, key = read_done(path), path.name.removeprefix(f"{name}-")
-        train_key, base_key = training_keys(STAGE_VERSIONS["train"], key, job)
+        train_key, base_key = training_keys(key, job)
         trained = read_done(folder.stages / f"train-{train_key}")
         if trained is None and job.command == "more":
             shorter = shorter_training(folder.stages, base_key, extra)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import os
 from pathlib import Path
@@ -12,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...array_file import is_whole
 from ...devices import DeviceChoice
-from ...errors import DatasetError, ParseError, UsageError, WrapError
-from ...files import read_bounded, read_json, write_bytes, write_json
+from ...errors import DatasetError, UsageError, WrapError
+from ...files import read_bounded, write_bytes, write_json
 from ...limits import MIN_IMAGES
 from ...machine import helper_memory_limit_bytes
 from ...masks.mask_folder import (
@@ -29,14 +27,13 @@ from ...masks.mask_folder import (
     read_list,
     used_masks,
 )
-from ...progress import COMPILING, Progress, ReportWarning
-from ...regions.scene_regions import parse_region, region_in_scene
+from ...progress import Progress, ReportWarning
 from ...regions.shapes import Region
-from ...settings import TrainingSettings
 from ..store.job_file import JobFile, training_keys
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done, run_stage, stage_key
-from .cameras import MASKED, scene_of_finished_training
+from .cameras import MASKED, is_whole_scene, regions_listed, scene_of_finished_training
+from .training_cost import compile_if_needed
 
 if TYPE_CHECKING:
     from ...gaussians.model import OrientedGaussians
@@ -96,7 +93,7 @@ def make_region_masks(
     gaussians = _coarse_training(
         scene, job, folder / "coarse", progress.span(0.0, _TRAINED), threads, device
     )
-    regions = _regions(job, scene)
+    regions = regions_listed(job.settings.mask_regions, scene)
     side = _inside(regions, gaussians)
     gaussians = gaussians.select(torch.from_numpy(side >= 0))
     inside = side[side >= 0] == 1
@@ -128,14 +125,6 @@ def _limited(camera: Camera) -> Camera:
     return camera.resized(max(1, width), max(1, height))
 
 
-def _regions(job: JobFile, scene: Scene) -> list[Region]:
-    """Return the job's mask regions, scene frame."""
-    return [
-        region_in_scene(parse_region(body, Path("job.json")), scene.world_from_scene)
-        for body in json.loads(job.settings.mask_regions)
-    ]
-
-
 def _inside(regions: list[Region], gaussians: OrientedGaussians) -> np.ndarray:
     """Tell which Gaussians are in regions, (n,) int8: 1, 0, or -1 for fog in there."""
     means = gaussians.means.detach().cpu().double().numpy()
@@ -147,11 +136,6 @@ def _inside(regions: list[Region], gaussians: OrientedGaussians) -> np.ndarray:
     return found
 
 
-def coarse_settings(settings: TrainingSettings) -> TrainingSettings:
-    """Return the settings of the short training of a job."""
-    return dataclasses.replace(settings, **COARSE)
-
-
 def _coarse_training(
     scene: Scene, job: JobFile, folder: Path, progress: Progress, threads: int, device: DeviceChoice
 ) -> OrientedGaussians:
@@ -159,18 +143,14 @@ def _coarse_training(
     from ...masks.making import with_background
     from ...photos.store import PhotoStore
     from ...training.device_backend import chosen_backend
-    from ...training.estimate import renderer_is_compiled
     from ...training.trainer import train
-    from ...training.warm_up import compile_kernels
 
     done = folder / "gaussians.npz"
     if done.is_file():
         return load_gaussians(done)
-    settings = coarse_settings(job.settings.training)
+    settings = dataclasses.replace(job.settings.training, **COARSE)
     folder.mkdir(exist_ok=True)
-    if not device.is_cuda and not renderer_is_compiled():
-        progress.enter(COMPILING, "compiling the renderer, about a minute, only this once")
-        compile_kernels(settings, folder, progress, threads=threads)
+    compile_if_needed(settings, folder, progress, threads, device)
     photos = PhotoStore(scene, settings.max_image_px)
     result = train(
         with_background(scene, photos, seed=job.settings.seed), photos, settings, folder, progress,
@@ -228,7 +208,7 @@ def run_masks(
     masks = read_list(where) or masks
     key = stage_key(STAGE_VERSIONS[MASKED], cameras.key, digest(where, masks))
     if of_finished:
-        train_key, _ = training_keys(STAGE_VERSIONS["train"], key, job)
+        train_key, _ = training_keys(key, job)
         if read_done(folder.stages / f"train-{train_key}") is None:
             earlier = scene_of_finished_training(folder, job)
             if earlier is not None:
@@ -242,7 +222,7 @@ def run_masks(
         return _write_masked_scene(stage_folder, cameras, where, masks)
 
     stage = run_stage(
-        folder.stages, MASKED, key, progress.span(0.95, 1.0), work, whole=_is_whole_scene
+        folder.stages, MASKED, key, progress.span(0.95, 1.0), work, whole=is_whole_scene
     )
     return dataclasses.replace(stage, before=(cameras, made))
 
@@ -434,13 +414,3 @@ def _write_masked_scene(
         "warnings": [warning.to_json() for warning in warnings],
         "facts": facts,
     }
-
-
-def _is_whole_scene(stage_folder: Path) -> bool:
-    from ...scene.scene import MOST_POINTS_BYTES, POINTS_NAME, SCENE_NAME
-
-    try:
-        read_json(stage_folder / SCENE_NAME)
-    except (FileNotFoundError, ParseError):
-        return False
-    return is_whole(stage_folder / POINTS_NAME, MOST_POINTS_BYTES)

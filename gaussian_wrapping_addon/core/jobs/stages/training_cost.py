@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...devices import DeviceChoice, stage_device
 from ...progress import COMPILING, Progress, ReportWarning
+from ...settings import TrainingSettings
 from ..store.job_file import JobFile
 from ..store.rollback import checkpoints
 
@@ -24,10 +25,7 @@ def fitting_device(
 ) -> DeviceChoice:
     """Return the job's device, or the processor where its memory does not suffice.
 
-    Parameters
-    ----------
-    gaussians : int, optional
-        Largest number of them; by default that of the whole training.
+    ``gaussians``: largest number of them; by default that of the whole training.
     """
     from ...training.estimate import gpu_bytes, scene_facts
 
@@ -39,7 +37,7 @@ def fitting_device(
 
 
 def compile_if_needed(
-    job: JobFile, folder: Path, progress: Progress, threads: int, device: DeviceChoice
+    settings: TrainingSettings, folder: Path, progress: Progress, threads: int, device: DeviceChoice
 ) -> None:
     """Compile the renderer if that was never done on this machine, and say so."""
     from ...training.estimate import renderer_is_compiled
@@ -48,7 +46,7 @@ def compile_if_needed(
     if device.is_cuda or renderer_is_compiled():
         return
     progress.enter(COMPILING, "compiling the renderer, about a minute, only this once")
-    compile_kernels(job.settings.training, folder, progress, threads=threads)
+    compile_kernels(settings, folder, progress, threads=threads)
 
 
 def estimated_cost(
@@ -66,29 +64,23 @@ def estimated_cost(
     ResourceError
         The disk is too full.
     """
-    from ...training.estimate import (
-        check_resources,
-        estimate_training,
-        scene_facts,
-        speeds,
-        this_machine,
-    )
+    from ...training import estimate
     from ...training.splat_start import wrapping_settings
     from .cameras import start_splat_of
 
     training = job.settings.training
     if start_splat_of(job) is not None:
         training = wrapping_settings(training)
-    compile_if_needed(job, stage_folder, progress, threads, device)
+    compile_if_needed(job.settings.training, stage_folder, progress, threads, device)
     progress.update(0.0, "timing this machine")
-    machine = this_machine(stage_folder, threads, *speeds(threads, device.device))
+    speeds = estimate.speeds(threads, device.device)
+    machine = estimate.this_machine(stage_folder, threads, *speeds)
     done = [int(path.stem.rpartition("-")[2]) for path in checkpoints(stage_folder)]
-    first = max(done, default=0)
-    expected = estimate_training(scene_facts(scene), training, machine, first=first)
-    warnings = check_resources(expected, machine)  # raises where the disk is too full
+    facts, first = estimate.scene_facts(scene), max(done, default=0)
+    expected = estimate.estimate_training(facts, training, machine, first=first)
+    warnings = estimate.check_resources(expected, machine)  # raises where the disk is too full
     _logger.info("estimate: %s", expected.sentence())
     for warning in warnings:
         _logger.warning("%s", warning.text)
     progress.update(0.0, f"training will take {expected.span()}")
-    values = {**dataclasses.asdict(expected), "speed": machine.speed}
-    return values, warnings
+    return {**dataclasses.asdict(expected), "speed": machine.speed}, warnings

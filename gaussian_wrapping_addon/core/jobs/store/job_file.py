@@ -39,7 +39,7 @@ from ...settings import (
     to_json,
 )
 from ...units.georeference import metric_from_world
-from .stage_folder import stage_key
+from .stage_folder import STAGE_VERSIONS, stage_key
 
 # -- What a job bakes the photos onto: the entry ``bake`` of the job file -------------------------
 #
@@ -486,20 +486,22 @@ def start_fingerprint(path: str) -> list[Any]:
     return [path, state.st_size, state.st_mtime_ns]
 
 
-def training_keys(version: int, cameras_key: str, job: JobFile) -> tuple[str, str]:
-    """Return the stage's key, and the key without the extra iterations."""
+def training_keys(cameras_key: str, job: JobFile) -> tuple[str, str]:
+    """Return the key of a training's stage, and the key without the extra iterations."""
     described = key_values(job.settings.training)
     start = start_fingerprint(job.settings.start_splat)
+    version = STAGE_VERSIONS["train"]
     parts = (version, cameras_key, job.settings.seed, *([start] if start else []))
     key = stage_key(*parts, described)
     described.pop("extra_iterations")
     return key, stage_key(*parts, described)
 
 
-def blocks_key(version: int, cameras_key: str, job: JobFile) -> str:
+def blocks_key(cameras_key: str, job: JobFile) -> str:
     """Return the key of the blocks of a training: without what follows when they are joined."""
     described = key_values(job.settings.training)
     described.pop("extra_iterations")
+    version = STAGE_VERSIONS["train"]
     return stage_key("blocks", version, cameras_key, job.settings.seed, described)
 
 
