@@ -60,19 +60,12 @@ def sendable_clock() -> Callable[[], float]:
 def run_child(request: dict[str, Any]) -> dict[str, Any]:
     """Run a module of the add-on in a child process and wait for it.
 
-    Parameters
-    ----------
-    request : dict
-        ``module``; ``arguments``, JSON values; ``folder``, relative to the shared folder where
-        ``is_shared``; ``command``, of the interpreter with its options up to the module, or
-        ``None`` for that of this computer.
-
-    Returns
-    -------
-    dict
-        ``code``, ``error``, ``hint``, ``host``, the last ``lines`` of its output, the ``answer``
-        that it gave (``None`` for none), and whether it is ``refused``: whatever this computer is
-        asked, it cannot do.
+    ``request``: ``module``; ``arguments``, JSON values; ``folder``, relative to the shared folder
+    where ``is_shared``; ``command``, of the interpreter with its options up to the module, or
+    ``None`` for that of this computer.
+    Returns dict: ``code``, ``error``, ``hint``, ``host``, the last ``lines`` of its output, the
+    ``answer`` that it gave (``None`` for none), and whether it is ``refused``: whatever this
+    computer is asked, it cannot do.
     """
     host = os.uname().nodename if hasattr(os, "uname") else os.environ.get("COMPUTERNAME", "")
     try:
@@ -118,10 +111,7 @@ def run_child(request: dict[str, Any]) -> dict[str, Any]:
 def _command(request: dict[str, Any], host: str) -> list[str]:
     """Return the command line of the child.
 
-    Raises
-    ------
-    OSError
-        The shared folder or the add-on is not there.
+    Raises OSError: the shared folder or the add-on is not there.
     """
     folder = Path(request["folder"])
     if request["is_shared"]:

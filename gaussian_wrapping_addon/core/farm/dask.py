@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 #
 # Names and results travel over the network, data over the folder that all computers share.
 
-
 _logger = logging.getLogger(__name__)
 
 HTTP = "127.0.0.1:0"
@@ -84,23 +83,11 @@ class _Bound:
 class DaskTasks:
     """A connection to a Dask cluster.
 
-    Parameters
-    ----------
-    address : str
-        ``"local"``, or that of a scheduler: ``tls://HOST:PORT``, ``tcp://`` on this computer only.
-    processes : int
-        Workers of a local cluster.
-    certificates : str
-        Folder of the certificates for ``tls://``.
-
-    Raises
-    ------
-    MissingExtraError
-        The worker lacks Dask.
-    UsageError
-        The address is none, is not encrypted, or the certificates are missing.
-    WorkerError
-        No scheduler answers there.
+    ``address``: ``"local"``, or that of a scheduler: ``tls://HOST:PORT``, ``tcp://`` on this
+    computer only; ``processes``: workers of a local cluster; ``certificates``: folder of the
+    certificates for ``tls://``.
+    Raises MissingExtraError: the worker lacks Dask; UsageError: the address is none, is not
+    encrypted, or the certificates are missing; WorkerError: no scheduler answers there.
     """
 
     def __init__(self, address: str, processes: int, certificates: str = "") -> None:
@@ -154,17 +141,8 @@ class DaskTasks:
     def submit(self, name: str, key: str, request: dict[str, Any]) -> None:
         """Have a child run somewhere (see :func:`.child.run_child`), not where one was refused.
 
-        Parameters
-        ----------
-        name : str
-            By which it is found again.
-        key : str
-            Unique: by it the scheduler knows the task.
-
-        Raises
-        ------
-        FarmLostError
-            The scheduler is gone.
+        ``name``: by which it is found again; ``key``: unique: by it the scheduler knows the task.
+        Raises FarmLostError: the scheduler is gone.
         """
         if self._client.status not in _CONNECTED:
             raise self._lost()
@@ -194,10 +172,7 @@ class DaskTasks:
     def ended(self, seconds: float) -> list[Ended]:
         """Return which children have ended; wait at most so long for the first.
 
-        Raises
-        ------
-        FarmLostError
-            The scheduler is gone.
+        Raises FarmLostError: the scheduler is gone.
         """
         until_s = time.monotonic() + seconds
         while True:
@@ -214,11 +189,8 @@ class DaskTasks:
     def _look_after_workers(self) -> None:
         """Submit for any worker what waits for some that are gone: Dask would wait for ever.
 
-        Raises
-        ------
-        FarmLostError
-            A cluster of this computer has no workers any more: Dask starts one again that dies at
-            work, and gives up one that dies while it starts.
+        Raises FarmLostError: a cluster of this computer has no workers any more: Dask starts one
+        again that dies at work, and gives up one that dies while it starts.
         """
         now_s = time.monotonic()
         watched = self._bound or self._cluster is not None
@@ -296,15 +268,8 @@ def _send_child_as_source(log_level: int) -> None:
 async def check_scheduler(address: str, security: Any) -> None:
     """Ask a scheduler for its name: a client would wait for ever for one that accepts and hangs.
 
-    Parameters
-    ----------
-    security : distributed.Security or None
-        See :func:`security_of`.
-
-    Raises
-    ------
-    WorkerError
-        It does not answer.
+    ``security``: see :func:`security_of`.
+    Raises WorkerError: it does not answer.
     """
     from distributed.core import rpc
 
@@ -331,10 +296,7 @@ def request_of(
 
     The folder is named relative to the shared folder of this computer, if it lies in it.
 
-    Parameters
-    ----------
-    command : list of str or None
-        For children on this computer.
+    ``command``: for children on this computer.
     """
     shared = os.environ.get(child.SHARED_VARIABLE, "")
     is_shared = bool(shared) and command is None and folder.is_relative_to(Path(shared).resolve())
@@ -348,10 +310,7 @@ def request_of(
 def security_of(address: str, certificates: str) -> Any:
     """Return what Dask needs for an address; ``None`` where nothing is encrypted.
 
-    Raises
-    ------
-    UsageError
-        Certificates are needed and missing.
+    Raises UsageError: certificates are needed and missing.
     """
     if not address.startswith("tls://"):
         return None
@@ -368,7 +327,6 @@ def security_of(address: str, certificates: str) -> Any:
 
 
 # -- Ask each worker of a Dask cluster something, beside its work and within a time limit ---------
-
 
 _CLOCK_READINGS = 3
 """Of which the one with the shortest round trip counts: the first ones open connections."""
@@ -407,20 +365,10 @@ async def ask_workers(
 ) -> AsyncIterator[Judged]:
     """Have each worker run children at once, whatever it works on; yield what comes of them.
 
-    Parameters
-    ----------
-    requests : callable
-        Returns the requests for the worker of a number; the next one is made where one had no
-        answer.
-    judge : callable
-        Receives the answers.
-    limit_s : float
-        Time for each worker.
-
-    Raises
-    ------
-    WorkerError
-        No scheduler answers.
+    ``requests``: returns the requests for the worker of a number; the next one is made where one
+    had no answer.
+    ``judge``: receives the answers; ``limit_s``: time for each worker.
+    Raises WorkerError: no scheduler answers.
     """
     from distributed import Client
 

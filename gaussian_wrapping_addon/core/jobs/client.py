@@ -62,13 +62,9 @@ KILLED_BAKE_HINT = (
 def worker_python(preference: str = "") -> str:
     """Return the interpreter for workers, or the folder of a worker environment.
 
-    In this order: the preference, the environment variable, the environment made by the add-on,
-    the running Python if it has torch.
-
-    Raises
-    ------
-    UsageError
-        The interpreter named does not exist, or none is set up.
+    In this order: the preference, the environment variable, the environment made by the add-on, the
+    running Python if it has torch. Raises UsageError: the interpreter named does not exist, or none
+    is set up.
     """
     chosen = preference or os.environ.get(PYTHON_VARIABLE, "")
     if chosen and not Path(chosen).exists():
@@ -113,15 +109,8 @@ def _writing(root: Path) -> Iterator[None]:
 def prepare_job(folder: Path, job: JobFile) -> JobFolder:
     """Write a job into its folder, to be started or submitted.
 
-    Parameters
-    ----------
-    folder : Path
-        New, empty, or a job folder.
-
-    Raises
-    ------
-    WrapError
-        The folder cannot be used, or a job runs there; the earlier job stays.
+    ``folder``: new, empty, or a job folder.
+    Raises WrapError: the folder cannot be used, or a job runs there; the earlier job stays.
     """
     target = JobFolder(real_path(folder))
     source = Path(job.source)
@@ -154,21 +143,10 @@ class JobClient:
     ) -> JobClient:
         """Write the job into ``folder`` and start its worker.
 
-        Parameters
-        ----------
-        folder : Path
-            New, empty, or a job folder.
-        job : JobFile
-            What to do.
-        python : str or None
-            Interpreter that has torch; ``None`` asks :func:`worker_python`.
-        keep_running : bool
-            Whether the worker continues when this process ends.
-
-        Raises
-        ------
-        DeviceError
-            The job names a GPU that the driver does not find; nothing was written.
+        ``folder``: new, empty, or a job folder; ``job``: what to do.
+        ``python``: interpreter that has torch; ``None`` asks :func:`worker_python`.
+        ``keep_running``: whether the worker continues when this process ends.
+        Raises DeviceError: the job names a GPU that the driver does not find; nothing was written.
         """
         _reject_absent_device(job)
         return cls._launch(prepare_job(folder, job), python, keep_running)
@@ -184,15 +162,8 @@ class JobClient:
     ) -> JobClient:
         """Start a worker for the job in ``folder``; finished stages are re-used.
 
-        Parameters
-        ----------
-        device : str or None
-            Replaces the job's setting; ``None`` keeps it.
-
-        Raises
-        ------
-        DeviceError
-            As for :meth:`start`.
+        ``device``: replaces the job's setting; ``None`` keeps it.
+        Raises DeviceError: as for :meth:`start`.
         """
         target = JobFolder(real_path(folder))
         if not target.is_job():
@@ -333,10 +304,8 @@ class JobClient:
     def cancel(self) -> None:
         """Ask the worker to stop; it stops within about two seconds and keeps a checkpoint.
 
-        Raises
-        ------
-        ParseError
-            ``cancel`` in the job folder is a link or another thing that is not a file.
+        Raises ParseError: ``cancel`` in the job folder is a link or another thing that is not a
+        file.
         """
         with contextlib.suppress(OSError):
             touch_regular(self.folder.cancel_path)
@@ -366,10 +335,7 @@ class JobClient:
     def wait(self, timeout_s: float | None = None) -> JobStatus:
         """Wait until our worker process has ended and return the final status.
 
-        Raises
-        ------
-        WorkerError
-            The job was started by another process.
+        Raises WorkerError: the job was started by another process.
         """
         if self._process is None:
             raise WorkerError("This job was started by another process.", "Poll it instead.")

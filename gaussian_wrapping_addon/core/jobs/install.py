@@ -55,7 +55,6 @@ from .store.job_folder import JobFolder, JobStatus
 
 # -- Find the Python installations that a worker environment can be created from ------------------
 
-
 OLDEST = (3, 11)
 NEWEST_WITH_WHEELS = (3, 13)
 """Some packages (xatlas) have no wheels for newer versions yet, which are listed last."""
@@ -116,10 +115,7 @@ class FoundPython:
 def probe(path: str) -> FoundPython:
     """Query the properties of an interpreter.
 
-    Raises
-    ------
-    UsageError
-        It is not a Python, does not respond, is 32-bit or too old.
+    Raises UsageError: it is not a Python, does not respond, is 32-bit or too old.
     """
     other = "Choose another Python 3.11 to 3.13 (python.org, or your system's packages)."
     if _is_blender(path):
@@ -193,7 +189,6 @@ def find_pythons(own: str = "", paths: Iterable[str] | None = None) -> list[Foun
 # index. From an index, all other packages are installed by the hashes of their files, before
 # torch: its builds have other hashes on each index. A folder of wheels is taken as it is.
 
-
 CPU = "cpu"
 CUDA = "cuda"
 CUDA_BRINGS = "Training and vacancy on the GPU, for several GiB more on the disk"
@@ -251,10 +246,7 @@ def cuda_present() -> bool:
 def torch_index(choice: str, system: str = "") -> str:
     """Return the extra package index for a torch build on a system; ``""`` for none.
 
-    Raises
-    ------
-    UsageError
-        The system has no such build.
+    Raises UsageError: the system has no such build.
     """
     system = system or platform.system()
     if choice == CUDA and system == "Darwin":
@@ -265,10 +257,7 @@ def torch_index(choice: str, system: str = "") -> str:
 def all_commands(request: SetupRequest, python: FoundPython) -> list[Command]:
     """Return every command of a set-up, in order.
 
-    Raises
-    ------
-    UsageError
-        The Python or the build of torch cannot be used.
+    Raises UsageError: the Python or the build of torch cannot be used.
     """
     folder = request.environment.next_folder()
     if request.adds:
@@ -345,10 +334,7 @@ def _additions(request: SetupRequest, python: FoundPython) -> list[Command]:
 def check_addition(request: SetupRequest) -> None:
     """Raise if there is no complete environment to add to, or nothing to add.
 
-    Raises
-    ------
-    UsageError
-        Says which, and the next step.
+    Raises UsageError: says which, and the next step.
     """
     if not request.extras:
         raise UsageError("No extra is named.", "Name what to add.")
@@ -361,10 +347,7 @@ def check_addition(request: SetupRequest) -> None:
 def check_folders(request: SetupRequest) -> None:
     """Raise if the folders of a set-up cannot be used; writes nothing.
 
-    Raises
-    ------
-    UsageError
-        A folder cannot be used; names it.
+    Raises UsageError: a folder cannot be used; names it.
     """
     root, wheels = request.environment.root, request.find_links
     try:
@@ -387,7 +370,6 @@ def check_folders(request: SetupRequest) -> None:
 #
 # A set-up builds in a folder that is not in use and switches to it at the end: if it is stopped,
 # the previous environment, or none, remains.
-
 
 _logger = logging.getLogger(__name__)
 
@@ -600,10 +582,7 @@ def _check_disk(root: Path, needed_gib: int) -> None:
 def start_process(command: list[str], temporary: Path) -> subprocess.Popen[bytes]:
     """Start :func:`main` in a process group of its own, with temporary files in ``temporary``.
 
-    Raises
-    ------
-    WorkerError
-        The process does not start.
+    Raises WorkerError: the process does not start.
     """
     inherited = {
         k: v for k, v in child_environment().items() if k.upper() not in _IGNORED_VARIABLES
@@ -662,12 +641,8 @@ def _delete_unused(environment: WorkerEnvironment, keep: Path | None = None) -> 
 def remove(environment: WorkerEnvironment) -> None:
     """Delete an environment made by the add-on, and nothing else.
 
-    Raises
-    ------
-    UsageError
-        The folder has no marker of ours, or a set-up is running in it.
-    OSError
-        A file cannot be deleted.
+    Raises UsageError: the folder has no marker of ours, or a set-up is running in it; OSError: a
+    file cannot be deleted.
     """
     root = environment.root
     if root.is_symlink() or not environment.is_ours():

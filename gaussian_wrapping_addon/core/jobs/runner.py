@@ -26,10 +26,7 @@ def run_job(
 ) -> None:
     """Run a job to its end in ``folder``; finished stages are re-used.
 
-    Raises
-    ------
-    WrapError
-        Any typed failure of a stage; stages finished so far stay.
+    Raises WrapError: any typed failure of a stage; stages finished so far stay.
     """
     threads = job.settings.threads or default_threads()
     overall = JobProgress(sink, is_cancelled)
@@ -60,10 +57,7 @@ def run_job(
 def _device_of(job: JobFile) -> DeviceChoice:
     """Choose the device of a job and log it with the reason.
 
-    Raises
-    ------
-    DeviceError
-        The job names a GPU that cannot be used.
+    Raises DeviceError: the job names a GPU that cannot be used.
     """
     # Nothing of a bake runs on a GPU: it goes on where the GPU of its training is missing.
     chosen = choose_device("cpu" if job.command == "bake" else job.settings.device)

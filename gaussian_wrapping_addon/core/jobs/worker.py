@@ -37,7 +37,6 @@ from .store.rollback import discard_rollback, roll_back
 
 # -- What a job that failed tells: exit code, error and next step of any exception ----------------
 
-
 FULL_DISK_HINT = "Make room on that disk, then resume: the last checkpoint is intact."
 MEMORY_HINT = "Close other programs, or choose a smaller preset."
 BUG_HINT = "Send the job folder's log.txt with a bug report."
@@ -59,10 +58,7 @@ class Failure:
 def failure_of(error: Exception, root: Path) -> Failure:
     """Describe an exception that ended a job.
 
-    Parameters
-    ----------
-    root : Path
-        The job folder: where a full disk is, if the error does not name a file.
+    ``root``: the job folder: where a full disk is, if the error does not name a file.
     """
     if isinstance(error, WrapError):
         cause = error.__cause__
@@ -81,7 +77,6 @@ def failure_of(error: Exception, root: Path) -> Failure:
 
 
 # -- The worker process: lock the job folder, run the job, keep ``status.json`` up to date --------
-
 
 _logger = logging.getLogger(__name__)
 

@@ -30,7 +30,6 @@ from ..files import read_json, write_json
 # with a venv, or with packages if the Python cannot create a venv, and ``ready.json``, without
 # which no job uses it. The marker names the folder in use; a set-up builds another one beside it.
 
-
 MARKER = "gaussian-wrapping-worker.json"
 READY = "ready.json"
 VENV = "venv"
@@ -197,7 +196,6 @@ def ready_worker() -> str:
 
 # -- The pinned packages of ``requirements-worker.txt``, and errors of a worker's Python ----------
 
-
 FILE_NAME = "requirements-worker.txt"
 HASHES_NAME = "requirements-worker-hashes.txt"
 """The same packages and what they need, by the hashes of their files; without torch."""
@@ -240,10 +238,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 def requirements_file() -> Path:
     """Return the add-on's requirements file, in the installed package or in the repository.
 
-    Raises
-    ------
-    UsageError
-        The file is missing.
+    Raises UsageError: the file is missing.
     """
     for folder in (_PACKAGE_ROOT, _PACKAGE_ROOT.parent):
         if (folder / FILE_NAME).is_file():
@@ -260,10 +255,7 @@ def hashes_file(requirements: Path) -> Path | None:
 def read_requirements(path: Path) -> list[Requirement]:
     """Return the packages of a list; its syntax is left to pip.
 
-    Raises
-    ------
-    UsageError
-        The file cannot be read or names no package.
+    Raises UsageError: the file cannot be read or names no package.
     """
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
@@ -317,7 +309,6 @@ def not_started(python: str, error: OSError) -> WorkerError:
 # An extra is installed when the user asks for it, by the hashes of its files, without
 # dependencies: what its packages need must be in ``requirements-worker.txt`` or among its
 # packages.
-
 
 EXTRA_HASHES_NAME = "requirements-worker-{}-hashes.txt"
 """Files of an extra by their hashes, written by ``tools.worker_hashes``."""
@@ -389,10 +380,7 @@ EXTRAS = (
 def extra_named(name: str) -> Extra:
     """Return an extra by its name.
 
-    Raises
-    ------
-    UsageError
-        There is none of this name; lists those there are.
+    Raises UsageError: there is none of this name; lists those there are.
     """
     for extra in EXTRAS:
         if extra.name == name:
@@ -404,10 +392,7 @@ def extra_named(name: str) -> Extra:
 def read_extra_names(text: str) -> tuple[str, ...]:
     """Return the names in a list such as ``heif,raw``, each once, in the order of the table.
 
-    Raises
-    ------
-    UsageError
-        A name is unknown.
+    Raises UsageError: a name is unknown.
     """
     given = {extra_named(word.strip()).name for word in text.split(",") if word.strip()}
     return tuple(extra.name for extra in EXTRAS if extra.name in given)
@@ -428,17 +413,9 @@ def extra_hashes_file(requirements: Path, extra: Extra) -> Path | None:
 def load_extra(name: str, needed_by: str) -> Any:
     """Import the module of an extra.
 
-    Parameters
-    ----------
-    name : str
-        Of the extra.
-    needed_by : str
-        What needs it, such as the names of files.
-
-    Raises
-    ------
-    MissingExtraError
-        It is not installed, in another version, or broken; says how to install it.
+    ``name``: of the extra; ``needed_by``: what needs it, such as the names of files.
+    Raises MissingExtraError: it is not installed, in another version, or broken; says how to
+    install it.
     """
     extra = extra_named(name)
     try:
@@ -462,15 +439,8 @@ def load_extra(name: str, needed_by: str) -> Any:
 def load_extras(needed_by: Mapping[str, str]) -> None:
     """Import several extras; see :func:`load_extra`.
 
-    Parameters
-    ----------
-    needed_by : mapping
-        What needs each of the extras.
-
-    Raises
-    ------
-    MissingExtraError
-        Names all that are missing.
+    ``needed_by``: what needs each of the extras.
+    Raises MissingExtraError: names all that are missing.
     """
     missing: list[MissingExtraError] = []
     for name, files in needed_by.items():

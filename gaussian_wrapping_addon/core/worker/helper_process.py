@@ -33,7 +33,6 @@ from .spawn import caller_option, kill_group, spawn
 
 # -- Peak memory of this process and of its helper processes --------------------------------------
 
-
 _largest_helper_bytes = 0
 
 
@@ -112,7 +111,6 @@ def is_limited_below(wanted_bytes: int) -> bool:
 # "DatasetError"}``. The last line of every helper that exits normally is ``{"peak_bytes": ...}``,
 # its peak memory.
 
-
 _logger = logging.getLogger(__name__)
 
 FAILURES: dict[str, type[WrapError]] = {
@@ -138,11 +136,8 @@ _MAX_SAID = 300
 def child_command(module: str, *arguments: str, python: str | None = None) -> list[str]:
     """Return the argument list that runs ``core.<module>`` in a child interpreter.
 
-    Parameters
-    ----------
-    python : str or None
-        An interpreter, or the folder of a worker environment; None for the running interpreter
-        with its packages.
+    ``python``: an interpreter, or the folder of a worker environment; None for the running
+    interpreter with its packages.
     """
     entry = Path(__file__).with_name("worker_main.py")
     if python:
@@ -180,19 +175,11 @@ def run_helper(
 ) -> None:
     """Run ``core.<module>`` on ``folder`` and wait for it, forwarding its progress.
 
-    Raises
-    ------
-    Cancelled
-        The user asked to stop; the helper has been ended.
-    DatasetError, MeshingError, UsageError
-        The helper reported such a failure.
-    ResourceError
-        The helper reported one, or the deadline passed.
-    MemoryShortageError
-        The system gave the helper too little memory.
-    WorkerError
-        The helper crashed, or reached ``memory_bytes``: the message names the signal and its last
-        line, the log has the end of its output. Or the worker's Python lacks a package.
+    Raises Cancelled: the user asked to stop; the helper has been ended; DatasetError, MeshingError,
+    UsageError: the helper reported such a failure; ResourceError: the helper reported one, or the
+    deadline passed; MemoryShortageError: the system gave the helper too little memory; WorkerError:
+    the helper crashed, or reached ``memory_bytes``: the message names the signal and its last line,
+    the log has the end of its output. Or the worker's Python lacks a package.
     """
     command = child_command("worker.helper_entry", module, str(folder), str(memory_bytes or 0))
     process = spawn(command)

@@ -17,7 +17,6 @@ from typing import IO, Any
 
 # -- Start child processes in groups of their own and end them with their descendants -------------
 
-
 _THREADING = {
     # Idle OpenMP threads of torch wait instead of spinning: spinning threads occupy the cores that
     # our own threads compute on (measured: rendering took twice the processor time).
@@ -60,21 +59,12 @@ def spawn(
 ) -> subprocess.Popen[bytes]:
     """Start a child in a new process group; it inherits no open files.
 
-    Parameters
-    ----------
-    command : list of str
-        Program and arguments, without a shell. Our own Python is started isolated (``-I``).
-    stdin, stdout, stderr : int or file
-        As in ``subprocess``; by default a child has no input.
-    environment : dict, optional
-        Default: :func:`child_environment`.
-    folder : Path, optional
-        Working directory; default: the parent's.
-
-    Raises
-    ------
-    OSError
-        The program does not start.
+    ``command``: program and arguments, without a shell. Our own Python is started isolated
+    (``-I``).
+    ``stdin``, ``stdout``, ``stderr``: as in ``subprocess``; by default a child has no input.
+    ``environment``: default: :func:`child_environment`.
+    ``folder``: working directory; default: the parent's.
+    Raises OSError: the program does not start.
     """
     return subprocess.Popen(
         command,
@@ -91,18 +81,9 @@ def spawn(
 def run_to_end(command: list[str], deadline_s: float) -> tuple[int, str, str]:
     """Start a child and wait for it; return its exit code and output.
 
-    Returns
-    -------
-    code : int
-    output, error_output : str
-        Text of stdout and stderr.
-
-    Raises
-    ------
-    OSError
-        The program does not start.
-    subprocess.TimeoutExpired
-        The deadline passed; the child has been ended.
+    Returns ``code``; ``output, error_output``: text of stdout and stderr.
+    Raises OSError: the program does not start; subprocess.TimeoutExpired: the deadline passed; the
+    child has been ended.
     """
     process = spawn(command)
     try:
@@ -136,7 +117,6 @@ def kill_group(process: subprocess.Popen[Any], grace_s: float = 2.0) -> None:
 # glog, in pycolmap, catches SIGTERM when it is imported: the process then dies with a native
 # trace instead of the typed end that its own handler would bring.
 
-
 _UNKNOWN = ctypes.c_void_p(-1).value
 """What C returns for a signal without handlers: SIG_ERR."""
 
@@ -165,7 +145,6 @@ def kept_signal_handlers() -> Iterator[None]:
 #
 # A pid alone is used again. A parent alone says nothing to a child that starts when its caller is
 # dead already: it has another parent from the start. So each child is told who called it.
-
 
 CALLER_OPTION = "gwrap_caller"
 """``-X`` option of children: pid and start time of the process that started them."""
@@ -284,7 +263,6 @@ class Caller:
 #
 # Elsewhere, and as well, a child looks after its caller (:mod:`.spawn`): that needs
 # the interpreter, which long native calls may hold.
-
 
 _SET_PARENT_DEATH_SIGNAL = 1
 """``PR_SET_PDEATHSIG`` of prctl(2). The signal comes when the thread that started this process

@@ -152,10 +152,7 @@ def main(arguments: list[str]) -> int:
 def diagnose_worker(python: str) -> list[Diagnosis]:
     """Diagnose another interpreter, in a child process.
 
-    Raises
-    ------
-    WorkerError
-        The interpreter does not start or reports nothing.
+    Raises WorkerError: the interpreter does not start or reports nothing.
     """
     try:
         command = child_command("jobs.commands.doctor", python=python)

@@ -80,16 +80,8 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
 def input_facts(source: Path, settings: JobSettings | None = None) -> SceneFacts:
     """Return number and size of an input's photos and points, from headers and poses alone.
 
-    Parameters
-    ----------
-    source : Path
-    settings : JobSettings, optional
-        Of a video, they may say how many frames are used; else the most is assumed.
-
-    Raises
-    ------
-    DatasetError
-        The input holds no photo that can be read.
+    ``settings``: of a video, they may say how many frames are used; else the most is assumed.
+    Raises DatasetError: the input holds no photo that can be read.
     """
     from ...loading.other_inputs import FAR_VIEWS, NEAR_VIEWS, PHOTO_SIDE_PX, takes_for_panoramas
     from ...loading.source_kind import SPLAT, VIDEO, read_poses, source_kind

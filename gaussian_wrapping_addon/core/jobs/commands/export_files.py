@@ -78,12 +78,8 @@ class StoredMesh:
 def result_of(folder: Path) -> Path:
     """Return the result folder of a job folder or of a result folder.
 
-    Raises
-    ------
-    UsageError
-        The folder is neither.
-    DatasetError
-        The job has no result yet, or its folder holds links.
+    Raises UsageError: the folder is neither; DatasetError: the job has no result yet, or its folder
+    holds links.
     """
     for path in (folder / "result", folder):
         if (path / "scene.json").is_file():
@@ -97,10 +93,7 @@ def result_of(folder: Path) -> Path:
 def frames_of(result: Path) -> tuple[Similarity, Similarity]:
     """Return ``world_from_scene`` and ``blender_from_scene`` of a result.
 
-    Raises
-    ------
-    ParseError
-        ``scene.json`` or ``placement.json`` holds no valid transform.
+    Raises ParseError: ``scene.json`` or ``placement.json`` holds no valid transform.
     """
     path = result / "scene.json"
     try:
@@ -119,16 +112,9 @@ def frames_of(result: Path) -> tuple[Similarity, Similarity]:
 def export_files(request: ExportRequest) -> Iterator[Path]:
     """Write every file of a request; yield each once it and its sidecar are complete.
 
-    Raises
-    ------
-    UsageError
-        An unknown format, shading or region.
-    DatasetError, ParseError
-        The result is incomplete.
-    MeshingError
-        A mesh or a Gaussian is not finite; nothing of it is written.
-    ResourceError
-        The folder cannot be written.
+    Raises UsageError: an unknown format, shading or region; DatasetError, ParseError: the result is
+    incomplete; MeshingError: a mesh or a Gaussian is not finite; nothing of it is written;
+    ResourceError: the folder cannot be written.
     """
     from ...texture.file_checks import write_errors
 

@@ -33,7 +33,6 @@ from .doctor import Diagnosis, diagnose
 # Runs on a Dask worker as the parts of a job do, as a child process of the worker's Python. Its
 # last line is ``{"answer": {...}}``.
 
-
 MODULE = "jobs.commands.farm_findings"
 COMPARED = ("torch", "numpy")
 """Packages that must have the same version on all computers: results depend on them."""
@@ -100,7 +99,6 @@ def _findings(out: Path) -> dict[str, Any]:
 # All files of the check lie in it, so that nothing is left once it is removed: a worker that
 # comes too late has no place to write to.
 
-
 _logger = logging.getLogger(__name__)
 
 SEEN_S = 10.0
@@ -115,10 +113,7 @@ _REMOVALS = 5
 class MeetingFolder:
     """Made with ``with``, which removes it again.
 
-    Parameters
-    ----------
-    shared : Path
-        The shared folder or one in it, which a job could lie in.
+    ``shared``: the shared folder or one in it, which a job could lie in.
     """
 
     def __init__(self, shared: Path) -> None:
@@ -190,7 +185,6 @@ def _text(path: Path) -> str:
 
 # -- What is found about one worker of a Dask cluster, and what is wrong with it ------------------
 
-
 MAX_CLOCK_S = 60.0
 """States of parts have the time of their computer; one of three minutes ago counts as left."""
 MAX_CHARACTERS = 300
@@ -243,10 +237,7 @@ async def finding_of(
 ) -> WorkerFinding:
     """Judge the answer of a worker.
 
-    Parameters
-    ----------
-    here : mapping
-        The versions of this computer, see :func:`.farm_findings.versions`.
+    ``here``: the versions of this computer, see :func:`.farm_findings.versions`.
     """
     values = _values(answer)
     problems = [

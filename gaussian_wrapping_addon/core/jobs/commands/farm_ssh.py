@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 # -- A Dask scheduler in this process, its workers told as they come and go, and an orderly end
 
-
 END_S = 10.0
 """Longest time in which others are told that this process ends."""
 POLL_S = 0.5
@@ -73,10 +72,7 @@ class Ending:
 async def serving(address: Address, certificates: str) -> AsyncIterator[Scheduler]:
     """Run a scheduler that listens at an address, and tell which workers come and go.
 
-    Raises
-    ------
-    UsageError
-        It cannot listen there, or certificates are missing.
+    Raises UsageError: it cannot listen there, or certificates are missing.
     """
     from distributed import Scheduler
 
@@ -117,7 +113,6 @@ async def _tell_workers(scheduler: Scheduler) -> None:
 # Runs in the worker's Python; writes one JSON object per line, in the protocol of commands. A
 # worker ends with its connection: it reads its input, which ends with this process, however that
 # ends.
-
 
 _END_S = 5.0
 _MAX_LINE_BYTES = 4000

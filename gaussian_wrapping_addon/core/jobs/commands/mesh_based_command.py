@@ -39,12 +39,8 @@ def evaluate_mesh_based(
 ) -> dict[str, Any]:
     """Return the figures of a mesh in world coordinates as plain JSON values.
 
-    Raises
-    ------
-    UsageError
-        There are no test photos, or one of them is a training photo.
-    DatasetError, ParseError
-        Photos or cameras cannot be used.
+    Raises UsageError: there are no test photos, or one of them is a training photo; DatasetError,
+    ParseError: photos or cameras cannot be used.
     """
     from ...evaluation.mesh_based_rendering import MeshBasedSettings, mesh_based_rendering
     from ...evaluation.photo_views import LONG_SIDE_PX, folder_scene, photo_views
@@ -103,12 +99,8 @@ def no_test_photos(name: str, is_job: bool) -> UsageError:
 def job_scene(folder: Path) -> tuple[Scene, list[str]]:
     """Return the scene of a job's result and the names of the photos held out of its training.
 
-    Raises
-    ------
-    DatasetError
-        The job has no result, or the stage that its cameras came from is gone.
-    ParseError
-        A file is not in the format that jobs write.
+    Raises DatasetError: the job has no result, or the stage that its cameras came from is gone;
+    ParseError: a file is not in the format that jobs write.
     """
     import numpy as np
 

@@ -32,7 +32,6 @@ from ...worker.spawn import Caller, kill_group, spawn
 # The child writes one JSON object per line to stdout: ``{"message"}`` for progress, ``{"line"}``
 # for a table, ``{"warning", "code"}``, and ``{"error", "hint"}`` at the end.
 
-
 _logger = logging.getLogger("gaussian_wrapping")
 
 ERROR_TAIL_BYTES = 2000
@@ -43,21 +42,12 @@ def run_in_worker(
 ) -> int:
     """Run a command in the worker's Python, log its output, and return its exit code.
 
-    Parameters
-    ----------
-    request : dict
-        What the child's module takes; plain JSON values.
-    python : str
-        The worker's interpreter.
-    module, what : str
-        The child's module, and its name in errors; all commands use the protocol above.
-    grace_s : float
-        Time in which it may end by itself when this is interrupted.
-
-    Raises
-    ------
-    WorkerError
-        It does not start, or ends without reporting an error.
+    ``request``: what the child's module takes; plain JSON values.
+    ``python``: the worker's interpreter.
+    ``module``, ``what``: the child's module, and its name in errors; all commands use the protocol
+    above.
+    ``grace_s``: time in which it may end by itself when this is interrupted.
+    Raises WorkerError: it does not start, or ends without reporting an error.
     """
     text = json.dumps(request, allow_nan=False)
     with tempfile.TemporaryFile() as error_file:
@@ -119,7 +109,6 @@ def _log_line(values: dict[str, Any]) -> bool:
 #
 # Writes one JSON object per line to stdout, which :mod:`.run_in_worker` reads.
 
-
 PARENT_POLL_S = 1.0
 
 
@@ -131,11 +120,8 @@ def run_command(
 
     The process ends when its caller does.
 
-    Parameters
-    ----------
-    leave : callable, optional
-        Called in another thread before the process ends with its caller: takes away what ``work``
-        has left elsewhere.
+    ``leave``: called in another thread before the process ends with its caller: takes away what
+    ``work`` has left elsewhere.
     """
     watched = (Caller(),) if leave is None else (Caller(), leave)
     threading.Thread(target=exit_with_caller, args=watched, daemon=True).start()

@@ -22,17 +22,9 @@ MODULE = "jobs.part_process"
 class FarmEngine:
     """Runs each part by ``run-part`` on a Dask cluster.
 
-    Parameters
-    ----------
-    root : Path
-        The job folder, which all computers see.
-    settings : JobSettings
-        ``computers``, ``processes``, ``certificates``, ``threads`` and ``device`` are read.
-
-    Raises
-    ------
-    MissingExtraError, UsageError, WorkerError
-        As :class:`~.dask.DaskTasks`.
+    ``root``: the job folder, which all computers see; ``settings``: ``computers``, ``processes``,
+    ``certificates``, ``threads`` and ``device`` are read.
+    Raises MissingExtraError, UsageError, WorkerError: as :class:`~.dask.DaskTasks`.
     """
 
     trusts_states = True

@@ -37,7 +37,6 @@ from ..store.stage_folder import STAGE_VERSIONS, stage_key
 
 # -- Exit codes of ``run-part``: what an engine may do with a part that is not done ---------------
 
-
 DONE = EXIT_DONE
 NEVER = 1
 """Bad data: it fails wherever it is run."""
@@ -58,7 +57,6 @@ def part_exit_code(error: WrapError) -> int:
 
 # -- The version of the code that runs parts: two computers must have the same --------------------
 
-
 _CORE = Path(__file__).resolve().parents[2]
 _DIGITS = 12
 
@@ -74,7 +72,6 @@ def code_version() -> str:
 
 
 # -- The state of each part of a job: ``parts/NAME.json``, written by the process that runs it ----
-
 
 STATES_FOLDER = "parts"
 STATES = ("RUNNING", "DONE", "FAILED")
@@ -210,7 +207,6 @@ def keep_states(root: Path, names: Collection[str]) -> None:
 
 # -- The parts of a job, what each needs, and ``parts.json`` (docs/file-formats.md, Parts) --------
 
-
 VERSION = 1
 PARTS_NAME = "parts.json"
 KINDS = (
@@ -265,13 +261,7 @@ class PartsGraph:
     parts: tuple[Part, ...]
 
     def part(self, name: str) -> Part:
-        """Return a part by its name.
-
-        Raises
-        ------
-        UsageError
-            There is none of this name.
-        """
+        """Return a part by its name. Raises UsageError: there is none of this name."""
         for part in self.parts:
             if part.name == name:
                 return part
@@ -306,12 +296,8 @@ def _json_value(value: Any) -> Any:
 def read_parts(folder: Path) -> PartsGraph:
     """Read and check ``parts.json`` of a job folder.
 
-    Raises
-    ------
-    UsageError
-        There is none.
-    ParseError
-        It is damaged, of another version, too large, or its parts do not fit together.
+    Raises UsageError: there is none; ParseError: it is damaged, of another version, too large, or
+    its parts do not fit together.
     """
     path = folder / PARTS_NAME
     try:
@@ -416,7 +402,6 @@ def _check_order(path: Path, parts: Sequence[Part]) -> None:
 
 # -- Plan the parts of a job: those of its stages, and those of tiles once they are known ---------
 
-
 # Shares of a job's time: measured on the demo scene, 2 cores.
 STAGE_SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
 MASKS_SHARE = 0.1
@@ -450,12 +435,7 @@ def plan_hash(job: JobFile) -> str:
 def plan_parts(folder: Path, job: JobFile, tiles: Mapping[str, PlannedTiles]) -> PartsGraph:
     """Return the parts of a job, in an order in which they can be run one after another.
 
-    Parameters
-    ----------
-    folder : Path
-        The job folder.
-    tiles : mapping
-        By region, those that are known to be meshed in tiles.
+    ``folder``: the job folder; ``tiles``: by region, those that are known to be meshed in tiles.
     """
     parts = _begin(job)
     last = parts[-1].name
@@ -487,10 +467,7 @@ def fixed_tiles(job: JobFile) -> dict[str, PlannedTiles]:
 def plan_if_missing(folder: JobFolder) -> PartsGraph:
     """Return the parts of a job folder; plan them if that was never done, or for another job.
 
-    Raises
-    ------
-    UsageError, ParseError
-        There is no job, or a file is damaged.
+    Raises UsageError, ParseError: there is no job, or a file is damaged.
     """
     job = read_job(folder.job_path)
     if (folder.root / PARTS_NAME).exists():

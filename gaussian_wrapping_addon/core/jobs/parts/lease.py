@@ -39,12 +39,7 @@ class PartHeldError(WorkerError):
 class PartLease:
     """The lease of this process on one part.
 
-    Parameters
-    ----------
-    root : Path
-        The job folder.
-    name, plan : str
-        The part, and the plan that it is run for.
+    ``root``: the job folder; ``name``, ``plan``: the part, and the plan that it is run for.
     """
 
     def __init__(self, root: Path, name: str, plan: str, attempt: int) -> None:
@@ -62,17 +57,9 @@ class PartLease:
     def take(self, is_cancelled: Callable[[], bool] | None = None) -> bool:
         """Begin to hold the part; return false if another process has done it meanwhile.
 
-        Parameters
-        ----------
-        is_cancelled : callable, optional
-            With it, wait until a process that runs the part has ended, or has done it.
-
-        Raises
-        ------
-        PartHeldError
-            Another process runs it.
-        Cancelled
-            While waiting.
+        ``is_cancelled``: with it, wait until a process that runs the part has ended, or has done
+        it.
+        Raises PartHeldError: another process runs it; Cancelled: while waiting.
         """
         while (held := self._held()) is not None:
             if is_cancelled is None:
@@ -114,10 +101,8 @@ class PartLease:
     def finish(self, state: str, **changes: object) -> PartState:
         """Write how the part has ended, unless another process holds it.
 
-        Raises
-        ------
-        OSError
-            It cannot be written that the part is done; that it is not need not be known.
+        Raises OSError: it cannot be written that the part is done; that it is not need not be
+        known.
         """
         if not self._is_held:
             return self._state

@@ -59,7 +59,6 @@ from .lease import PartLease
 
 # -- How far a job is: the progress of its parts, run here or elsewhere, on one scale -------------
 
-
 STATES_EVERY_S = 1.0
 """How often the states of parts that run elsewhere are read."""
 STAGE_OF_KIND = {
@@ -185,14 +184,8 @@ class PartRunner:
     def run(self, part: Part, progress: Progress) -> PartResult:
         """Run a part whose needs are done.
 
-        Raises
-        ------
-        BegunAgain
-            The region of the part is to be planned anew.
-        WrapError
-            Any typed failure of a stage.
-        WorkerError
-            What it needs is not there.
+        Raises BegunAgain: the region of the part is to be planned anew; WrapError: any typed
+        failure of a stage; WorkerError: what it needs is not there.
         """
         if part.kind in TILE_KINDS:
             return self._run_tile(part, progress)
@@ -464,7 +457,6 @@ class InProcess:
 # A part that may work elsewhere is begun again, at most :data:`MOST_ATTEMPTS` times in all. One
 # that never will holds up what needs it; everything else is done first.
 
-
 _logger = logging.getLogger(__name__)
 
 MOST_ATTEMPTS = 3
@@ -523,14 +515,8 @@ class Walk:
     def run(self) -> None:
         """Run all parts.
 
-        Raises
-        ------
-        Cancelled
-            The job was cancelled.
-        PartError
-            Parts failed for good; all that do not need them are done.
-        WrapError
-            What an engine raises.
+        Raises Cancelled: the job was cancelled; PartError: parts failed for good; all that do not
+        need them are done; WrapError: what an engine raises.
         """
         while True:
             if self.is_cancelled():

@@ -46,14 +46,8 @@ def run_bake(
 ) -> Stage:
     """Bake onto the mesh of a job and replace ``baked/NAME``, or re-use the finished stage.
 
-    Raises
-    ------
-    UsageError
-        The job names no mesh.
-    DatasetError, MeshingError
-        The mesh cannot be read or textured, or no photo sees it.
-    ResourceError
-        Memory or disk space is not sufficient.
+    Raises UsageError: the job names no mesh; DatasetError, MeshingError: the mesh cannot be read or
+    textured, or no photo sees it; ResourceError: memory or disk space is not sufficient.
     """
     request = job.bake
     if request is None:

@@ -93,10 +93,7 @@ def run_frames(
 ) -> tuple[Path, dict[str, Any]]:
     """Take the frames of a job's video; return their folder and the stage's ``done.json``.
 
-    Raises
-    ------
-    DatasetError, ParseError
-        The video cannot be used.
+    Raises DatasetError, ParseError: the video cannot be used.
     """
     from ...photos.video_frames import FRAMES_FOLDER, extract_frames
 
@@ -124,7 +121,6 @@ def run_frames(
 
 # -- Make a scene of a splat without photos: place virtual cameras around it and render them ------
 
-
 MAX_START_POINTS = 30_000
 """Centres of at most this many opaque Gaussians serve as sparse points."""
 
@@ -148,12 +144,8 @@ def is_splat(source: Path) -> bool:
 def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads: int = 0) -> Scene:
     """Render a splat from virtual cameras into ``folder/images`` and return the scene.
 
-    The scene frame keeps the axes of the file. The background is black, as in training.
-
-    Raises
-    ------
-    ParseError, DatasetError
-        The file is not a splat, or has no visible Gaussian.
+    The scene frame keeps the axes of the file. The background is black, as in training. Raises
+    ParseError, DatasetError: the file is not a splat, or has no visible Gaussian.
     """
     import torch
 
@@ -238,7 +230,6 @@ def write_scene_summary(path: Path, scene: Scene) -> None:
 
 # -- Cameras stage: load the input as a scene, or re-use the cameras of a finished training -------
 
-
 FRAMES_SHARE = 0.4
 """Rough share of the stage's time, where the photos are frames of a video."""
 
@@ -251,15 +242,10 @@ MASKED = "masked"
 def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads: int) -> Stage:
     """Load the scene, or re-use a finished cameras stage.
 
-    ``mesh``, ``bake`` and ``more`` use the cameras of the finished training even if the photos
-    have changed since, or an earlier version has loaded them.
-
-    Raises
-    ------
-    DatasetError, ParseError
-        The input cannot be used.
-    UsageError
-        A splat is to get metres by photos, or a video by GPS, which they have none of.
+    ``mesh``, ``bake`` and ``more`` use the cameras of the finished training even if the photos have
+    changed since, or an earlier version has loaded them. Raises DatasetError, ParseError: the input
+    cannot be used; UsageError: a splat is to get metres by photos, or a video by GPS, which they
+    have none of.
     """
     from ...loading.load import load_scene
     from ...loading.real_world import UnitsRequest

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 
 # -- Masks of what stands in regions: a short training, and its silhouettes in the photos ---------
 
-
 _logger = logging.getLogger(__name__)
 
 COARSE: dict[str, Any] = {
@@ -79,10 +78,7 @@ def make_region_masks(
 ) -> None:
     """Write ``000000.png``, ... of the scene's views; the training in ``folder`` is resumed.
 
-    Raises
-    ------
-    DatasetError
-        The short training has nothing in the regions.
+    Raises DatasetError: the short training has nothing in the regions.
     """
     import torch
 
@@ -163,7 +159,6 @@ def _coarse_training(
 
 # -- Masks stages: make masks once, put them where people can edit them, and use what is left -----
 
-
 SECONDS_A_PHOTO = 120.0
 """Of a mask model, at most: a large one needs some 20 s on one slow core."""
 _KEPT_SHARE = 1e-4
@@ -189,11 +184,8 @@ def run_masks(
     Masks are made once and put into the job's folder ``masks``. What is there when a training
     begins counts: edited files, deleted ones, and those that ``masks.json`` rejects. ``mesh``,
     ``bake`` and ``more`` use the masks of the finished training even if they have changed since.
-
-    Raises
-    ------
-    DatasetError, UsageError, ResourceError
-        Masks cannot be made, or too few photos are left.
+    Raises DatasetError, UsageError, ResourceError: masks cannot be made, or too few photos are
+    left.
     """
     if not job.settings.masks_are_made or cameras.name == MASKED:
         return cameras
@@ -230,10 +222,7 @@ def run_masks(
 def _making_key(job: JobFile, cameras: Stage) -> str:
     """Return the key of the masks. Constants of the method are left out: edited masks stay.
 
-    Raises
-    ------
-    DatasetError, ResourceError
-        The mask model is missing, or too large.
+    Raises DatasetError, ResourceError: the mask model is missing, or too large.
     """
     settings = job.settings
     if settings.mask_model:
@@ -307,10 +296,7 @@ def _run_model(scene: Scene, job: JobFile, folder: Path, progress: Progress, thr
 def check_mask_model(job: JobFile, folder: JobFolder, progress: Progress) -> None:
     """Load the job's mask model and raise if it is none, before photos are read.
 
-    Raises
-    ------
-    UsageError, DatasetError, ResourceError
-        The model cannot be used.
+    Raises UsageError, DatasetError, ResourceError: the model cannot be used.
     """
     import tempfile
 

@@ -74,7 +74,6 @@ def mesh_key(job: JobFile, request: str, name: str, trained_key: str) -> str:
 
 # -- Build the vacancy field of a region with the job's cameras, masks and unseen space -----------
 
-
 _logger = logging.getLogger(__name__)
 
 
@@ -97,14 +96,8 @@ def load_region(
     """Load a finished training and build the field of a region from it.
 
     ``request`` is the region's entry in the job's settings; vacancy is evaluated on ``device``, if
-    it fits there.
-
-    Raises
-    ------
-    ParseError, DatasetError
-        A file of the stages is damaged or missing.
-    DeviceError
-        As :func:`~.choice.stage_device`.
+    it fits there. Raises ParseError, DatasetError: a file of the stages is damaged or missing;
+    DeviceError: as :func:`~.choice.stage_device`.
     """
     scene = scene_files.load_refined_scene(cameras.folder, trained.folder)
     gaussians = load_gaussians(trained.folder / "gaussians.npz")
@@ -130,12 +123,8 @@ def requested_region(
     The world-frame region of a file is returned as read: transforming it to the scene frame and
     back would change its last digits each time.
 
-    Parameters
-    ----------
-    request : str
-        ``"auto"``, ``"all"`` or the path of a region file with the content ``body``.
-    arrays : GaussianArrays, optional
-        Of the training; only the region ``"all"`` needs them.
+    ``request``: ``"auto"``, ``"all"`` or the path of a region file with the content ``body``.
+    ``arrays``: of the training; only the region ``"all"`` needs them.
     """
     if request not in AUTOMATIC_REGIONS:
         world_region = scene_regions.parse_region(body, Path(request))
@@ -152,12 +141,8 @@ def requested_region(
 def reject_short_edges(job: JobFile, cameras: Stage) -> None:
     """Refuse edges far too short for their region, which would else fail after the training.
 
-    The region of all Gaussians is known only then, and is left out.
-
-    Raises
-    ------
-    ResourceError
-        Names the region.
+    The region of all Gaussians is known only then, and is left out. Raises ResourceError: names the
+    region.
     """
     lengths = {
         request: meshing.edge_length
@@ -175,16 +160,9 @@ def reject_short_edges(job: JobFile, cameras: Stage) -> None:
 def field_views(scene: Scene, photos: PhotoSource, holdout_every: int, cameras: str) -> list[int]:
     """Return the views whose cameras a mesh is made from (docs/method.md, section 5.3).
 
-    Parameters
-    ----------
-    cameras : str
-        Setting of the meshing: ``"training"`` leaves out held-out photos and photos that their
-        masks cover; ``"all"`` uses every camera.
-
-    Raises
-    ------
-    DatasetError
-        No camera is left.
+    ``cameras``: setting of the meshing: ``"training"`` leaves out held-out photos and photos that
+    their masks cover; ``"all"`` uses every camera.
+    Raises DatasetError: no camera is left.
     """
     if cameras == "all":
         return list(range(len(scene.views)))
@@ -209,22 +187,12 @@ def region_field(
 ) -> VacancyField:
     """Return the field in and around a region, limited to the mesher's halo.
 
-    Parameters
-    ----------
-    region : Region
-        Scene frame.
-    training : TrainingSettings
-        ``mask_mode``, ``holdout_every`` and the size of the photos that masks are read at.
-    meshing : MeshingSettings
-        ``unseen`` and ``cameras`` are read.
-    device : str
-        Torch device of the field. If the kernels of a GPU cannot run, the field is evaluated on the
-        processor and the log says why.
-
-    Raises
-    ------
-    DatasetError
-        A mask does not fit its photo, or masks cover every photo that was trained on.
+    ``region``: scene frame; ``training``: ``mask_mode``, ``holdout_every`` and the size of the
+    photos that masks are read at; ``meshing``: ``unseen`` and ``cameras`` are read.
+    ``device``: torch device of the field. If the kernels of a GPU cannot run, the field is
+    evaluated on the processor and the log says why.
+    Raises DatasetError: a mask does not fit its photo, or masks cover every photo that was trained
+    on.
     """
     photos = PhotoStore(scene, training.max_image_px)
     views = field_views(scene, photos, training.holdout_every, meshing.cameras)
@@ -262,7 +230,6 @@ def field_figures(field: VacancyField) -> dict[str, Any]:
 #
 # Tiles are parts of a job, which other processes may make (:mod:`..parts`): a region in tiles is
 # planned here, and joined here once its tiles are there.
-
 
 TILES_FOLDER = "tiles"
 """Subfolder of the stage's folder while tiles are being meshed."""
@@ -491,7 +458,6 @@ class TileMaker:
 
 # -- Mesh stage: mesh a region of a finished training and clean the mesh up -----------------------
 
-
 ON_PROCESSOR = DeviceChoice(CPU, "", "The GPU failed.")
 
 DENSE_MESH = "dense.npz"
@@ -513,26 +479,14 @@ def run_mesh(
 ) -> Stage:
     """Mesh a region, or plan or join its tiles, or re-use its finished mesh stage.
 
-    Parameters
-    ----------
-    request : str
-        The region's entry in the job's settings; ``name`` is that of its folder.
-    device : DeviceChoice
-        The job's; vacancy is evaluated and depth maps are rendered there. Everything else gets
-        arrays and CPU tensors.
-    load : callable
-        Returns what :func:`load_region` does for a device.
-    tile_processes : int
-        How many processes made the tiles, for the report.
-    warnings : sequence of ReportWarning
-        Of what was tried before.
-
-    Raises
-    ------
-    TilesPlanned
-        The region is planned in tiles, which are to be made before this is called again.
-    MeshingError, ResourceError
-        The region holds no surface, or its mesh does not fit into memory.
+    ``request``: the region's entry in the job's settings; ``name`` is that of its folder.
+    ``device``: the job's; vacancy is evaluated and depth maps are rendered there. Everything else
+    gets arrays and CPU tensors.
+    ``load``: returns what :func:`load_region` does for a device; ``tile_processes``: how many
+    processes made the tiles, for the report; ``warnings``: of what was tried before.
+    Raises TilesPlanned: the region is planned in tiles, which are to be made before this is called
+    again; MeshingError, ResourceError: the region holds no surface, or its mesh does not fit into
+    memory.
     """
     meshing = job.meshing_of(request)
     key = mesh_key(job, request, name, trained.key)

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 # -- Texture stage: bake a region's textures, write its files, and compare it with the photos -----
 
-
 OCCLUSION_VERSION = 2
 """Raise it where ambient occlusion alone is computed otherwise: other textures stay valid."""
 
@@ -51,10 +50,7 @@ def run_texture(
 ) -> Stage:
     """Texture the mesh of a region and write its files, or re-use the finished stage.
 
-    Raises
-    ------
-    ResourceError
-        Memory or disk space is not sufficient.
+    Raises ResourceError: memory or disk space is not sufficient.
     """
     texture = job.settings.texture
     occlusion = [OCCLUSION_VERSION] if texture.ambient_occlusion == "on" else []
@@ -123,7 +119,6 @@ def run_texture(
 
 # -- Export stage: gather the results of all regions in ``result/`` and write the report ----------
 
-
 REPORTS = ("report.json", "report.md")
 """Replaced last, since they describe all other files."""
 
@@ -141,11 +136,7 @@ def export_results(
 
     Files are replaced together at the end: after a failure the result is unchanged.
 
-    Parameters
-    ----------
-    regions : list of (name, mesh stage, texture stage)
-    summary : dict
-        Measurements of the whole job, from the runner.
+    ``summary``: measurements of the whole job, from the runner.
     """
     from ...gaussians.files import load_gaussians, write_splat_ply
     from ...scene.scene import load_refined_scene

@@ -47,7 +47,6 @@ if TYPE_CHECKING:
 
 # -- Retry a training with reduced settings after it runs out of memory ---------------------------
 
-
 _logger = logging.getLogger(__name__)
 
 MAX_RETRIES = 2
@@ -107,12 +106,8 @@ def train_with_oom_retry(
 
     The retries are recorded in the folder of the training stage, so that an interrupted run resumes
     with the same settings. ``discard_checkpoints`` removes those of the failed attempt, which fit
-    no other settings.
-
-    Raises
-    ------
-    ResourceError
-        The last retry also ran out of memory. Other exceptions of ``train`` propagate.
+    no other settings. Raises ResourceError: the last retry also ran out of memory. Other exceptions
+    of ``train`` propagate.
     """
     reasons = _read_retries(folder)
     for _ in reasons:
@@ -202,7 +197,6 @@ def killed_mesh_hint(meshing: MeshingSettings, *, kept: bool) -> str:
 
 # -- Stages of a training: in one piece; or coarse with a plan, each block, and joining -----------
 
-
 COARSE, COARSE_KEY = "coarse", "all"
 BLOCK = "block"
 GAUSSIANS_NAME = "gaussians.npz"
@@ -215,12 +209,9 @@ REFINED = "poses_refined"
 class TrainingStages:
     """The stages of one training; each is run, or re-used. Scene and plan are loaded once.
 
-    A training that was begun on another device continues on this one: no key depends on it.
-
-    Raises
-    ------
-    ResourceError
-        By each stage: the disk is too full, or memory does not suffice even with reduced settings.
+    A training that was begun on another device continues on this one: no key depends on it. Raises
+    ResourceError: by each stage: the disk is too full, or memory does not suffice even with reduced
+    settings.
     """
 
     folder: JobFolder
@@ -232,12 +223,8 @@ class TrainingStages:
     def run(self, progress: Progress) -> Stage:
         """Train in one piece or join the blocks.
 
-        Raises
-        ------
-        UsageError
-            The job continues a training, and there is no training to continue.
-        WorkerError
-            A block is not finished.
+        Raises UsageError: the job continues a training, and there is no training to continue;
+        WorkerError: a block is not finished.
         """
         extra = self._settings.extra_iterations
         _, base_key = self._keys
@@ -263,10 +250,7 @@ class TrainingStages:
     def coarse(self, progress: Progress) -> Stage:
         """Train the whole scene coarsely and divide it; or return the finished whole training.
 
-        Raises
-        ------
-        UsageError
-            The scene cannot be divided into so many blocks.
+        Raises UsageError: the scene cannot be divided into so many blocks.
         """
         from ...training.block_plan import ARRAYS_NAME, PLAN_NAME
         from ...training.estimate import coarse_gaussians
@@ -326,14 +310,8 @@ class TrainingStages:
     def block(self, index: int, progress: Progress) -> Stage:
         """Train a block; or return the finished whole training.
 
-        Raises
-        ------
-        UsageError
-            There is no such block.
-        WorkerError
-            The coarse training is not finished.
-        ParseError
-            Its files are damaged.
+        Raises UsageError: there is no such block; WorkerError: the coarse training is not finished;
+        ParseError: its files are damaged.
         """
         from ...training.estimate import gaussians_of_block
 

@@ -59,10 +59,7 @@ def estimated_cost(
 ) -> tuple[dict[str, Any], list[ReportWarning]]:
     """Estimate the training's cost, for ``done.json``; the renderer is compiled for it.
 
-    Raises
-    ------
-    ResourceError
-        The disk is too full.
+    Raises ResourceError: the disk is too full.
     """
     from ...training import estimate
     from ...training.splat_start import wrapping_settings

@@ -45,7 +45,6 @@ from .stage_folder import STAGE_VERSIONS, stage_key
 #
 # Standard library only.
 
-
 MAX_FACES = 100_000_000
 MIN_FACES = 4
 """No closed surface has fewer."""
@@ -75,12 +74,8 @@ class BakeRequest:
     def validated(self) -> BakeRequest:
         """Return self with a safe name, or raise.
 
-        Raises
-        ------
-        UsageError
-            A choice is unknown or out of range, or contradicts another one.
-        DatasetError
-            A file does not exist.
+        Raises UsageError: a choice is unknown or out of range, or contradicts another one;
+        DatasetError: a file does not exist.
         """
         files = ((self.mesh, "mesh"), (self.sidecar, "sidecar"), (self.dense, "dense mesh"))
         for path, what in files:
@@ -116,10 +111,7 @@ class BakeRequest:
     def from_json(cls, values: Any) -> BakeRequest:
         """Build from :meth:`to_json`'s values.
 
-        Raises
-        ------
-        UsageError
-            An entry is missing, unknown, of the wrong type or out of range.
+        Raises UsageError: an entry is missing, unknown, of the wrong type or out of range.
         """
         try:
             request: BakeRequest = from_json(cls, values, "bake")
@@ -129,7 +121,6 @@ class BakeRequest:
 
 
 # -- The job file: command, input, settings and regions, the same for button and command line -----
-
 
 SCHEMA_VERSION = 1
 COMMANDS = ("wrap", "mesh", "more", "bake")
@@ -177,10 +168,8 @@ class JobFile:
     def from_json(cls, values: Any) -> JobFile:
         """Build from :meth:`to_json`'s values.
 
-        Raises
-        ------
-        UsageError
-            An entry is missing, unknown, of the wrong type or out of range; a region is invalid.
+        Raises UsageError: an entry is missing, unknown, of the wrong type or out of range; a region
+        is invalid.
         """
         wanted = {"schema_version", "command", "source", "settings", "region_bodies"}
         if not isinstance(values, dict) or set(values) - {"edge_lengths", "bake"} != wanted:
@@ -213,17 +202,10 @@ def make_job(
 ) -> JobFile:
     """Check the settings, read the region files, and return the job.
 
-    Parameters
-    ----------
-    edge_lengths : mapping, optional
-        Edge lengths, world units, of regions that have their own, keyed by their entry in
-        ``settings.regions``.
-
-    Raises
-    ------
-    UsageError, DatasetError
-        A setting is out of range; the source or a region file is missing or unreadable; two
-        regions have the same name.
+    ``edge_lengths``: edge lengths, world units, of regions that have their own, keyed by their
+    entry in ``settings.regions``.
+    Raises UsageError, DatasetError: a setting is out of range; the source or a region file is
+    missing or unreadable; two regions have the same name.
     """
     settings = settings.validated()
     _check_source(str(real_path(source)))
@@ -372,10 +354,7 @@ def _check_regions(bodies: dict[str, Any]) -> None:
 def make_bake_job(earlier: JobFile, request: BakeRequest) -> JobFile:
     """Return the job that bakes the photos of a finished job onto a mesh.
 
-    Raises
-    ------
-    UsageError, DatasetError
-        A setting is out of range, or a file does not exist.
+    Raises UsageError, DatasetError: a setting is out of range, or a file does not exist.
     """
     return replace(earlier, command="bake", bake=request.validated())
 
@@ -397,17 +376,9 @@ def reject_region_conflicts(result: Path, job: JobFile) -> None:
 
     A region of the same name is the same region, meshed again.
 
-    Parameters
-    ----------
-    result : Path
-        The result folder of the job; need not exist.
-
-    Raises
-    ------
-    UsageError
-        Two regions of the job, or one of it and one meshed before, conflict; names both.
-    ParseError
-        A region in the job file is invalid.
+    ``result``: the result folder of the job; need not exist.
+    Raises UsageError: two regions of the job, or one of it and one meshed before, conflict; names
+    both; ParseError: a region in the job file is invalid.
     """
     region_names(job.settings.regions, job.region_bodies)
     folders = {
@@ -422,15 +393,8 @@ def reject_folder_conflicts(result: Path, folders: dict[str, str]) -> None:
 
     A region of the same name is the same region, meshed again.
 
-    Parameters
-    ----------
-    folders : dict
-        Folder name by region name, as the region's file gives it.
-
-    Raises
-    ------
-    UsageError
-        Two regions conflict; names both.
+    ``folders``: folder name by region name, as the region's file gives it.
+    Raises UsageError: two regions conflict; names both.
     """
     there = {path.parent.name: path for path in sorted(result.glob("*/region.json"))}
     for wanted, name in folders.items():
@@ -467,10 +431,7 @@ def write_job(path: Path, job: JobFile) -> None:
 def start_fingerprint(path: str) -> list[Any]:
     """Return path, size and time of the start splat for the stage key; empty for none.
 
-    Raises
-    ------
-    DatasetError
-        The file does not exist, or is a pipe or a device.
+    Raises DatasetError: the file does not exist, or is a pipe or a device.
     """
     if not path:
         return []
@@ -509,7 +470,6 @@ def blocks_key(cameras_key: str, job: JobFile) -> str:
 #
 # Exports are shared with others, so that it holds names and no paths of this machine.
 
-
 _logger = logging.getLogger("gaussian_wrapping")
 
 VERSION = 1
@@ -534,18 +494,11 @@ def write_sidecar(
 ) -> None:
     """Write the sidecar of ``path``.
 
-    Parameters
-    ----------
-    path : Path
-        The exported file.
-    frame : FileFrame
-        Frame of its coordinates.
-    placed : bool
-        Whether the target of ``frame`` is the scene as placed, else the world of the input.
-    result : Path
-        The result folder of the job; entries missing there are left out.
-    contents : dict
-        Content of the file: region, level, shading, number of vertices and faces, textures.
+    ``path``: the exported file; ``frame``: frame of its coordinates; ``placed``: whether the target
+    of ``frame`` is the scene as placed, else the world of the input.
+    ``result``: the result folder of the job; entries missing there are left out.
+    ``contents``: content of the file: region, level, shading, number of vertices and faces,
+    textures.
     """
     units = _units(result, frame, world_from_scene)
     in_metres = units is not None and units["applied"]

@@ -28,7 +28,6 @@ from ...worker.spawn import host_and_pid_namespace, is_here, owner_alive, proces
 #
 # It is written outside of the worker, which has no Blender, and only on request.
 
-
 _blend_file_logger = logging.getLogger("gaussian_wrapping")
 
 NAME = "scene.blend"
@@ -47,10 +46,7 @@ def result_state(result: Path) -> dict[str, bytes]:
 def back_up_stale_blend(result: Path, before: dict[str, bytes]) -> bool:
     """Rename ``scene.blend`` if the result has changed; tell whether it was renamed.
 
-    Parameters
-    ----------
-    before : dict
-        :func:`result_state` from when the file was up to date.
+    ``before``: :func:`result_state` from when the file was up to date.
     """
     blend = result / NAME
     if not blend.is_file() or result_state(result) == before:
@@ -64,7 +60,6 @@ def back_up_stale_blend(result: Path, before: dict[str, bytes]) -> bool:
 #
 # Layout: ``job.json``, ``status.json``, ``log.txt``, ``lock.json``, ``cancel`` (a file asks to
 # stop), ``stages/<name>-<hash>/`` (``done.json`` last), ``result/``.
-
 
 FOREIGN_LOCK_HINT = "If it is no job of this add-on, delete lock.json there."
 STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
@@ -110,10 +105,8 @@ class JobStatus:
     def from_json(cls, values: Any) -> JobStatus:
         """Build from JSON values, ignoring unknown entries.
 
-        Raises
-        ------
-        TypeError, ValueError
-            An entry has the wrong type: the file is not ours, or is being written.
+        Raises TypeError, ValueError: an entry has the wrong type: the file is not ours, or is being
+        written.
         """
         given = dict(values)
         known = {f.name: given[f.name] for f in fields(cls) if f.name in given}
@@ -204,14 +197,9 @@ class JobFolder:
     def create(self) -> None:
         """Create the folder, or accept an existing job folder or an empty folder.
 
-        Raises
-        ------
-        UsageError
-            The path is a file, a folder with other content, or too long.
-        DatasetError
-            It holds links or other entries that no job makes, see :meth:`check_entries`.
-        ResourceError
-            It cannot be written.
+        Raises UsageError: the path is a file, a folder with other content, or too long;
+        DatasetError: it holds links or other entries that no job makes, see :meth:`check_entries`;
+        ResourceError: it cannot be written.
         """
         try:
             if self.root.exists() and not self.root.is_dir():
@@ -234,15 +222,8 @@ class JobFolder:
         and a link in it would lead writes and deletions out of it. The folder itself may be reached
         through links.
 
-        Parameters
-        ----------
-        but : frozenset of str
-            Names of folders that are not looked into; they must be folders all the same.
-
-        Raises
-        ------
-        DatasetError
-            Names the entry.
+        ``but``: names of folders that are not looked into; they must be folders all the same.
+        Raises DatasetError: names the entry.
         """
         reject_foreign_entries(self.root, but=but)
 
@@ -290,12 +271,7 @@ class JobFolder:
         """Lock the folder for this process.
 
         The lock of a dead process, or an unreadable one, is taken over: a lock of a living process
-        is written atomically.
-
-        Raises
-        ------
-        UsageError
-            Another process holds the folder.
+        is written atomically. Raises UsageError: another process holds the folder.
         """
         mine = {
             "pid": os.getpid(),

@@ -25,7 +25,6 @@ from .stage_folder import read_done
 # A new result is written to a subfolder of the result folder until it is complete: on the same
 # disk, so that replacing takes renames only. Region names contain no dot.
 
-
 _logger = logging.getLogger(__name__)
 
 NEW = ".new"
@@ -41,17 +40,9 @@ def new_result(result: Path, last: tuple[str, ...] = ()) -> Iterator[Path]:
     Each entry of the folder replaces the one of its name in ``result``; others stay. If the block
     or the swap raises, the result is unchanged.
 
-    Parameters
-    ----------
-    result : Path
-        The result folder; created if missing.
-    last : tuple of str
-        Entries that describe the others and are replaced after them.
-
-    Raises
-    ------
-    OSError
-        An entry cannot be replaced.
+    ``result``: the result folder; created if missing.
+    ``last``: entries that describe the others and are replaced after them.
+    Raises OSError: an entry cannot be replaced.
     """
     begun = not result.exists()
     result.mkdir(exist_ok=True)
@@ -123,7 +114,6 @@ def _remove(path: Path) -> None:
 # removed when that is done. If it fails, job and status of the finished job are restored and the
 # stages it began are removed. A cancelled one can be resumed, as any job.
 
-
 NAME = "job-finished.json"
 
 
@@ -153,10 +143,7 @@ def save_rollback(folder: JobFolder, job: JobFile) -> None:
 def finished_job(folder: JobFolder) -> JobFile:
     """Return the job that produced a folder's result, not one whose mesh is unfinished.
 
-    Raises
-    ------
-    UsageError, ParseError
-        There is no job.
+    Raises UsageError, ParseError: there is no job.
     """
     saved = _read(folder.root / NAME)
     if saved is None or folder.read_status().state == "DONE":
@@ -218,7 +205,6 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 # -- Continue the training of a finished job from its last checkpoint -----------------------------
 
-
 _CHECKPOINT = re.compile(r"checkpoint-(\d{1,9})\.json")
 _INSTEAD = "Train anew instead: run wrap with the total number of --iterations."
 
@@ -226,12 +212,8 @@ _INSTEAD = "Train anew instead: run wrap with the total number of --iterations."
 def continue_training_job(folder: JobFolder, job: JobFile, iterations: int) -> JobFile:
     """Return the job that trains ``job`` for more iterations, then meshes again.
 
-    Raises
-    ------
-    UsageError
-        The number is not positive.
-    DatasetError
-        The folder holds no finished training, or no checkpoint to continue from.
+    Raises UsageError: the number is not positive; DatasetError: the folder holds no finished
+    training, or no checkpoint to continue from.
     """
     if iterations < 1:
         raise UsageError(f"--iterations {iterations} adds nothing.", "Give a positive number.")
@@ -257,10 +239,7 @@ def checkpoints(folder: Path) -> list[Path]:
 def lineage(base_key: str, extra_iterations: int) -> dict[str, Any]:
     """Return the entry of ``done.json`` by which longer trainings find a finished one.
 
-    Parameters
-    ----------
-    base_key : str
-        Hash of everything that the stage's key depends on except the extra iterations.
+    ``base_key``: hash of everything that the stage's key depends on except the extra iterations.
     """
     return {"base": base_key, "extra_iterations": extra_iterations}
 
@@ -284,10 +263,7 @@ def link_checkpoints(source: Path, target: Path, others: tuple[str, ...] = ()) -
 
     Files of a stage are replaced, never modified, so that a link cannot change its source.
 
-    Parameters
-    ----------
-    others : tuple of str
-        Further files to link, if they exist.
+    ``others``: further files to link, if they exist.
     """
     for path in reversed(checkpoints(source)):
         # The JSON file last: without it, the arrays are ignored.

@@ -67,12 +67,8 @@ def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
 
     An input that is gone has none.
 
-    Photos are not read: size and time detect a change, as in build systems.
-
-    Raises
-    ------
-    DatasetError
-        The folder holds too many files to be a set of photos, such as a whole disk.
+    Photos are not read: size and time detect a change, as in build systems. Raises DatasetError:
+    the folder holds too many files to be a set of photos, such as a whole disk.
     """
     if source.is_file() and source.suffix.lower() == ".ply":
         state = source.stat()
@@ -135,14 +131,10 @@ def run_stage(
 ) -> Stage:
     """Run the stage ``stages/NAME-KEY``, or re-use its finished folder.
 
-    Parameters
-    ----------
-    work : callable
-        Works in the folder; returns the content of ``done.json``. The folder of an interrupted
-        run is passed as it is, so that training finds its checkpoints.
-    whole : callable
-        Tells whether a finished folder still holds what later stages read; without, or damaged,
-        the stage is done again.
+    ``work``: works in the folder; returns the content of ``done.json``. The folder of an
+    interrupted run is passed as it is, so that training finds its checkpoints.
+    ``whole``: tells whether a finished folder still holds what later stages read; without, or
+    damaged, the stage is done again.
     """
     folder = stages / f"{name}-{key}"
     done = read_done(folder)
