@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import json
 import os
 import signal
 import subprocess
@@ -27,7 +26,7 @@ from ..errors import (
 )
 from ..files import open_regular, real_path, touch_regular
 from ..worker.environment import not_started, ready_worker
-from ..worker.helper_process import child_command
+from ..worker.helper_process import child_command, ending_of, json_object
 from ..worker.spawn import is_here, kill_group, process_alive, spawn
 from .stages.training import killed_hint, killed_mesh_hint
 from .store.job_file import JobFile, read_job, reject_region_conflicts, write_job
@@ -246,8 +245,8 @@ class JobClient:
         if status.active or status.state == "LOST":
             if code in KILLED_CODES:
                 return self._killed(status)
-            reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
-            return self._failed(status, f"The worker {reason}. {self.output_tail()}".strip())
+            words = f"The worker {ending_of(code)}. {self.output_tail()}"
+            return self._failed(status, words.strip())
         return status
 
     def _killed(self, status: JobStatus) -> JobStatus:
@@ -270,10 +269,9 @@ class JobClient:
     def _refusal(self) -> WorkerError | None:
         """Return the error of a worker that could not begin; the job's status is not of it."""
         for line in reversed(self._output_lines()):
-            with contextlib.suppress(ValueError, RecursionError):
-                values = json.loads(line)
-                if isinstance(values, dict) and values.get("error"):
-                    return WorkerError(str(values["error"]), str(values.get("hint", "")))
+            values = json_object(line) or {}
+            if values.get("error"):
+                return WorkerError(str(values["error"]), str(values.get("hint", "")))
         return None
 
     def _failed(self, status: JobStatus, error: str) -> JobStatus:

@@ -148,8 +148,7 @@ def candidates(own: str = "") -> list[str]:
     found = [shutil.which(name) or "" for name in names]
     if sys.platform == "darwin":
         found += [path for pattern in _MAC_PATTERNS for path in sorted(glob.glob(pattern))]
-    launcher = shutil.which("py") if sys.platform == "win32" else None
-    if launcher:
+    if sys.platform == "win32" and (launcher := shutil.which("py")):
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
             done = subprocess.run(
                 [launcher, "-0p"], stdin=subprocess.DEVNULL, capture_output=True, check=False,
@@ -238,9 +237,8 @@ def as_line(command: Command) -> str:
 
 def cuda_present() -> bool:
     """Tell whether an NVIDIA driver is installed; looks at files only."""
-    if sys.platform == "darwin":
-        return False
-    return bool(shutil.which("nvidia-smi")) or Path("/proc/driver/nvidia/version").exists()
+    is_there = shutil.which("nvidia-smi") or Path("/proc/driver/nvidia/version").exists()
+    return sys.platform != "darwin" and bool(is_there)
 
 
 def torch_index(choice: str, system: str = "") -> str:
@@ -280,21 +278,20 @@ def all_commands(request: SetupRequest, python: FoundPython) -> list[Command]:
 
 def _installs(request: SetupRequest) -> list[Command]:
     """Return the arguments of pip, one call after the other."""
-    options, extras = _INSTALL, _extra_installs(request)
-    index = torch_index(request.torch)
+    extras, index = _extra_installs(request), torch_index(request.torch)
     if request.find_links:
         return [(*_only_wheels(request), "-r", request.requirements), *extras]
     also = ("--extra-index-url", index) if index else ()
     requirements = Path(request.requirements)
     hashes = hashes_file(requirements)
     if hashes is None:
-        return [(*options, *also, "-r", request.requirements), *extras]
+        return [(*_INSTALL, *also, "-r", request.requirements), *extras]
     (torch,) = (r for r in read_requirements(requirements) if r.name == "torch")
     # What the build for the processor needs is in the list with hashes.
     alone = ("--no-deps",) if request.torch == CPU else ()
     return [
-        (*options, "--require-hashes", "-r", str(hashes)),
-        (*options, *also, *alone, f"{torch.name}{torch.versions}"),
+        (*_INSTALL, "--require-hashes", "-r", str(hashes)),
+        (*_INSTALL, *also, *alone, f"{torch.name}{torch.versions}"),
         *extras,
     ]
 
@@ -310,10 +307,9 @@ def _extra_installs(request: SetupRequest) -> list[Command]:
     found: list[Command] = []
     for extra in map(extra_named, request.extras):
         hashes = extra_hashes_file(Path(request.requirements), extra)
-        if request.find_links:
-            found.append((*_only_wheels(request), "--no-deps", *extra.pins))
-        elif hashes is None:
-            found.append((*_INSTALL, "--no-deps", *extra.pins))
+        if request.find_links or hashes is None:
+            options = _only_wheels(request) if request.find_links else _INSTALL
+            found.append((*options, "--no-deps", *extra.pins))
         else:
             found.append((*_INSTALL, "--no-deps", "--require-hashes", "-r", str(hashes)))
     return found
@@ -447,14 +443,10 @@ class SetupTask(threading.Thread):
         commands = all_commands(request, python)
         folder = environment.next_folder()
         marker = {
-            "made_by": "gaussian_wrapping_addon",
-            "kind": VENV if python.has_venv else PACKAGES,
-            "python": python.path,
-            "version": python.version_text,
-            "torch": request.torch,
-            "folder": folder.name,
-            "extras": list(request.extras),
-        }
+            "made_by": "gaussian_wrapping_addon", "kind": VENV if python.has_venv else PACKAGES,
+            "python": python.path, "version": python.version_text, "torch": request.torch,
+            "folder": folder.name, "extras": list(request.extras),
+        }  # fmt: skip
         check_folders(request)
         environment.root.mkdir(parents=True, exist_ok=True)
         if "torch" in names:
@@ -514,7 +506,7 @@ class SetupTask(threading.Thread):
         """Run a command to its end; the progress is the share of ``expected`` packages named."""
         log.write(f"$ {as_line(command)}\n")
         last: deque[str] = deque(maxlen=40)
-        self._process = process = start_process(
+        self._process = process = _start_process(
             child_command("jobs.install", *command, python=python),
             self.request.environment.root / TEMPORARY,
         )
@@ -579,23 +571,20 @@ def _check_disk(root: Path, needed_gib: int) -> None:
         )
 
 
-def start_process(command: list[str], temporary: Path) -> subprocess.Popen[bytes]:
+def _start_process(command: list[str], temporary: Path) -> subprocess.Popen[bytes]:
     """Start :func:`main` in a process group of its own, with temporary files in ``temporary``.
 
     Raises WorkerError: the process does not start.
     """
-    inherited = {
+    variables = {
         k: v for k, v in child_environment().items() if k.upper() not in _IGNORED_VARIABLES
     }
-    temporary_variables = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
+    variables |= {**dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary)), "PIP_USER": "0"}
     try:
         return spawn(
-            command,
-            stdin=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            environment={**inherited, **temporary_variables, "PIP_USER": "0"},
+            command, stdin=subprocess.PIPE, stderr=subprocess.STDOUT, environment=variables,
             folder=temporary,
-        )
+        )  # fmt: skip
     except OSError as error:
         raise WorkerError(
             f"{command[0]} does not start: {error.strerror}.", "Choose another Python."

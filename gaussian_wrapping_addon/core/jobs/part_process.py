@@ -37,11 +37,11 @@ from .parts.graph import (
     Part,
     PartsGraph,
     code_version,
+    done_state,
     part_exit_code,
     plan_hash,
     read_parts,
     read_state,
-    states_folder,
 )
 from .parts.lease import PartLease
 from .parts.runner import HERE, PartResult, PartRunner
@@ -96,13 +96,17 @@ def _run(folder: JobFolder, request: dict[str, object]) -> int:
     if part.kind not in TILE_KINDS:
         folder.check_entries()
     driven = bool(request["driven"])
-    if _was_done(folder, graph, part):
+    if done_state(folder.root, part.name, graph.plan) is not None:
+        emit(line=f"part {part.name} was done before")
         return DONE
-    _check_needs(folder, graph, part)
+    for name in part.needs:
+        if done_state(folder.root, name, graph.plan) is None:
+            raise WorkerError(f"Part {part.name} needs {name}, which is not done.", "Run it first.")
+    job = _with_photos(job, graph, folder)
     if part.kind in HERE and not driven:
         folder.lock()
         try:
-            code = _hold(folder, _with_photos(job, graph, folder), graph, part, request)
+            code = _hold(folder, job, graph, part, request)
             if code == DONE:  # it is the last one
                 result = str(folder.result) if folder.result.is_dir() else ""
                 folder.write_status(JobStatus("DONE", part.kind, 1.0, result=result))
@@ -110,22 +114,7 @@ def _run(folder: JobFolder, request: dict[str, object]) -> int:
             return code
         finally:
             folder.unlock()
-    return _hold(folder, _with_photos(job, graph, folder), graph, part, request)
-
-
-def _was_done(folder: JobFolder, graph: PartsGraph, part: Part) -> bool:
-    state = read_state(folder.root, part.name)
-    if state is None or not state.done_in(folder.root, graph.plan):
-        return False
-    emit(line=f"part {part.name} was done before")
-    return True
-
-
-def _check_needs(folder: JobFolder, graph: PartsGraph, part: Part) -> None:
-    for name in part.needs:
-        state = read_state(folder.root, name)
-        if state is None or not state.done_in(folder.root, graph.plan):
-            raise WorkerError(f"Part {part.name} needs {name}, which is not done.", "Run it first.")
+    return _hold(folder, job, graph, part, request)
 
 
 def _with_photos(job: JobFile, graph: PartsGraph, folder: JobFolder) -> JobFile:
@@ -140,12 +129,9 @@ class _Watch:
     """Tells whether the part is to stop, and why."""
 
     def __init__(self, folder: JobFolder, lease: PartLease, driven: bool) -> None:
-        self._folder = folder
-        self._lease = lease
-        self._driven = driven
+        self._folder, self._lease, self._driven = folder, lease, driven
         self._caller = Caller()
-        self._terminated = False
-        self._driver_is_gone = False
+        self._terminated = self._driver_is_gone = False
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._terminate)
 
@@ -222,7 +208,10 @@ def _hold(
         failure = failure_of(error, folder.root)
         if not failure.is_known:
             _logger.exception("unexpected failure")
-        code = part_exit_code(error) if isinstance(error, WrapError) else _code_of(failure.code)
+        if isinstance(error, WrapError):
+            code = part_exit_code(error)
+        else:
+            code = MAY_WORK_ELSEWHERE if failure.code == EXIT_RESOURCES else NEVER
         lease.finish("FAILED", error=failure.error, hint=failure.hint, exit_code=code)
         emit(error=failure.error, hint=failure.hint)
         return code
@@ -230,10 +219,6 @@ def _hold(
         ended.set()
     emit(line=f"part {part.name} is done, {state.seconds:.0f} s")
     return DONE
-
-
-def _code_of(job_code: int) -> int:
-    return MAY_WORK_ELSEWHERE if job_code == EXIT_RESOURCES else NEVER
 
 
 def _work(
@@ -260,7 +245,7 @@ def _work(
 def begun_s(folder: JobFolder, graph: PartsGraph) -> float:
     """Return when the first part of a plan was begun; now, if none was."""
     begun = [time.time()]
-    for path in states_folder(folder.root).glob("*.json"):
+    for path in (folder.root / STATES_FOLDER).glob("*.json"):
         state = read_state(folder.root, path.stem)
         if state is not None and state.plan == graph.plan:
             begun.append(state.begun_s)

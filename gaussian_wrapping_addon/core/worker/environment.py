@@ -118,9 +118,8 @@ def _read_object(path: Path, key: str, value: str | None = None) -> dict[str, An
         values = read_json(path, follow_links=True)
     except (OSError, ParseError):
         return {}
-    if not isinstance(values, dict) or key not in values:
-        return {}
-    return values if value is None or values[key] == value else {}
+    is_ours = isinstance(values, dict) and key in values and value in (None, values[key])
+    return values if is_ours else {}
 
 
 def interpreter_of(worker: str) -> tuple[str, str]:
@@ -181,11 +180,8 @@ def unregister_environment(root: Path) -> None:
 def known_environments() -> list[WorkerEnvironment]:
     """Return the environments that may exist, in order of preference."""
     registered = _read_object(user_data() / _POINTER, "root").get("root")
-    roots = [
-        installed_root(),
-        Path(registered) if isinstance(registered, str) else None,
-        default_root(),
-    ]
+    named = Path(registered) if isinstance(registered, str) else None
+    roots = [installed_root(), named, default_root()]
     return [WorkerEnvironment(root) for root in dict.fromkeys(roots) if root is not None]
 
 
@@ -382,9 +378,8 @@ def extra_named(name: str) -> Extra:
 
     Raises UsageError: there is none of this name; lists those there are.
     """
-    for extra in EXTRAS:
-        if extra.name == name:
-            return extra
+    if found := [extra for extra in EXTRAS if extra.name == name]:
+        return found[0]
     known = ", ".join(extra.name for extra in EXTRAS)
     raise UsageError(f"There is no extra {name}.", f"Give one or several of: {known}.")
 

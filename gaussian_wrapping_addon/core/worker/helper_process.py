@@ -65,8 +65,7 @@ def peak_memory_bytes() -> dict[str, int]:
     return {"worker": own_bytes, "largest_helper": largest_helper_bytes()} if own_bytes else {}
 
 
-def record_helper_peak(peak_bytes: int) -> None:
-    """Record the peak reported by a helper process if it is the largest so far."""
+def _record_helper_peak(peak_bytes: int) -> None:
     global _largest_helper_bytes
     _largest_helper_bytes = max(_largest_helper_bytes, peak_bytes)
 
@@ -155,6 +154,26 @@ def emit(**values: Any) -> None:
     sys.stdout.flush()
 
 
+def json_object(line: str | bytes) -> dict[str, Any] | None:
+    """Return what a line of that protocol holds; ``None`` where it is no JSON object."""
+    try:
+        values = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return values if isinstance(values, dict) else None
+
+
+def last_line(text: str | bytes, otherwise: str = "no output") -> str:
+    """Return the last line of a child's output, or other words where it has none."""
+    text = text if isinstance(text, str) else text.decode(errors="replace")
+    return (text.strip().splitlines() or [otherwise])[-1]
+
+
+def ending_of(code: int) -> str:
+    """Return how a child has ended, from its exit code: a verb and what follows."""
+    return f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
+
+
 def kill_helpers() -> None:
     """Kill all running helpers; for a process about to exit without unwinding the stack."""
     for process in list(_running):
@@ -207,14 +226,14 @@ def run_helper(
                 source, line = lines.get(timeout=_POLL_S)
             except queue.Empty:
                 continue
-            values = _parse(line) if source == "out" else None
+            values = json_object(line) if source == "out" else None
             if values is None:
                 output_tail = [*output_tail, line.rstrip()][-_OUTPUT_TAIL_LINES:]
                 _logger.debug("%s: %s", module, line.rstrip())
             elif "error" in values:
                 failure = values
             elif "peak_bytes" in values:
-                record_helper_peak(int(values["peak_bytes"]))
+                _record_helper_peak(int(values["peak_bytes"]))
             else:
                 progress.update(float(values.get("fraction", 0.0)), str(values.get("message", "")))
     finally:
@@ -227,13 +246,12 @@ def run_helper(
         kind = FAILURES.get(str(failure.get("kind")), WorkerError)
         raise kind(str(failure["error"]), str(failure.get("hint", "")))
     if code != 0:
-        reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
         for line in output_tail:
             _logger.error("%s: %s", module, line)
         last = f": {output_tail[-1][:_MAX_SAID]}" if output_tail else "."
         if _is_short_of_memory(code, output_tail, memory_bytes):
-            raise MemoryShortageError(f"{module} {reason}{last}", _MEMORY_HINT)
-        raise WorkerError(f"{module} {reason}{last}", "See the log.")
+            raise MemoryShortageError(f"{module} {ending_of(code)}{last}", _MEMORY_HINT)
+        raise WorkerError(f"{module} {ending_of(code)}{last}", "See the log.")
 
 
 def _is_short_of_memory(code: int, output: Sequence[str], memory_bytes: int | None) -> bool:
@@ -252,11 +270,3 @@ def _is_short_of_memory(code: int, output: Sequence[str], memory_bytes: int | No
 def _drain(stream: IO[bytes], name: str, lines: queue.Queue[tuple[str, str]]) -> None:
     for raw in stream:
         lines.put((name, raw.decode(errors="replace")))
-
-
-def _parse(line: str) -> dict[str, Any] | None:
-    try:
-        values = json.loads(line)
-    except ValueError:
-        return None
-    return values if isinstance(values, dict) else None

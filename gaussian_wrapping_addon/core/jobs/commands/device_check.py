@@ -6,14 +6,12 @@ The child writes one JSON object to stdout: ``{"device"}``, or ``{"error", "hint
 
 from __future__ import annotations
 
-import json
 import subprocess
-from typing import Any
 
 from ...devices import choose_device, reject_absent_gpu
 from ...errors import DeviceError, WorkerError, WrapError
 from ...worker.environment import not_started
-from ...worker.helper_process import child_command, emit
+from ...worker.helper_process import child_command, emit, json_object, last_line
 from ...worker.spawn import run_to_end
 from ..client import worker_python
 
@@ -39,18 +37,13 @@ def require_device(setting: str) -> None:
     except subprocess.TimeoutExpired:
         raise WorkerError(f"{python} does not answer.", "Run batch.py doctor.") from None
     for line in reversed(output.splitlines()):
-        try:
-            values: Any = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(values, dict) and "error" in values:
+        values = json_object(line) or {}
+        if "error" in values:
             raise DeviceError(str(values["error"]), str(values.get("hint", "")))
-        if isinstance(values, dict) and "device" in values:
+        if "device" in values:
             return
-    error_lines = error_output.strip().splitlines()
     raise WorkerError(
-        f"The check of the device {setting} ended without a result: "
-        f"{error_lines[-1] if error_lines else 'no output'}.",
+        f"The check of the device {setting} ended without a result: {last_line(error_output)}.",
         "Run batch.py doctor to check the worker's Python.",
     )
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import importlib.metadata
-import json
 import platform
 import shutil
 import subprocess
@@ -17,7 +16,7 @@ from typing import Any
 from ...errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError, WrapError
 from ...machine import total_memory_bytes
 from ...worker.environment import EXTRAS, not_started, read_requirements, requirements_file
-from ...worker.helper_process import child_command, emit
+from ...worker.helper_process import child_command, emit, json_object, last_line
 from ...worker.spawn import run_to_end
 
 MIN_PYTHON = (3, 11)
@@ -44,28 +43,14 @@ class Diagnosis:
 
 def diagnose(folder: str = ".") -> list[Diagnosis]:
     """Diagnose the running interpreter."""
-    found = [
-        Diagnosis(
-            "Python",
-            sys.version_info[:2] >= MIN_PYTHON,
-            f"{platform.python_version()} at {sys.executable}",
-            "Use Python 3.11 or newer.",
-        )
-    ]
-    found += _packages()
-    found += _extras()
-    found += _devices()
-    found.append(_memory())
+    good, python = sys.version_info[:2] >= MIN_PYTHON, platform.python_version()
     free_bytes = shutil.disk_usage(folder).free
-    found.append(
-        Diagnosis(
-            "Disk",
-            free_bytes > MIN_DISK_BYTES,
-            f"{free_bytes / 2**30:.1f} GiB free",
-            "Free at least 2 GiB.",
-        )
-    )
-    return found
+    free = f"{free_bytes / 2**30:.1f} GiB free"
+    return [
+        Diagnosis("Python", good, f"{python} at {sys.executable}", "Use Python 3.11 or newer."),
+        *_packages(), *_extras(), *_devices(), _memory(),
+        Diagnosis("Disk", free_bytes > MIN_DISK_BYTES, free, "Free at least 2 GiB."),
+    ]  # fmt: skip
 
 
 def _packages() -> list[Diagnosis]:
@@ -133,12 +118,8 @@ def _memory() -> Diagnosis:
     total_bytes = total_memory_bytes()
     if not total_bytes:
         return Diagnosis("Memory", True, "unknown")
-    return Diagnosis(
-        "Memory",
-        total_bytes >= MIN_MEMORY_BYTES,
-        f"{total_bytes / 2**30:.1f} GiB",
-        "At least 4 GiB are needed.",
-    )
+    found, good = f"{total_bytes / 2**30:.1f} GiB", total_bytes >= MIN_MEMORY_BYTES
+    return Diagnosis("Memory", good, found, "At least 4 GiB are needed.")
 
 
 def main(arguments: list[str]) -> int:
@@ -165,18 +146,14 @@ def diagnose_worker(python: str) -> list[Diagnosis]:
         ) from None
     findings: list[Diagnosis] = []
     for line in output.splitlines():
-        try:
-            values: Any = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(values, dict) and "error" in values:
+        values = json_object(line) or {}
+        if "error" in values:
             raise WorkerError(str(values["error"]), str(values.get("hint", "")))
         with contextlib.suppress(TypeError):
             findings.append(Diagnosis(**values))
     if not findings:
-        error_lines = error_output.strip().splitlines()
         raise WorkerError(
-            f"{python} reported nothing: {error_lines[-1] if error_lines else 'no output'}.",
+            f"{python} reported nothing: {last_line(error_output)}.",
             "Press Set Up Worker, or choose a Python 3.11 or newer with the worker's packages.",
         )
     return findings

@@ -24,7 +24,7 @@ from ...errors import (
 )
 from ...progress import ReportWarning
 from ...worker.environment import not_started, package_error
-from ...worker.helper_process import child_command, emit
+from ...worker.helper_process import child_command, emit, ending_of, json_object, last_line
 from ...worker.spawn import Caller, kill_group, spawn
 
 # -- Start a command in the worker's Python and log what it says; the parent needs no packages ----
@@ -59,7 +59,7 @@ def run_in_worker(
         try:
             assert process.stdout is not None
             for raw in process.stdout:
-                values = _parse(raw)
+                values = json_object(raw)
                 if values is not None:
                     understood = _log_line(values) or understood
                     error_shown = error_shown or "error" in values
@@ -73,21 +73,11 @@ def run_in_worker(
             not error_shown if code else not understood
         ):
             error_file.seek(max(0, error_file.seek(0, os.SEEK_END) - ERROR_TAIL_BYTES))
-            error_lines = error_file.read().decode(errors="replace").strip().splitlines()
-            reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
             raise WorkerError(
-                f"The {what} {reason}: {error_lines[-1] if error_lines else 'no output'}.",
+                f"The {what} {ending_of(code)}: {last_line(error_file.read())}.",
                 "Run batch.py doctor to check the worker's Python.",
             )
         return code
-
-
-def _parse(raw: bytes) -> dict[str, Any] | None:
-    try:
-        values = json.loads(raw)
-    except (ValueError, RecursionError):
-        return None
-    return values if isinstance(values, dict) else None
 
 
 def _log_line(values: dict[str, Any]) -> bool:

@@ -113,22 +113,6 @@ class PartState:
         """The computer, for people."""
         return self.place.split(" ")[0]
 
-    def done_in(self, root: Path, plan: str) -> bool:
-        """Return whether the part is done for a plan, and what it has made is still there."""
-        return (
-            self.state == "DONE"
-            and self.plan == plan
-            and all(
-                (path := resolve_inside(root, output)) is not None and path.exists()
-                for output in self.outputs
-            )
-        )
-
-
-def states_folder(root: Path) -> Path:
-    """Return the folder of the states in a job folder."""
-    return root / STATES_FOLDER
-
 
 def state_path(root: Path, name: str) -> Path:
     """Return the state file of a part."""
@@ -137,17 +121,13 @@ def state_path(root: Path, name: str) -> Path:
 
 def write_state(root: Path, name: str, state: PartState) -> None:
     """Write the state of a part, atomically."""
-    states_folder(root).mkdir(exist_ok=True)
-    write_json(state_path(root, name), _values_of(state))
+    state_path(root, name).parent.mkdir(exist_ok=True)
+    write_json(state_path(root, name), asdict(state))
 
 
 def overwrite_state(root: Path, name: str, state: PartState) -> None:
     """Write the state of a part over the earlier one, where there is no room for another file."""
-    overwrite_json(state_path(root, name), _values_of(state))
-
-
-def _values_of(state: PartState) -> dict[str, Any]:
-    return {**asdict(state), "outputs": list(state.outputs)}
+    overwrite_json(state_path(root, name), asdict(state))
 
 
 def read_state(root: Path, name: str) -> PartState | None:
@@ -157,6 +137,15 @@ def read_state(root: Path, name: str) -> PartState | None:
         return _state_of(values)
     except (OSError, ParseError, TypeError, ValueError, KeyError, OverflowError):
         return None
+
+
+def done_state(root: Path, name: str, plan: str) -> PartState | None:
+    """Return the state of a part that is done for a plan, and whose outputs are still there."""
+    state = read_state(root, name)
+    if state is None or state.state != "DONE" or state.plan != plan:
+        return None
+    paths = [resolve_inside(root, output) for output in state.outputs]
+    return state if all(path is not None and path.exists() for path in paths) else None
 
 
 _TEXTS = ("state", "plan", "place", "token", "message", "error", "hint")
@@ -199,8 +188,7 @@ def new_state(plan: str, attempt: int) -> PartState:
 
 def keep_states(root: Path, names: Collection[str]) -> None:
     """Remove the states of all parts of a job but some."""
-    folder = states_folder(root)
-    for path in folder.glob("*.json") if folder.is_dir() else ():
+    for path in (root / STATES_FOLDER).glob("*.json"):
         if path.stem not in names:
             path.unlink(missing_ok=True)
 
@@ -262,9 +250,8 @@ class PartsGraph:
 
     def part(self, name: str) -> Part:
         """Return a part by its name. Raises UsageError: there is none of this name."""
-        for part in self.parts:
-            if part.name == name:
-                return part
+        if found := [part for part in self.parts if part.name == name]:
+            return found[0]
         raise UsageError(f"The job has no part {name}.", f"Its parts are listed in {PARTS_NAME}.")
 
     def of_region(self, region: str) -> list[Part]:
@@ -274,23 +261,7 @@ class PartsGraph:
 
 def write_parts(folder: Path, graph: PartsGraph) -> None:
     """Write ``parts.json`` into a job folder, atomically."""
-    write_json(
-        folder / PARTS_NAME,
-        {
-            "version": VERSION,
-            "code": graph.code,
-            "plan": graph.plan,
-            "source": graph.source,
-            "parts": [
-                {f.name: _json_value(getattr(part, f.name)) for f in fields(Part)}
-                for part in graph.parts
-            ],
-        },
-    )
-
-
-def _json_value(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+    write_json(folder / PARTS_NAME, {"version": VERSION, **asdict(graph)})
 
 
 def read_parts(folder: Path) -> PartsGraph:
@@ -344,9 +315,8 @@ def _part_of(entry: Any) -> Part:
         raise _WrongEntryError("", "not the entries of a part")
     for key in ("name", "region"):
         text = entry[key]
-        if not isinstance(text, str) or not (
-            NAME.fullmatch(text) or (key == "region" and not text)
-        ):
+        is_none = key == "region" and text == ""
+        if not is_none and not (isinstance(text, str) and NAME.fullmatch(text)):
             raise _WrongEntryError(key, "not a name of letters, digits, _ and -")
     if entry["kind"] not in KINDS:
         raise _WrongEntryError("kind", "no kind of parts")
@@ -481,8 +451,7 @@ def plan_if_missing(folder: JobFolder) -> PartsGraph:
 
 def _begin(job: JobFile) -> list[Part]:
     """Return the parts up to the training."""
-    train = STAGE_SHARES["train"]
-    cameras = STAGE_SHARES["cameras"]
+    train, cameras = STAGE_SHARES["train"], STAGE_SHARES["cameras"]
     if job.command == "bake":  # both are finished
         cameras = train = BAKE_BEGINS / 2
     parts = [Part("cameras", "cameras", (), ("stages/cameras-*/scene.json",), cameras)]

@@ -24,7 +24,15 @@ from ...files import seconds_since_written
 from ...progress import ProgressEvent
 from ...worker.helper_process import emit, own_peak_bytes
 from ...worker.spawn import is_here, owner_alive
-from .graph import PartState, new_state, overwrite_state, read_state, state_path, write_state
+from .graph import (
+    PartState,
+    done_state,
+    new_state,
+    overwrite_state,
+    read_state,
+    state_path,
+    write_state,
+)
 
 _logger = logging.getLogger(__name__)
 
@@ -43,8 +51,7 @@ class PartLease:
     """
 
     def __init__(self, root: Path, name: str, plan: str, attempt: int) -> None:
-        self._root = root
-        self._name = name
+        self._root, self._name = root, name
         self._state = new_state(plan, attempt)
         self._begun_s = time.monotonic()
         self._ended = threading.Event()
@@ -70,8 +77,7 @@ class PartLease:
             if is_cancelled():
                 raise Cancelled()
             time.sleep(WAIT_S)
-        state = read_state(self._root, self._name)
-        if state is not None and state.done_in(self._root, self._state.plan):
+        if done_state(self._root, self._name, self._state.plan) is not None:
             return False
         self._write()
         self._is_held = True

@@ -48,6 +48,7 @@ from .graph import (
     PartsGraph,
     PartState,
     PlannedTiles,
+    done_state,
     fixed_tiles,
     keep_states,
     plan_parts,
@@ -342,9 +343,8 @@ class PartRunner:
         return self._folder.root / self._done_state(name).outputs[0]
 
     def _done_state(self, name: str) -> PartState:
-        state = read_state(self._folder.root, name)
-        plan = self._graph().plan
-        if state is None or not state.outputs or not state.done_in(self._folder.root, plan):
+        state = done_state(self._folder.root, name, self._graph().plan)
+        if state is None or not state.outputs:
             raise WorkerError(f"Part {name} is not done yet.", "Run it first, or resume the job.")
         return state
 
@@ -357,9 +357,9 @@ def _stage_in(folder: Path) -> Stage:
     return Stage(name, key, folder, done, True)
 
 
-def planned_tiles(folder: JobFolder, plan: PartState | None) -> PlannedTiles | None:
+def planned_tiles(folder: JobFolder, plan: PartState) -> PlannedTiles | None:
     """Return what is known of the tiles of a region whose plan is done; ``None`` if it is whole."""
-    if plan is None or plan.state != "DONE" or not plan.outputs:
+    if not plan.outputs:
         return None
     tiles = folder.root / plan.outputs[0] / TILES_FOLDER
     if not is_planned(tiles):
@@ -547,17 +547,13 @@ class Walk:
             if part.kind == "plan":
                 self._note_tiles(part)
         self._plan()
-        root = self.folder.root
-        states = {part.name: read_state(root, part.name) for part in self.graph.parts}
-        return {
-            name: state
-            for name, state in states.items()
-            if state is not None and state.done_in(root, self.graph.plan)
-        }
+        root, plan = self.folder.root, self.graph.plan
+        states = {part.name: done_state(root, part.name, plan) for part in self.graph.parts}
+        return {name: state for name, state in states.items() if state is not None}
 
     def _note_tiles(self, part: Part) -> None:
-        state = read_state(self.folder.root, part.name)
-        if state is None or not state.done_in(self.folder.root, self.graph.plan):
+        state = done_state(self.folder.root, part.name, self.graph.plan)
+        if state is None:
             return
         known = planned_tiles(self.folder, state)
         self._tiles.pop(part.region, None)

@@ -103,22 +103,6 @@ class BakeRequest:
         JobSettings(texture=self.texture).validated()
         return replace(self, name=file_stem(self.name, 0))
 
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
-        return to_json(self)
-
-    @classmethod
-    def from_json(cls, values: Any) -> BakeRequest:
-        """Build from :meth:`to_json`'s values.
-
-        Raises UsageError: an entry is missing, unknown, of the wrong type or out of range.
-        """
-        try:
-            request: BakeRequest = from_json(cls, values, "bake")
-        except TypeError:
-            raise UsageError("job.json: bake names no mesh.", "Start the bake again.") from None
-        return request
-
 
 # -- The job file: command, input, settings and regions, the same for button and command line -----
 
@@ -153,7 +137,7 @@ class JobFile:
         """Return plain JSON values."""
         # Omitted if empty: job files stay as they were before this entry existed.
         own = {"edge_lengths": self.edge_lengths} if self.edge_lengths else {}
-        bake = {"bake": self.bake.to_json()} if self.bake is not None else {}
+        bake = {"bake": to_json(self.bake)} if self.bake is not None else {}
         return {
             **own,
             **bake,
@@ -189,7 +173,10 @@ class JobFile:
         lengths = _checked_lengths(values.get("edge_lengths", {}), settings.regions)
         if (values["command"] == "bake") != ("bake" in values):
             raise UsageError("job.json names no mesh to bake onto.", "Start the bake again.")
-        bake = BakeRequest.from_json(values["bake"]) if "bake" in values else None
+        try:
+            bake = from_json(BakeRequest, values["bake"], "bake") if "bake" in values else None
+        except TypeError:
+            raise UsageError("job.json: bake names no mesh.", "Start the bake again.") from None
         bodies = values["region_bodies"]
         return cls(values["command"], values["source"], settings, bodies, lengths, bake)
 

@@ -28,11 +28,10 @@ from ...worker.spawn import host_and_pid_namespace, is_here, owner_alive, proces
 #
 # It is written outside of the worker, which has no Blender, and only on request.
 
-_blend_file_logger = logging.getLogger("gaussian_wrapping")
+_logger = logging.getLogger("gaussian_wrapping")
 
-NAME = "scene.blend"
-EARLIER = "scene.blend1"
-"""Blender's name for the previous version, which may hold a user's additions."""
+NAME, EARLIER = "scene.blend", "scene.blend1"
+"""Its name, and Blender's name for the previous version, which may hold a user's additions."""
 
 
 def result_state(result: Path) -> dict[str, bytes]:
@@ -52,7 +51,7 @@ def back_up_stale_blend(result: Path, before: dict[str, bytes]) -> bool:
     if not blend.is_file() or result_state(result) == before:
         return False
     os.replace(blend, result / EARLIER)
-    _blend_file_logger.info("%s showed the previous result and was renamed to %s", NAME, EARLIER)
+    _logger.info("%s showed the previous result and was renamed to %s", NAME, EARLIER)
     return True
 
 
@@ -110,9 +109,8 @@ class JobStatus:
         """
         given = dict(values)
         known = {f.name: given[f.name] for f in fields(cls) if f.name in given}
-        for name, value in known.items():
-            if not _is_kind(name, value):
-                raise TypeError(f"{name} is {type(value).__name__}")
+        if wrong := [name for name, value in known.items() if not _is_kind(name, value)]:
+            raise TypeError(f"{wrong[0]} is {type(known[wrong[0]]).__name__}")
         # Version 0.1.0 marked a rolled-back job only by its error.
         old = known.get("state") == "DONE" and bool(known.get("error"))
         return cls(**{"put_back": old, **known})
@@ -143,56 +141,20 @@ def _read_small(path: Path) -> Any:
     return read_json(path, most_bytes=limits.MAX_STATUS_BYTES)
 
 
-@dataclass(frozen=True)
 class JobFolder:
     """Paths of a job folder; access to its status and lock."""
 
-    root: Path
-
-    @property
-    def job_path(self) -> Path:
-        """``job.json``."""
-        return self.root / "job.json"
-
-    @property
-    def status_path(self) -> Path:
-        """``status.json``."""
-        return self.root / "status.json"
-
-    @property
-    def log_path(self) -> Path:
-        """``log.txt``."""
-        return self.root / "log.txt"
-
-    @property
-    def output_path(self) -> Path:
-        """``worker-output.txt``; what the worker wrote to stdout and stderr."""
-        return self.root / "worker-output.txt"
-
-    @property
-    def cancel_path(self) -> Path:
-        """``cancel``; the worker stops if it exists."""
-        return self.root / "cancel"
-
-    @property
-    def lock_path(self) -> Path:
-        """``lock.json``; names the process that holds the folder."""
-        return self.root / "lock.json"
-
-    @property
-    def stages(self) -> Path:
-        """Folder of the stages."""
-        return self.root / "stages"
-
-    @property
-    def baked(self) -> Path:
-        """Folder of the meshes from elsewhere that photos were baked onto."""
-        return self.root / "baked"
-
-    @property
-    def result(self) -> Path:
-        """Folder of the results."""
-        return self.root / "result"
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.job_path = root / "job.json"
+        self.status_path = root / "status.json"
+        self.log_path = root / "log.txt"
+        self.output_path = root / "worker-output.txt"  # what the worker wrote to stdout and stderr
+        self.cancel_path = root / "cancel"  # the worker stops if it exists
+        self.lock_path = root / "lock.json"  # names the process that holds the folder
+        self.stages = root / "stages"
+        self.baked = root / "baked"  # meshes from elsewhere that photos were baked onto
+        self.result = root / "result"
 
     def create(self) -> None:
         """Create the folder, or accept an existing job folder or an empty folder.
@@ -233,18 +195,14 @@ class JobFolder:
 
     def read_status(self) -> JobStatus:
         """Return the status; a running job whose process is gone is reported as LOST."""
-        status = self._read_file()
-        if self._gone(status):
-            # The worker may have written its final status and ended after the first read.
+        for _ in range(2):  # it may have written its final status and ended after the first read
             status = self._read_file()
-        if not self._gone(status):
-            return status
+            if not self._gone(status):
+                return status
         return replace(
-            status,
-            state="LOST",
-            error="The worker process ended without reporting an error.",
+            status, state="LOST", error="The worker process ended without reporting an error.",
             hint="Resume the job; it continues from the last checkpoint.",
-        )
+        )  # fmt: skip
 
     def _read_file(self) -> JobStatus:
         try:
@@ -253,9 +211,9 @@ class JobFolder:
             return JobStatus()
 
     def _gone(self, status: JobStatus) -> bool:
-        if status.state not in ("RUNNING", "CANCELLING"):
-            return False
-        return not _lives(status.pid, status.pid_started, status.place, self.status_path)
+        return status.state in ("RUNNING", "CANCELLING") and not _lives(
+            status.pid, status.pid_started, status.place, self.status_path
+        )
 
     def write_status(self, status: JobStatus) -> None:
         """Write the status atomically."""
@@ -273,16 +231,14 @@ class JobFolder:
         The lock of a dead process, or an unreadable one, is taken over: a lock of a living process
         is written atomically. Raises UsageError: another process holds the folder.
         """
-        mine = {
-            "pid": os.getpid(),
-            "started": process_start_ticks(os.getpid()),
-            "place": host_and_pid_namespace(),
-        }
+        pid = os.getpid()
+        started, place = process_start_ticks(pid), host_and_pid_namespace()
+        mine = {"pid": pid, "started": started, "place": place}
         if self._lock_owner() == tuple(mine.values()):
             return
         self._drop_stale_lock()
         # A hard link to a complete file is atomic and succeeds for one process only.
-        ready = self.lock_path.with_name(f"lock.{os.getpid()}.json")
+        ready = self.lock_path.with_name(f"lock.{pid}.json")
         write_json(ready, mine)
         try:
             os.link(ready, self.lock_path)

@@ -136,8 +136,10 @@ def save_rollback(folder: JobFolder, job: JobFile) -> None:
     except (UsageError, ParseError):
         path.unlink(missing_ok=True)
         return  # nothing to restore
-    saved = {"job": finished.to_json(), "status": asdict(_without_error(status))}
-    write_json(path, {**saved, "stages": sorted(p.name for p in folder.stages.iterdir())})
+    without_error = replace(status, error="", hint="", exit_code=0, put_back=False)
+    stages = sorted(p.name for p in folder.stages.iterdir())
+    saved = {"job": finished.to_json(), "status": asdict(without_error), "stages": stages}
+    write_json(path, saved)
 
 
 def finished_job(folder: JobFolder) -> JobFile:
@@ -170,12 +172,10 @@ def roll_back(folder: JobFolder) -> JobStatus | None:
     except (UsageError, TypeError, ValueError):
         return None
     known = set(saved["stages"])
-    begun = [
-        stage for kind in ("mesh", "texture", "bake") for stage in folder.stages.glob(f"{kind}-*")
-    ]
-    for stage in begun if is_real_folder(folder.stages) else ():
-        if is_real_folder(stage) and stage.name not in known and read_done(stage) is None:
-            shutil.rmtree(stage, ignore_errors=True)
+    for kind in ("mesh", "texture", "bake") if is_real_folder(folder.stages) else ():
+        for stage in folder.stages.glob(f"{kind}-*"):
+            if is_real_folder(stage) and stage.name not in known and read_done(stage) is None:
+                shutil.rmtree(stage, ignore_errors=True)
     for files in (folder.result, folder.baked):
         if is_real_folder(files):
             recover(files)
@@ -184,10 +184,6 @@ def roll_back(folder: JobFolder) -> JobStatus | None:
     _logger.info("the job was restored to its state before this mesh")
     # The folder may be a copy whose status names the original's path.
     return replace(status, result=str(folder.result) if status.result else "")
-
-
-def _without_error(status: JobStatus) -> JobStatus:
-    return replace(status, error="", hint="", exit_code=0, put_back=False)
 
 
 def _read(path: Path) -> dict[str, Any] | None:
