@@ -357,12 +357,9 @@ class Answer:
 
 
 async def ask_workers(
-    address: Address,
-    certificates: str,
-    requests: Callable[[int], Sequence[dict[str, Any]]],
-    judge: Callable[[Answer], Awaitable[Judged]],
-    limit_s: float,
-) -> AsyncIterator[Judged]:
+    address: Address, certificates: str, requests: Callable[[int], Sequence[dict[str, Any]]],
+    judge: Callable[[Answer], Awaitable[Judged]], limit_s: float,
+) -> AsyncIterator[Judged]:  # fmt: skip
     """Have each worker run children at once, whatever it works on; yield what comes of them.
 
     ``requests``: returns the requests for the worker of a number; the next one is made where one

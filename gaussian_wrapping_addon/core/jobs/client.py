@@ -152,13 +152,9 @@ class JobClient:
 
     @classmethod
     def resume(
-        cls,
-        folder: Path,
-        *,
-        python: str | None = None,
-        keep_running: bool = False,
+        cls, folder: Path, *, python: str | None = None, keep_running: bool = False,
         device: str | None = None,
-    ) -> JobClient:
+    ) -> JobClient:  # fmt: skip
         """Start a worker for the job in ``folder``; finished stages are re-used.
 
         ``device``: replaces the job's setting; ``None`` keeps it.
@@ -278,11 +274,9 @@ class JobClient:
         log = self.folder.log_path.name
         begun = status.state != "NEW"
         return replace(
-            status,
-            state="LOST" if begun else "FAILED",
-            error=error,
+            status, state="LOST" if begun else "FAILED", error=error,
             hint=f"See {log} in the job folder, then resume." if begun else PYTHON_HINT,
-        )
+        )  # fmt: skip
 
     def output_tail(self) -> str:
         """Return the last line that the worker wrote to stdout and stderr."""

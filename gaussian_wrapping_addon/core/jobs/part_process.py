@@ -222,14 +222,9 @@ def _hold(
 
 
 def _work(
-    folder: JobFolder,
-    job: JobFile,
-    graph: PartsGraph,
-    part: Part,
-    request: dict[str, object],
-    lease: PartLease,
-    watch: _Watch,
-) -> PartResult:
+    folder: JobFolder, job: JobFile, graph: PartsGraph, part: Part, request: dict[str, object],
+    lease: PartLease, watch: _Watch,
+) -> PartResult:  # fmt: skip
     threads = int(str(request["threads"])) or default_threads()
     wanted = str(request["device"] or job.settings.device)
     device = choose_device("cpu" if job.command == "bake" else wanted)

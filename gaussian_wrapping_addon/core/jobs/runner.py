@@ -19,11 +19,9 @@ _logger = logging.getLogger(__name__)
 
 
 def run_job(
-    folder: JobFolder,
-    job: JobFile,
-    sink: Callable[[ProgressEvent], None],
+    folder: JobFolder, job: JobFile, sink: Callable[[ProgressEvent], None],
     is_cancelled: Callable[[], bool],
-) -> None:
+) -> None:  # fmt: skip
     """Run a job to its end in ``folder``; finished stages are re-used.
 
     Raises WrapError: any typed failure of a stage; stages finished so far stay.

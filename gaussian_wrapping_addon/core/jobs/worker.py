@@ -105,14 +105,10 @@ class _Reporter:
         changed = event.stage != self.status.stage
         with self._guard:
             self.status = replace(
-                self.status,
-                stage=event.stage,
-                fraction=event.fraction,
-                message=event.message,
-                phase=event.phase,
-                seconds_left=event.seconds_left,
+                self.status, stage=event.stage, fraction=event.fraction, message=event.message,
+                phase=event.phase, seconds_left=event.seconds_left,
                 figures=_merged({} if changed else self.status.figures, event.figures),
-            )
+            )  # fmt: skip
         if changed or now_s - self._written_s > STATUS_EVERY_S:
             self.write()
         if changed or now_s - self._logged_s > HEARTBEAT_S:

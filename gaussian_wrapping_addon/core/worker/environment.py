@@ -201,12 +201,9 @@ _COMPARE = {
     ">": operator.gt, "<": operator.lt,
 }  # fmt: skip
 NO_ROOM = (
-    "failed to map segment",
-    "annot allocate memory",
-    "cannot apply additional memory protection",
-    "cannot enable executable stack",
-    "paging file is too small",
-)
+    "failed to map segment", "annot allocate memory", "cannot apply additional memory protection",
+    "cannot enable executable stack", "paging file is too small",
+)  # fmt: skip
 """What the loaders of Linux, macOS and Windows say where a library finds no room in memory."""
 _LLVM = "llvmlite.binding"
 

@@ -185,13 +185,9 @@ def kill_helpers() -> None:
 
 
 def run_helper(
-    module: str,
-    folder: Path,
-    progress: Progress,
-    *,
-    deadline_s: float = limits.HELPER_DEADLINE_S,
+    module: str, folder: Path, progress: Progress, *, deadline_s: float = limits.HELPER_DEADLINE_S,
     memory_bytes: int | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Run ``core.<module>`` on ``folder`` and wait for it, forwarding its progress.
 
     Raises Cancelled: the user asked to stop; the helper has been ended; DatasetError, MeshingError,

@@ -49,14 +49,10 @@ def group_options() -> dict[str, Any]:
 
 
 def spawn(
-    command: list[str],
-    *,
-    stdin: int | IO[Any] | None = subprocess.DEVNULL,
-    stdout: int | IO[Any] | None = subprocess.PIPE,
-    stderr: int | IO[Any] | None = subprocess.PIPE,
-    environment: dict[str, str] | None = None,
-    folder: Path | None = None,
-) -> subprocess.Popen[bytes]:
+    command: list[str], *, stdin: int | IO[Any] | None = subprocess.DEVNULL,
+    stdout: int | IO[Any] | None = subprocess.PIPE, stderr: int | IO[Any] | None = subprocess.PIPE,
+    environment: dict[str, str] | None = None, folder: Path | None = None,
+) -> subprocess.Popen[bytes]:  # fmt: skip
     """Start a child in a new process group; it inherits no open files.
 
     ``command``: program and arguments, without a shell. Our own Python is started isolated
@@ -67,15 +63,9 @@ def spawn(
     Raises OSError: the program does not start.
     """
     return subprocess.Popen(
-        command,
-        stdin=stdin,
-        stdout=stdout,
-        stderr=stderr,
-        close_fds=True,
-        cwd=folder,
-        env=child_environment() if environment is None else environment,
-        **group_options(),
-    )
+        command, stdin=stdin, stdout=stdout, stderr=stderr, close_fds=True, cwd=folder,
+        env=child_environment() if environment is None else environment, **group_options(),
+    )  # fmt: skip
 
 
 def run_to_end(command: list[str], deadline_s: float) -> tuple[int, str, str]:
@@ -92,10 +82,8 @@ def run_to_end(command: list[str], deadline_s: float) -> tuple[int, str, str]:
         kill_group(process)
         raise
     return (
-        process.returncode,
-        output.decode(errors="replace"),
-        error_output.decode(errors="replace"),
-    )
+        process.returncode, output.decode(errors="replace"), error_output.decode(errors="replace"),
+    )  # fmt: skip
 
 
 def kill_group(process: subprocess.Popen[Any], grace_s: float = 2.0) -> None:

@@ -86,14 +86,10 @@ def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     measure = _against_photos if given["metric"] == "mbr" else _against_truth
     mesh, result, lines = measure(given, source, lambda: read_mesh(path), threads, progress)
     report = {
-        "version": 1,
-        "started_unix_s": begun_unix_s,
-        "seconds": time.monotonic() - begun_s,
+        "version": 1, "started_unix_s": begun_unix_s, "seconds": time.monotonic() - begun_s,
         "mesh": {"path": str(path.resolve()), "vertices": len(mesh[0]), "faces": len(mesh[1])},
-        **result,
-        "machine": describe_machine(threads),
-        "peak_memory_bytes": peak_memory_bytes(),
-    }
+        **result, "machine": describe_machine(threads), "peak_memory_bytes": peak_memory_bytes(),
+    }  # fmt: skip
     return report, [f"{path.name}: {len(mesh[0])} vertices, {len(mesh[1])} faces", *lines]
 
 

@@ -201,12 +201,9 @@ def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
 
 
 def _write_mesh(
-    request: ExportRequest,
-    mesh: StoredMesh,
-    format: str,
-    world_from_scene: Similarity,
+    request: ExportRequest, mesh: StoredMesh, format: str, world_from_scene: Similarity,
     blender_from_scene: Similarity,
-) -> Path:
+) -> Path:  # fmt: skip
     from ...texture.file_checks import vertex_colors, write_errors, write_mesh_ply
     from ...texture.files import write_glb, write_obj
 

@@ -162,16 +162,9 @@ class PartRunner:
     """
 
     def __init__(
-        self,
-        folder: JobFolder,
-        job: JobFile,
-        graph: Callable[[], PartsGraph],
-        *,
-        threads: int,
-        device: DeviceChoice,
-        begun_s: float,
-        is_alone: bool = True,
-    ) -> None:
+        self, folder: JobFolder, job: JobFile, graph: Callable[[], PartsGraph], *, threads: int,
+        device: DeviceChoice, begun_s: float, is_alone: bool = True,
+    ) -> None:  # fmt: skip
         self._folder, self._job, self._graph = folder, job, graph
         self._threads, self._device = threads, device
         self._begun_s, self._is_alone = begun_s, is_alone

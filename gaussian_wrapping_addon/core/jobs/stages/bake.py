@@ -36,14 +36,9 @@ def require_training(folder: JobFolder, job: JobFile, cameras: Stage) -> None:
 
 
 def run_bake(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    trained: Stage,
-    progress: Progress,
-    *,
+    folder: JobFolder, job: JobFile, cameras: Stage, trained: Stage, progress: Progress, *,
     threads: int,
-) -> Stage:
+) -> Stage:  # fmt: skip
     """Bake onto the mesh of a job and replace ``baked/NAME``, or re-use the finished stage.
 
     Raises UsageError: the job names no mesh; DatasetError, MeshingError: the mesh cannot be read or
@@ -73,13 +68,9 @@ def run_bake(
 
 
 def _bake(
-    request: BakeRequest,
-    cameras: Stage,
-    trained: Stage,
-    stage_folder: Path,
-    progress: Progress,
+    request: BakeRequest, cameras: Stage, trained: Stage, stage_folder: Path, progress: Progress,
     threads: int,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     from ...evaluation.photo_views import compare_with_photos
     from ...limits import MAX_IMAGE_SIDE_PX
     from ...mesh.textured_mesh import POLYGONS_FILE, write_polygons
@@ -120,15 +111,10 @@ def _bake(
         from_gaussians=request.texture.source == "gaussians", threads=threads,
     )  # fmt: skip
     figures = {
-        "version": VERSION,
-        "name": request.name,
-        "vertices": len(textured.mesh.vertices),
-        "faces": len(textured.mesh.faces),
-        "faces_given": len(given.faces),
-        "udims": list(textured.udims),
-        "texture": textured.statistics,
-        "mesh_rendering": rendering,
-    }
+        "version": VERSION, "name": request.name, "vertices": len(textured.mesh.vertices),
+        "faces": len(textured.mesh.faces), "faces_given": len(given.faces),
+        "udims": list(textured.udims), "texture": textured.statistics, "mesh_rendering": rendering,
+    }  # fmt: skip
     write_json(files / BAKE_FILE, figures)
     return figures
 

@@ -188,13 +188,10 @@ def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads:
     facts = {"kind": SPLAT, "views": len(views), "points": len(chosen), **splat.facts}
     progress.update(1.0, f"{len(views)} views are rendered")
     return Scene(
-        tuple(views),
-        scene_from_world.points(means[chosen]),
-        np.round(255.0 * colors).astype(np.uint8),
-        scene_from_world.inverse(),
-        tuple(warnings),
+        tuple(views), scene_from_world.points(means[chosen]),
+        np.round(255.0 * colors).astype(np.uint8), scene_from_world.inverse(), tuple(warnings),
         facts,
-    )
+    )  # fmt: skip
 
 
 def _png(color: np.ndarray) -> bytes:

@@ -68,14 +68,9 @@ _HINT = (
 
 
 def make_region_masks(
-    scene: Scene,
-    job: JobFile,
-    folder: Path,
-    progress: Progress,
-    *,
-    threads: int,
+    scene: Scene, job: JobFile, folder: Path, progress: Progress, *, threads: int,
     device: DeviceChoice,
-) -> None:
+) -> None:  # fmt: skip
     """Write ``000000.png``, ... of the scene's views; the training in ``folder`` is resumed.
 
     Raises DatasetError: the short training has nothing in the regions.
@@ -171,14 +166,9 @@ _OWN_HINT = (
 
 
 def run_masks(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    progress: Progress,
-    *,
-    threads: int,
+    folder: JobFolder, job: JobFile, cameras: Stage, progress: Progress, *, threads: int,
     device: DeviceChoice,
-) -> Stage:
+) -> Stage:  # fmt: skip
     """Return the stage whose scene has the job's made masks; ``cameras`` where none are made.
 
     Masks are made once and put into the job's folder ``masks``. What is there when a training
@@ -243,13 +233,9 @@ def _are_made(folder: JobFolder, job: JobFile, cameras: Stage) -> bool:
 
 
 def _run_making(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    progress: Progress,
-    threads: int,
+    folder: JobFolder, job: JobFile, cameras: Stage, progress: Progress, threads: int,
     device: DeviceChoice,
-) -> Stage:
+) -> Stage:  # fmt: skip
     settings = job.settings
     key = _making_key(job, cameras)
 
@@ -318,11 +304,9 @@ def check_mask_model(job: JobFile, folder: JobFolder, progress: Progress) -> Non
 def _task(job: JobFile, photos: list[str], threads: int) -> dict[str, Any]:
     settings = job.settings
     return {
-        "model": settings.mask_model,
-        "range": settings.mask_model_range,
-        "threads": threads,
+        "model": settings.mask_model, "range": settings.mask_model_range, "threads": threads,
         "photos": photos,
-    }
+    }  # fmt: skip
 
 
 def _list_of(folder: JobFolder, cameras: Stage, made: Stage) -> MaskList:

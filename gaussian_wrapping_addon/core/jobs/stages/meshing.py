@@ -176,15 +176,9 @@ def field_views(scene: Scene, photos: PhotoSource, holdout_every: int, cameras: 
 
 
 def region_field(
-    scene: Scene,
-    arrays: GaussianArrays,
-    region: Region,
-    training: TrainingSettings,
-    meshing: MeshingSettings,
-    *,
-    threads: int,
-    device: str = "cpu",
-) -> VacancyField:
+    scene: Scene, arrays: GaussianArrays, region: Region, training: TrainingSettings,
+    meshing: MeshingSettings, *, threads: int, device: str = "cpu",
+) -> VacancyField:  # fmt: skip
     """Return the field in and around a region, limited to the mesher's halo.
 
     ``region``: scene frame; ``training``: ``mask_mode``, ``holdout_every`` and the size of the
@@ -218,12 +212,9 @@ def region_field(
 def field_figures(field: VacancyField) -> dict[str, Any]:
     """Return the report's figures of a field: device, cameras, evaluations, what is unseen."""
     return {
-        "field_device": field.device,
-        "field_cameras": len(field.cameras),
-        "unseen": field.unseen,
-        "field_evaluations": field.evaluations,
-        "unseen_evaluations": field.unseen_evaluations,
-    }
+        "field_device": field.device, "field_cameras": len(field.cameras), "unseen": field.unseen,
+        "field_evaluations": field.evaluations, "unseen_evaluations": field.unseen_evaluations,
+    }  # fmt: skip
 
 
 # -- Mesh a region in its stage folder, whole or in tiles, as requested or as memory allows -------
@@ -247,15 +238,9 @@ class TilesPlanned(Exception):  # noqa: N818 - no error: the tiles are made next
 
 
 def _mesh_in_stage(
-    stage_folder: Path,
-    inputs: RegionInputs,
-    meshing: MeshingSettings,
-    progress: Progress,
-    *,
-    seed: int,
-    sampled: Callable[[], DepthSamples],
-    warnings: Sequence[ReportWarning],
-) -> tuple[SurfaceMesh, dict[str, Any]]:
+    stage_folder: Path, inputs: RegionInputs, meshing: MeshingSettings, progress: Progress, *,
+    seed: int, sampled: Callable[[], DepthSamples], warnings: Sequence[ReportWarning],
+) -> tuple[SurfaceMesh, dict[str, Any]]:  # fmt: skip
     """Estimate the mesh of a region, then make it; or plan its tiles; or join them.
 
     Return the mesh and the estimate. Raise :class:`TilesPlanned` where tiles are to be made first.
@@ -327,16 +312,9 @@ def _joined(
 
 
 def mesh_by_pivots_in_stage(
-    stage_folder: Path,
-    field: Field,
-    arrays: GaussianArrays,
-    region: Region,
-    meshing: MeshingSettings,
-    progress: Progress,
-    *,
-    seed: int,
-    depth_samples: DepthSamples | None,
-) -> tuple[SurfaceMesh, dict[str, Any]]:
+    stage_folder: Path, field: Field, arrays: GaussianArrays, region: Region,
+    meshing: MeshingSettings, progress: Progress, *, seed: int, depth_samples: DepthSamples | None,
+) -> tuple[SurfaceMesh, dict[str, Any]]:  # fmt: skip
     """Estimate the mesh of a region by pivots, then make it; return both."""
     vacancy = field.vacancy
     expected = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
@@ -350,12 +328,9 @@ def mesh_by_pivots_in_stage(
 
 
 def estimate_region_pivots(
-    vacancy: VacancyField,
-    arrays: GaussianArrays,
-    region: Region,
-    meshing: MeshingSettings,
+    vacancy: VacancyField, arrays: GaussianArrays, region: Region, meshing: MeshingSettings,
     depth_samples: DepthSamples | None,
-) -> PivotEstimate:
+) -> PivotEstimate:  # fmt: skip
     """Estimate the mesh of a region by pivots from the Gaussians and depth samples in it."""
     if depth_samples is None:
         samples, near = 0, arrays.means[region.contains(arrays.means, 0.0)]
@@ -369,12 +344,9 @@ def estimate_region_pivots(
 
 
 def estimate_region_mesh(
-    vacancy: VacancyField,
-    region: Region,
-    meshing: MeshingSettings,
-    edge_length_scene: float,
+    vacancy: VacancyField, region: Region, meshing: MeshingSettings, edge_length_scene: float,
     depth_samples: DepthSamples,
-) -> MeshEstimate:
+) -> MeshEstimate:  # fmt: skip
     """Estimate the mesh of a region from the depth samples of its surface."""
     adaptive = meshing.spacing == "adaptive"
     subset = depth_samples.points[:: max(1, len(depth_samples) // MAX_SPACING_SAMPLES)]
@@ -465,18 +437,10 @@ DENSE_MESH = "dense.npz"
 
 
 def run_mesh(
-    folder: JobFolder,
-    job: JobFile,
-    request: str,
-    name: str,
-    trained: Stage,
-    progress: Progress,
-    *,
-    device: DeviceChoice,
-    load: Callable[[DeviceChoice], RegionInputs],
-    tile_processes: int = 1,
+    folder: JobFolder, job: JobFile, request: str, name: str, trained: Stage, progress: Progress, *,
+    device: DeviceChoice, load: Callable[[DeviceChoice], RegionInputs], tile_processes: int = 1,
     warnings: Sequence[ReportWarning] = (),
-) -> Stage:
+) -> Stage:  # fmt: skip
     """Mesh a region, or plan or join its tiles, or re-use its finished mesh stage.
 
     ``request``: the region's entry in the job's settings; ``name`` is that of its folder.
@@ -492,11 +456,9 @@ def run_mesh(
     key = mesh_key(job, request, name, trained.key)
 
     def meshed(
-        chosen: DeviceChoice,
-        stage_folder: Path,
-        progress: Progress,
+        chosen: DeviceChoice, stage_folder: Path, progress: Progress,
         warnings: Sequence[ReportWarning],
-    ) -> dict[str, Any]:
+    ) -> dict[str, Any]:  # fmt: skip
         inputs = load(chosen)
         region, vacancy = inputs.region, inputs.field.vacancy
 

@@ -38,16 +38,9 @@ OCCLUSION_VERSION = 2
 
 
 def run_texture(
-    folder: JobFolder,
-    job: JobFile,
-    name: str,
-    cameras: Stage,
-    trained: Stage,
-    meshed: Stage,
-    progress: Progress,
-    *,
-    threads: int,
-) -> Stage:
+    folder: JobFolder, job: JobFile, name: str, cameras: Stage, trained: Stage, meshed: Stage,
+    progress: Progress, *, threads: int,
+) -> Stage:  # fmt: skip
     """Texture the mesh of a region and write its files, or re-use the finished stage.
 
     Raises ResourceError: memory or disk space is not sufficient.
@@ -124,14 +117,9 @@ REPORTS = ("report.json", "report.md")
 
 
 def export_results(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    trained: Stage,
-    regions: list[tuple[str, Stage, Stage]],
-    summary: dict[str, Any],
-    progress: Progress,
-) -> None:
+    folder: JobFolder, job: JobFile, cameras: Stage, trained: Stage,
+    regions: list[tuple[str, Stage, Stage]], summary: dict[str, Any], progress: Progress,
+) -> None:  # fmt: skip
     """Fill ``result/``; regions of earlier jobs in the same folder stay.
 
     Files are replaced together at the end: after a failure the result is unchanged.

@@ -97,11 +97,9 @@ def reduced_settings(settings: TrainingSettings) -> TrainingSettings | None:
 
 
 def train_with_oom_retry(
-    train: Callable[[TrainingSettings], Result],
-    settings: TrainingSettings,
-    folder: Path,
+    train: Callable[[TrainingSettings], Result], settings: TrainingSettings, folder: Path,
     discard_checkpoints: Callable[[], None],
-) -> Trained[Result]:
+) -> Trained[Result]:  # fmt: skip
     """Train; after running out of memory, train again with reduced settings, at most twice.
 
     The retries are recorded in the folder of the training stage, so that an interrupted run resumes
@@ -487,13 +485,10 @@ class TrainingStages:
             ),
         )  # fmt: skip
         return {
-            **result.to_json(),
-            REFINED: result.poses is not None,
-            "device": result.device,
-            "device_reason": self.device.reason,
-            "pictures": pictures,
+            **result.to_json(), REFINED: result.poses is not None, "device": result.device,
+            "device_reason": self.device.reason, "pictures": pictures,
             "settings": to_json(trained.settings),
-        }
+        }  # fmt: skip
 
     @property
     def _settings(self) -> TrainingSettings:

@@ -50,13 +50,9 @@ def compile_if_needed(
 
 
 def estimated_cost(
-    scene: Scene,
-    job: JobFile,
-    stage_folder: Path,
-    progress: Progress,
-    threads: int,
+    scene: Scene, job: JobFile, stage_folder: Path, progress: Progress, threads: int,
     device: DeviceChoice,
-) -> tuple[dict[str, Any], list[ReportWarning]]:
+) -> tuple[dict[str, Any], list[ReportWarning]]:  # fmt: skip
     """Estimate the training's cost, for ``done.json``; the renderer is compiled for it.
 
     Raises ResourceError: the disk is too full.

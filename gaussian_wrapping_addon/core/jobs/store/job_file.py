@@ -139,14 +139,10 @@ class JobFile:
         own = {"edge_lengths": self.edge_lengths} if self.edge_lengths else {}
         bake = {"bake": to_json(self.bake)} if self.bake is not None else {}
         return {
-            **own,
-            **bake,
-            "schema_version": SCHEMA_VERSION,
-            "command": self.command,
-            "source": self.source,
-            "settings": to_json(self.settings),
+            **own, **bake, "schema_version": SCHEMA_VERSION, "command": self.command,
+            "source": self.source, "settings": to_json(self.settings),
             "region_bodies": self.region_bodies,
-        }
+        }  # fmt: skip
 
     @classmethod
     def from_json(cls, values: Any) -> JobFile:
@@ -182,11 +178,9 @@ class JobFile:
 
 
 def make_job(
-    command: str,
-    source: Path,
-    settings: JobSettings,
+    command: str, source: Path, settings: JobSettings,
     edge_lengths: Mapping[str, float] | None = None,
-) -> JobFile:
+) -> JobFile:  # fmt: skip
     """Check the settings, read the region files, and return the job.
 
     ``edge_lengths``: edge lengths, world units, of regions that have their own, keyed by their
@@ -242,14 +236,11 @@ def make_job(
         training = replace(training, focus=listed if weighted else "")
         mask_regions = listed if _makes_masks_of_regions(settings, source, bodies) else ""
     settings = replace(
-        settings,
-        training=training,
-        mask_regions=mask_regions,
+        settings, training=training, mask_regions=mask_regions,
         mask_model=str(real_path(settings.mask_model)) if settings.mask_model else "",
-        regions=tuple(names),
-        start_splat=str(real_path(start)) if start else "",
+        regions=tuple(names), start_splat=str(real_path(start)) if start else "",
         control_points=str(real_path(control)) if control else "",
-    )
+    )  # fmt: skip
     return JobFile(command, str(real_path(source)), settings, bodies, lengths)
 
 
@@ -470,15 +461,9 @@ def sidecar_path(path: Path) -> Path:
 
 
 def write_sidecar(
-    path: Path,
-    frame: FileFrame,
-    world_from_scene: Similarity,
-    blender_from_scene: Similarity,
-    *,
-    placed: bool,
-    result: Path,
-    contents: dict[str, Any],
-) -> None:
+    path: Path, frame: FileFrame, world_from_scene: Similarity, blender_from_scene: Similarity, *,
+    placed: bool, result: Path, contents: dict[str, Any],
+) -> None:  # fmt: skip
     """Write the sidecar of ``path``.
 
     ``path``: the exported file; ``frame``: frame of its coordinates; ``placed``: whether the target
@@ -491,17 +476,12 @@ def write_sidecar(
     in_metres = units is not None and units["applied"]
     unit = "metre" if in_metres else "unit of the input"
     values = {
-        "version": VERSION,
-        "file": path.name,
-        "format": frame.format,
-        "placed": placed,
+        "version": VERSION, "file": path.name, "format": frame.format, "placed": placed,
         "unit": "metre, as placed in Blender" if placed else unit,
         **frame.to_json(world_from_scene, blender_from_scene),
-        **({} if units is None else {"georeference": units}),
-        **contents,
-        **_source(result, contents.get("region")),
-        "made_with": _versions(),
-    }
+        **({} if units is None else {"georeference": units}), **contents,
+        **_source(result, contents.get("region")), "made_with": _versions(),
+    }  # fmt: skip
     write_json(sidecar_path(path), finite_json(values))
 
 
@@ -554,12 +534,9 @@ def _name(text: str) -> str:
 def _versions() -> dict[str, str | None]:
     bpy = sys.modules.get("bpy")
     return {
-        "add_on": add_on_version(),
-        "code": code_fingerprint(),
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "blender": None if bpy is None else str(bpy.app.version_string),
-    }
+        "add_on": add_on_version(), "code": code_fingerprint(), "python": platform.python_version(),
+        "numpy": np.__version__, "blender": None if bpy is None else str(bpy.app.version_string),
+    }  # fmt: skip
 
 
 @functools.cache

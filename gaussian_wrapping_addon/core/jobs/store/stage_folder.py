@@ -121,14 +121,10 @@ def read_done(folder: Path) -> dict[str, Any] | None:
 
 
 def run_stage(
-    stages: Path,
-    name: str,
-    key: str,
-    progress: Progress,
-    work: Callable[[Path, Progress], dict[str, Any]],
-    *,
+    stages: Path, name: str, key: str, progress: Progress,
+    work: Callable[[Path, Progress], dict[str, Any]], *,
     whole: Callable[[Path], bool] = Path.is_dir,
-) -> Stage:
+) -> Stage:  # fmt: skip
     """Run the stage ``stages/NAME-KEY``, or re-use its finished folder.
 
     ``work``: works in the folder; returns the content of ``done.json``. The folder of an
