@@ -108,7 +108,7 @@ _SECRET = 0o600
 def checked_folder(folder: str) -> Path:
     """Return the folder of the certificates; that of the environment where none is given.
 
-    Raises UsageError: None is named, or files are missing in it, or damaged, or the key is of
+    Raises UsageError: none is named, or files are missing in it, or damaged, or the key is of
     another.
     """
     named = folder or os.environ.get(FOLDER_VARIABLE, "")
@@ -127,7 +127,9 @@ def checked_folder(folder: str) -> Path:
             "all computers.",
         )
     try:
-        _context_of(path)
+        # As Dask does later, where an error looks like one of the network.
+        context = ssl.create_default_context(cafile=str(path / CA_NAME))
+        context.load_cert_chain(path / CERTIFICATE_NAME, path / KEY_NAME, password=_no_password)
     except (OSError, ValueError) as error:  # SSLError is one
         said = getattr(error, "reason", None) or getattr(error, "strerror", None)
         raise UsageError(
@@ -135,12 +137,6 @@ def checked_folder(folder: str) -> Path:
             "Copy the folder again, whole, from the computer where it was made.",
         ) from None
     return path
-
-
-def _context_of(folder: Path) -> None:
-    """Load all three files, as Dask does later, where an error looks like one of the network."""
-    context = ssl.create_default_context(cafile=str(folder / CA_NAME))
-    context.load_cert_chain(folder / CERTIFICATE_NAME, folder / KEY_NAME, password=_no_password)
 
 
 def _no_password() -> str:

@@ -109,10 +109,7 @@ def run_child(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def _command(request: dict[str, Any], host: str) -> list[str]:
-    """Return the command line of the child.
-
-    Raises OSError: the shared folder or the add-on is not there.
-    """
+    """Return the child's command line. Raises OSError: shared folder or add-on are not there."""
     folder = Path(request["folder"])
     if request["is_shared"]:
         shared = os.environ.get(SHARED_VARIABLE, "")

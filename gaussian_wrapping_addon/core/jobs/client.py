@@ -140,9 +140,8 @@ class JobClient:
     def start(
         cls, folder: Path, job: JobFile, *, python: str | None = None, keep_running: bool = False
     ) -> JobClient:
-        """Write the job into ``folder`` and start its worker.
+        """Write the job into ``folder``, new, empty, or a job folder, and start its worker.
 
-        ``folder``: new, empty, or a job folder; ``job``: what to do.
         ``python``: interpreter that has torch; ``None`` asks :func:`worker_python`.
         ``keep_running``: whether the worker continues when this process ends.
         Raises DeviceError: the job names a GPU that the driver does not find; nothing was written.

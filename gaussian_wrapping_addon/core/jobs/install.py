@@ -572,10 +572,7 @@ def _check_disk(root: Path, needed_gib: int) -> None:
 
 
 def _start_process(command: list[str], temporary: Path) -> subprocess.Popen[bytes]:
-    """Start :func:`main` in a process group of its own, with temporary files in ``temporary``.
-
-    Raises WorkerError: the process does not start.
-    """
+    """Start :func:`main` in a process group of its own, with temporary files in ``temporary``."""
     variables = {
         k: v for k, v in child_environment().items() if k.upper() not in _IGNORED_VARIABLES
     }

@@ -7,7 +7,7 @@ import logging
 import time
 from collections.abc import Callable
 
-from ..devices import DeviceChoice, choose_device
+from ..devices import choose_device
 from ..parallel import default_threads
 from ..progress import Progress, ProgressEvent
 from .parts.runner import Engine, InProcess, JobProgress, PartRunner, Walk
@@ -30,8 +30,10 @@ def run_job(
     overall = JobProgress(sink, is_cancelled)
     begun_s = time.time()
     reject_region_conflicts(folder.result, job)
-    device = _device_of(job)  # refused before photos are read
-    # As is a model for masks that is not there.
+    # Nothing of a bake runs on a GPU: it goes on where the GPU of its training is missing.
+    device = choose_device("cpu" if job.command == "bake" else job.settings.device)
+    _logger.info("device: %s", device.sentence())
+    # A GPU and a model for masks that are not there are refused before photos are read.
     check_mask_model(job, folder, Progress("cameras", sink, is_cancelled))
     runner = PartRunner(
         folder, job, lambda: walk.graph, threads=threads, device=device, begun_s=begun_s
@@ -50,14 +52,3 @@ def run_job(
     finally:
         engine.close(cancelled=is_cancelled())
     sink(ProgressEvent("bake" if job.command == "bake" else "export", 1.0, "finished"))
-
-
-def _device_of(job: JobFile) -> DeviceChoice:
-    """Choose the device of a job and log it with the reason.
-
-    Raises DeviceError: the job names a GPU that cannot be used.
-    """
-    # Nothing of a bake runs on a GPU: it goes on where the GPU of its training is missing.
-    chosen = choose_device("cpu" if job.command == "bake" else job.settings.device)
-    _logger.info("device: %s", chosen.sentence())
-    return chosen

@@ -63,7 +63,7 @@ def spawn(
     Raises OSError: the program does not start.
     """
     return subprocess.Popen(
-        command, stdin=stdin, stdout=stdout, stderr=stderr, close_fds=True, cwd=folder,
+        command, stdin=stdin, stdout=stdout, stderr=stderr, cwd=folder,
         env=child_environment() if environment is None else environment, **group_options(),
     )  # fmt: skip
 
@@ -208,8 +208,6 @@ def _linux_stat(pid: int) -> list[str]:
 
 
 def _alive_windows(pid: int) -> bool:
-    import ctypes
-
     query_limited_information, still_active = 0x1000, 259
     kernel32 = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
     handle = kernel32.OpenProcess(query_limited_information, False, pid)
@@ -261,8 +259,6 @@ def end_with_parent() -> None:
     """Have this process killed when the thread that started it ends."""
     if not sys.platform.startswith("linux"):
         return
-    import ctypes
-
     parent = os.getppid()
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)

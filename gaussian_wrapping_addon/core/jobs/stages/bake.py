@@ -75,10 +75,11 @@ def _bake(
     from ...limits import MAX_IMAGE_SIDE_PX
     from ...mesh.textured_mesh import POLYGONS_FILE, write_polygons
     from ...photos.store import PhotoStore
-    from ...scene.scene import PhotoSource, load_refined_scene
+    from ...scene.scene import load_refined_scene
     from ...texture.bake_onto import BakeChoices, bake_onto, welded
     from ...texture.files import write_textured
     from .meshing import free_bytes
+    from .texture import photo_source
 
     progress.update(0.0, "reading the mesh")
     scene = load_refined_scene(cameras.folder, trained.folder)
@@ -87,14 +88,7 @@ def _bake(
     if request.dense:
         dense = welded(_read_in_scene(request.dense, request, scene.world_from_scene))
     photos = PhotoStore(scene, MAX_IMAGE_SIDE_PX)
-    source: PhotoSource = photos
-    if request.texture.source == "gaussians":
-        from ...gaussians.files import load_gaussians
-        from ...texture.atlas_colors import GaussianPhotos
-
-        source = GaussianPhotos(
-            load_gaussians(trained.folder / "gaussians.npz"), photos, threads=threads
-        )
+    source = photo_source(request.texture, trained, photos, threads)
     textured = bake_onto(
         given, scene, source, request.texture, BakeChoices(request.uvs, request.faces),
         stage_folder, progress.span(0.02, 0.9),

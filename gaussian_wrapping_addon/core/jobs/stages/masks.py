@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -210,10 +211,7 @@ def run_masks(
 
 
 def _making_key(job: JobFile, cameras: Stage) -> str:
-    """Return the key of the masks. Constants of the method are left out: edited masks stay.
-
-    Raises DatasetError, ResourceError: the mask model is missing, or too large.
-    """
+    """Return the key of the masks. Constants of the method are left out: edited masks stay."""
     settings = job.settings
     if settings.mask_model:
         check_model_file(Path(settings.mask_model))
@@ -245,7 +243,8 @@ def _run_making(
         scene = load_saved_scene(cameras.folder)
         _refuse_own_masks(scene, settings.training.mask_mode)
         if settings.mask_model:
-            _run_model(scene, job, stage_folder, progress, threads)
+            photos = [os.path.abspath(view.photo_path) for view in scene.views]
+            _run_model(job, photos, stage_folder, progress, threads)
         else:
             make_region_masks(scene, job, stage_folder, progress, threads=threads, device=device)
         return {"masks": len(scene.views)}
@@ -268,14 +267,21 @@ def _refuse_own_masks(scene: Scene, mask_mode: str) -> None:
         )
 
 
-def _run_model(scene: Scene, job: JobFile, folder: Path, progress: Progress, threads: int) -> None:
+def _run_model(
+    job: JobFile, photos: list[str], folder: Path, progress: Progress, threads: int
+) -> None:
+    """Load the job's model, and mask photos with it."""
     from ...worker.helper_process import run_helper
 
-    photos = [os.path.abspath(view.photo_path) for view in scene.views]
-    write_json(folder / "task.json", _task(job, photos, threads))
+    settings = job.settings
+    task = {
+        "model": settings.mask_model, "range": settings.mask_model_range, "threads": threads,
+        "photos": photos,
+    }  # fmt: skip
+    write_json(folder / "task.json", task)
     run_helper(
-        "masks.model_helper", folder, progress, deadline_s=SECONDS_A_PHOTO * (5 + len(photos)),
-        memory_bytes=helper_memory_limit_bytes(),
+        "masks.model_helper", folder, progress, memory_bytes=helper_memory_limit_bytes(),
+        deadline_s=SECONDS_A_PHOTO * (5 + len(photos) if photos else 1),
     )  # fmt: skip
 
 
@@ -284,29 +290,13 @@ def check_mask_model(job: JobFile, folder: JobFolder, progress: Progress) -> Non
 
     Raises UsageError, DatasetError, ResourceError: the model cannot be used.
     """
-    import tempfile
-
-    from ...worker.helper_process import run_helper
-
     if not job.settings.mask_model or job.command != "wrap":
         return
     if any(read_done(path) is not None for path in folder.stages.glob("masks-*")):
         return  # it may be resumed where the model is no longer; else it is checked when it runs
     progress.update(0.0, "loading the mask model")
     with tempfile.TemporaryDirectory() as temporary:
-        write_json(Path(temporary) / "task.json", _task(job, [], 1))
-        run_helper(
-            "masks.model_helper", Path(temporary), progress, deadline_s=SECONDS_A_PHOTO,
-            memory_bytes=helper_memory_limit_bytes(),
-        )  # fmt: skip
-
-
-def _task(job: JobFile, photos: list[str], threads: int) -> dict[str, Any]:
-    settings = job.settings
-    return {
-        "model": settings.mask_model, "range": settings.mask_model_range, "threads": threads,
-        "photos": photos,
-    }  # fmt: skip
+        _run_model(job, [], Path(temporary), progress, 1)
 
 
 def _list_of(folder: JobFolder, cameras: Stage, made: Stage) -> MaskList:
@@ -316,12 +306,9 @@ def _list_of(folder: JobFolder, cameras: Stage, made: Stage) -> MaskList:
     names = [view.camera.name for view in views]
     entries = []
     for view, name, file in zip(views, names, mask_names(names), strict=True):
-        path = view.photo_path
-        image = (
-            path.relative_to(folder.root).as_posix()
-            if path.is_relative_to(folder.root)
-            else str(path)
-        )
+        path, root = view.photo_path, folder.root
+        inside = path.is_relative_to(root)
+        image = path.relative_to(root).as_posix() if inside else str(path)
         entries.append(MadeMask(name, file, image))
     return MaskList(made.key, tuple(entries))
 

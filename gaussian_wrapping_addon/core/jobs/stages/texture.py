@@ -18,17 +18,18 @@ from ...progress import Progress
 from ...scene.camera import Similarity
 from ...scene.placement import FILE_NAME as PLACEMENT
 from ...scene.placement import read_placement, write_placement
-from ...settings import to_json
+from ...settings import TextureSettings, to_json
 from ...units.georeference import blender_start
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
 from ..store.rollback import new_result
 from ..store.stage_folder import STAGE_VERSIONS, Stage, run_stage, stage_key
 from .cameras import write_scene_summary
-from .meshing import DENSE_MESH
+from .meshing import DENSE_MESH, free_bytes
 
 if TYPE_CHECKING:
-    from ...scene.scene import Scene
+    from ...photos.store import PhotoStore
+    from ...scene.scene import PhotoSource, Scene
 
 
 # -- Texture stage: bake a region's textures, write its files, and compare it with the photos -----
@@ -51,30 +52,22 @@ def run_texture(
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         from ...evaluation.photo_views import compare_with_photos, write_preview
-        from ...files import read_json
         from ...limits import MAX_IMAGE_SIDE_PX
         from ...mesh.surface_mesh import load_mesh
         from ...photos.store import PhotoStore
         from ...regions.scene_regions import parse_region, region_in_scene
         from ...scene.frames import file_offset
-        from ...scene.scene import PhotoSource, load_refined_scene
+        from ...scene.scene import load_refined_scene
         from ...texture.files import write_textured
         from ...texture.levels_of_detail import levels_of_detail
         from ...texture.texture_mesh import texture_mesh
-        from .meshing import free_bytes
 
         scene = load_refined_scene(cameras.folder, trained.folder)
         photos = PhotoStore(scene, MAX_IMAGE_SIDE_PX)
         mesh = load_mesh(meshed.folder / "mesh.npz")
         dense_path = meshed.folder / DENSE_MESH
         dense = load_mesh(dense_path) if dense_path.is_file() else None
-        source: PhotoSource = photos
-        if texture.source == "gaussians":
-            from ...gaussians.files import load_gaussians
-            from ...texture.atlas_colors import GaussianPhotos
-
-            trained_file = trained.folder / "gaussians.npz"
-            source = GaussianPhotos(load_gaussians(trained_file), photos, threads=threads)
+        source = photo_source(texture, trained, photos, threads)
         coarse_from = 0.7 if texture.lods else 0.9
         textured = texture_mesh(
             mesh, scene, source, texture, stage_folder, progress.span(0.0, coarse_from),
@@ -108,6 +101,19 @@ def run_texture(
         folder.stages, f"texture-{name}", stage_key(key, formats), progress, work,
         whole=lambda stage_folder: is_whole(stage_folder / "files" / "mesh.npz"),
     )  # fmt: skip
+
+
+def photo_source(
+    texture: TextureSettings, trained: Stage, photos: PhotoStore, threads: int
+) -> PhotoSource:
+    """Return what a texture is made of: the photos, or renderings of the Gaussians instead."""
+    from ...gaussians.files import load_gaussians
+    from ...texture.atlas_colors import GaussianPhotos
+
+    if texture.source != "gaussians":
+        return photos
+    gaussians = load_gaussians(trained.folder / "gaussians.npz")
+    return GaussianPhotos(gaussians, photos, threads=threads)
 
 
 # -- Export stage: gather the results of all regions in ``result/`` and write the report ----------
@@ -179,16 +185,12 @@ def _figures_in(result: Path) -> dict[str, dict[str, Any]]:
 def _job_report(
     cameras: Stage, trained: Stage, regions: list[tuple[str, Stage, Stage]]
 ) -> dict[str, Any]:
+    times = ("seconds", "processor_seconds")
     training = [*trained.before, trained]
     stages = [*cameras.before, cameras, *training, *(s for _, m, t in regions for s in (m, t))]
     return {
         "stages": [
-            {
-                "name": s.name,
-                "seconds": s.done.get("seconds"),
-                "processor_seconds": s.done.get("processor_seconds"),
-                "reused": s.reused,
-            }
+            {"name": s.name, **{t: s.done.get(t) for t in times}, "reused": s.reused}
             for s in stages
         ],
         "cameras": {k: v for k, v in cameras.done.items() if k != "finished_unix_s"},

@@ -207,9 +207,9 @@ REFINED = "poses_refined"
 class TrainingStages:
     """The stages of one training; each is run, or re-used. Scene and plan are loaded once.
 
-    A training that was begun on another device continues on this one: no key depends on it. Raises
-    ResourceError: by each stage: the disk is too full, or memory does not suffice even with reduced
-    settings.
+    A training that was begun on another device continues on this one: no key depends on it. Each
+    stage raises ResourceError: the disk is too full, or memory does not suffice, not even with
+    reduced settings.
     """
 
     folder: JobFolder
