@@ -101,9 +101,8 @@ def run_child(request: dict[str, Any]) -> dict[str, Any]:
     if code and not problem:
         reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
         problem = f"Its process {reason}: {said[-1] if said else 'no output'}."
-    hint = str(told.get("hint", ""))
     return {
-        "code": code, "error": problem, "hint": hint, "host": host,
+        "code": code, "error": problem, "hint": str(told.get("hint", "")), "host": host,
         "lines": [*lines, *said][-LAST_LINES:], "answer": answer, "refused": code == OTHER_CODE,
     }  # fmt: skip
 

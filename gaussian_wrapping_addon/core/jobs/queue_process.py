@@ -228,8 +228,7 @@ class _Queue:
                     if _may_work(end) and attempts[end.name] < MOST_ATTEMPTS:
                         waiting.append(end.name)
                         continue
-                    code = self._exit_code(end)
-                    yield end.name, code, f"{end.error} {end.hint}".strip()
+                    yield end.name, self._exit_code(end), f"{end.error} {end.hint}".strip()
         except Cancelled:
             self.stopped = True
         finally:

@@ -84,10 +84,9 @@ def limit_address_space(most_bytes: int) -> None:
         return
     import resource
 
-    limits = resource.getrlimit(resource.RLIMIT_AS)
     lowered = [
         most_bytes if limit == resource.RLIM_INFINITY else min(limit, most_bytes)
-        for limit in limits
+        for limit in resource.getrlimit(resource.RLIMIT_AS)
     ]
     resource.setrlimit(resource.RLIMIT_AS, (lowered[0], lowered[1]))
 

@@ -40,8 +40,7 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
         training = wrapping_settings(training)
     threads = job.settings.threads or default_threads()
     timed = device.is_cuda or estimate.renderer_is_compiled()
-    speeds = estimate.speeds(threads, device.device)
-    machine = estimate.this_machine(Path.cwd(), threads, *speeds)
+    machine = estimate.this_machine(Path.cwd(), threads, *estimate.speeds(threads, device.device))
     expected = estimate.estimate_training(facts, training, machine)
     low, high = estimate.MESH_AND_TEXTURE_SHARE
     points = f"{facts.points} sparse points" if facts.points else "camera poses still to be solved"

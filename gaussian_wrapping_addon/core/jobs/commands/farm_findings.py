@@ -51,8 +51,7 @@ def main(arguments: list[str]) -> int:
     late.daemon = True  # nobody waits for the answer any more
     late.start()
     out = Path(request["out"])
-    answer = {**_exchanged(out, request), **versions(), **_findings(out)}
-    emit(answer=answer)
+    emit(answer={**_exchanged(out, request), **versions(), **_findings(out)})
     return 0
 
 

@@ -121,8 +121,7 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
         poses = poses.reshape(len(shown), 3, 4)
         report = read_json(paths[1])
         held_out = [str(entry["name"]) for entry in report["training"]["held_out"]]
-        facts = report.get("cameras", {}).get("facts", {})
-        name = MASKED if MASKS_MADE in facts else "cameras"
+        name = MASKED if MASKS_MADE in report.get("cameras", {}).get("facts", {}) else "cameras"
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ParseError(paths[0], "cameras", f"not as expected ({error}).", again) from None
     for stage in sorted(job.stages.glob(f"{name}-*")):

@@ -25,8 +25,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _look(source: Path, threads: int) -> Iterator[str]:
-    found = photo_findings(source, Progress("check", _say), threads=threads)
-    for finding in found:
+    for finding in photo_findings(source, Progress("check", _say), threads=threads):
         emit(finding=asdict(finding))
         yield f"{finding.severity}: {finding.message} {finding.hint}".rstrip()
     yield "fact: All photos were looked at."

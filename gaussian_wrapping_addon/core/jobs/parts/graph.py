@@ -133,8 +133,7 @@ def overwrite_state(root: Path, name: str, state: PartState) -> None:
 def read_state(root: Path, name: str) -> PartState | None:
     """Return the state of a part; ``None`` where there is none, or it is damaged."""
     try:
-        values = read_json(state_path(root, name), most_bytes=limits.MAX_PART_STATE_BYTES)
-        return _state_of(values)
+        return _state_of(read_json(state_path(root, name), most_bytes=limits.MAX_PART_STATE_BYTES))
     except (OSError, ParseError, TypeError, ValueError, KeyError, OverflowError):
         return None
 
@@ -282,8 +281,7 @@ def read_parts(folder: Path) -> PartsGraph:
         raise ParseError(path, "version", f"it is not {VERSION}.", _AGAIN)
     listed = values.get("parts")
     if not isinstance(listed, list) or not 0 < len(listed) <= limits.MAX_PARTS:
-        wanted = f"not a list of 1 to {limits.MAX_PARTS:,} parts."
-        raise ParseError(path, "parts", wanted, _AGAIN)
+        raise ParseError(path, "parts", f"not a list of 1 to {limits.MAX_PARTS:,} parts.", _AGAIN)
     texts = {}
     for key in ("code", "plan", "source"):
         found = values.get(key)

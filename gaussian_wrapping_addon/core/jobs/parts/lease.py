@@ -101,8 +101,7 @@ class PartLease:
     def tell(self) -> None:
         """Write a line about the progress, if anybody reads the output."""
         with self._guard, contextlib.suppress(OSError):
-            message = self._state.message or self._name
-            emit(message=message, fraction=round(self._state.fraction, 4))
+            emit(message=self._state.message or self._name, fraction=round(self._state.fraction, 4))
 
     def finish(self, state: str, **changes: object) -> PartState:
         """Write how the part has ended, unless another process holds it.

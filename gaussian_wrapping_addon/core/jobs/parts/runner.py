@@ -236,9 +236,8 @@ class PartRunner:
                     f"Tiles of region {part.region} are missing.", "Resume the job: it makes them."
                 ) from None
             # A list of parts that cannot grow was made before the plan.
-            inputs = self._inputs(part.region, self._device)
             TileMaker(planned.stage_folder / TILES_FOLDER).make_all(
-                inputs.field, progress.span(0.1, 0.9)
+                self._inputs(part.region, self._device).field, progress.span(0.1, 0.9)
             )
             return self._finished(part, self._meshed(part.region, progress.span(0.9, 1.0)))
         finally:

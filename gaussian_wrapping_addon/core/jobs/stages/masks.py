@@ -102,8 +102,7 @@ def make_region_masks(
         shares = silhouettes(gaussians, inside, cameras, renderer, bounds=bounds, threads=threads)
         for index, view in enumerate(scene.views):
             rendering.update(index / len(cameras), f"masking photo {index + 1} of {len(cameras)}")
-            size = (view.camera.width, view.camera.height)
-            mask = cleaned(next(shares), size, GROWN_SHARE)
+            mask = cleaned(next(shares), (view.camera.width, view.camera.height), GROWN_SHARE)
             write_bytes(folder / f"{index:06d}.png", encoded(mask))
 
     with_renderer(device.device, "Silhouettes", write)

@@ -102,8 +102,7 @@ def load_region(
     scene = scene_files.load_refined_scene(cameras.folder, trained.folder)
     gaussians = load_gaussians(trained.folder / "gaussians.npz")
     arrays = gaussians.arrays()
-    body = job.region_bodies.get(request)
-    region, world_region = requested_region(request, body, scene, arrays)
+    region, world_region = requested_region(request, job.region_bodies.get(request), scene, arrays)
     if device.is_cuda:
         needed = cuda_vacancy.needed_bytes(len(arrays))
         device = stage_device(device, job.settings.device, needed, "Vacancy")

@@ -112,8 +112,7 @@ def photo_source(
 
     if texture.source != "gaussians":
         return photos
-    gaussians = load_gaussians(trained.folder / "gaussians.npz")
-    return GaussianPhotos(gaussians, photos, threads=threads)
+    return GaussianPhotos(load_gaussians(trained.folder / "gaussians.npz"), photos, threads=threads)
 
 
 # -- Export stage: gather the results of all regions in ``result/`` and write the report ----------

@@ -282,11 +282,10 @@ class TrainingStages:
 
         settings, blocks = self._settings, self._blocks
         coarse_settings, scene = blocks.coarse(settings), self._scene
-        backend = self._backend()
         coarse = train_coarse(
             scene, _photos(scene, coarse_settings), coarse_settings, folder,
             progress.span(0.0, 0.9), seed=self.job.settings.seed, threads=self.threads,
-            inside=inside, backend=backend,
+            inside=inside, backend=self._backend(),
         )  # fmt: skip
         if coarse.poses is not None:
             scene = with_poses(scene, coarse.poses)

@@ -66,8 +66,7 @@ def estimated_cost(
         training = wrapping_settings(training)
     compile_if_needed(job.settings.training, stage_folder, progress, threads, device)
     progress.update(0.0, "timing this machine")
-    speeds = estimate.speeds(threads, device.device)
-    machine = estimate.this_machine(stage_folder, threads, *speeds)
+    machine = estimate.this_machine(stage_folder, threads, *estimate.speeds(threads, device.device))
     done = [int(path.stem.rpartition("-")[2]) for path in checkpoints(stage_folder)]
     facts, first = estimate.scene_facts(scene), max(done, default=0)
     expected = estimate.estimate_training(facts, training, machine, first=first)

@@ -429,8 +429,7 @@ def training_keys(cameras_key: str, job: JobFile) -> tuple[str, str]:
     """Return the key of a training's stage, and the key without the extra iterations."""
     described = key_values(job.settings.training)
     start = start_fingerprint(job.settings.start_splat)
-    version = STAGE_VERSIONS["train"]
-    parts = (version, cameras_key, job.settings.seed, *([start] if start else []))
+    parts = (STAGE_VERSIONS["train"], cameras_key, job.settings.seed, *([start] if start else []))
     key = stage_key(*parts, described)
     described.pop("extra_iterations")
     return key, stage_key(*parts, described)
@@ -440,8 +439,7 @@ def blocks_key(cameras_key: str, job: JobFile) -> str:
     """Return the key of the blocks of a training: without what follows when they are joined."""
     described = key_values(job.settings.training)
     described.pop("extra_iterations")
-    version = STAGE_VERSIONS["train"]
-    return stage_key("blocks", version, cameras_key, job.settings.seed, described)
+    return stage_key("blocks", STAGE_VERSIONS["train"], cameras_key, job.settings.seed, described)
 
 
 # -- Write the JSON sidecar of an exported file: its coordinate frame and how it was made ---------
@@ -494,8 +492,7 @@ def _units(result: Path, frame: FileFrame, world_from_scene: Similarity) -> dict
     metric = metric_from_world(record)
     if metric is None:
         return None
-    metric_from_scene = metric.after(world_from_scene)
-    metric_from_file = metric_from_scene.after(frame.file_from_scene().inverse())
+    metric_from_file = metric.after(world_from_scene).after(frame.file_from_scene().inverse())
     applied = bool(record.get("applied"))
     return {**record, "applied": applied, "metric_from_file": metric_from_file.to_json()}
 

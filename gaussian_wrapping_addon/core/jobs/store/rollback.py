@@ -138,8 +138,7 @@ def save_rollback(folder: JobFolder, job: JobFile) -> None:
         return  # nothing to restore
     without_error = replace(status, error="", hint="", exit_code=0, put_back=False)
     stages = sorted(p.name for p in folder.stages.iterdir())
-    saved = {"job": finished.to_json(), "status": asdict(without_error), "stages": stages}
-    write_json(path, saved)
+    write_json(path, {"job": finished.to_json(), "status": asdict(without_error), "stages": stages})
 
 
 def finished_job(folder: JobFolder) -> JobFile:
