@@ -27,7 +27,7 @@ from ..errors import (
     WorkerError,
     WrapError,
 )
-from ..progress import Progress
+from ..progress import Progress, ProgressEvent
 from .environment import NO_ROOM, PACKAGES_OPTION, interpreter_of
 from .spawn import caller_option, kill_group, spawn
 
@@ -151,6 +151,11 @@ def emit(**values: Any) -> None:
     """Write one JSON line to stdout: the protocol of helpers and commands."""
     sys.stdout.write(json.dumps(values, allow_nan=False) + "\n")
     sys.stdout.flush()
+
+
+def emit_progress(event: ProgressEvent) -> None:
+    """Write how far a command is as such a line."""
+    emit(fraction=event.fraction, message=event.message)
 
 
 def json_object(line: str | bytes) -> dict[str, Any] | None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ...errors import DatasetError, ParseError, UsageError, unwritable_error
 from ...files import read_json, write_json
 from ...names import JOB_MARKER
-from ...worker.helper_process import emit
+from ...worker.helper_process import emit_progress
 from ..store.job_folder import JobFolder
 from .run_in_worker import run_command
 
@@ -62,7 +62,7 @@ def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     from ...evaluation.layouts import read_mesh
     from ...machine import describe_machine
     from ...parallel import default_threads
-    from ...progress import Progress, ProgressEvent
+    from ...progress import Progress
     from ...worker.helper_process import peak_memory_bytes
 
     begun_s, begun_unix_s = time.monotonic(), time.time()
@@ -79,10 +79,7 @@ def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
             )
         path = source
 
-    def report_progress(event: ProgressEvent) -> None:
-        emit(fraction=event.fraction, message=event.message)
-
-    progress = Progress("evaluate", report_progress)
+    progress = Progress("evaluate", emit_progress)
     measure = _against_photos if given["metric"] == "mbr" else _against_truth
     mesh, result, lines = measure(given, source, lambda: read_mesh(path), threads, progress)
     report = {

@@ -140,15 +140,10 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
         if "splat" in request.formats:
             yield _write_splat(request, *frames)
     except WrapError:
-        _remove_empty(made)
+        with contextlib.suppress(OSError):  # the innermost first, until one holds something
+            for folder in made:
+                folder.rmdir()
         raise
-
-
-def _remove_empty(folders: list[Path]) -> None:
-    """Remove folders, the innermost first, until one holds something."""
-    with contextlib.suppress(OSError):
-        for folder in folders:
-            folder.rmdir()
 
 
 def _meshes(request: ExportRequest) -> Iterator[StoredMesh]:

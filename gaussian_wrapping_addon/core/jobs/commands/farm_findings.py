@@ -147,7 +147,11 @@ class MeetingFolder:
 
     def requests(self, number: int, deadline_s: float) -> list[dict[str, Any]]:
         """Return what the worker of a number is asked: as a job asks, then without the folder."""
-        arguments = {"token": FROM_HERE_NAME, "reply": _reply(number), "deadline_s": deadline_s}
+        arguments = {
+            "token": FROM_HERE_NAME,
+            "reply": f"worker-{number}.txt",
+            "deadline_s": deadline_s,
+        }
         seen = request_of(self.root, MODULE, arguments, None)
         unseen = {**seen, "arguments": {**arguments, "token": ""}, "folder": ".",
                   "is_shared": False}  # fmt: skip
@@ -168,10 +172,6 @@ class MeetingFolder:
             if time.monotonic() >= until_s:
                 return False
             await asyncio.sleep(_POLL_S)
-
-
-def _reply(number: int) -> str:
-    return f"worker-{number}.txt"
 
 
 def _text(path: Path) -> str:

@@ -206,7 +206,9 @@ async def _run(
             for host in hosts:
                 connections.append(Connection(host, str(address), start_s))
             while not ending.is_asked:
-                for news in await asyncio.to_thread(_news, connections):
+                for news in await asyncio.to_thread(
+                    lambda: [n for c in connections for n in c.news()]
+                ):
                     emit(**news)
                 if all(connection.has_ended for connection in connections):
                     raise FarmError(
@@ -215,10 +217,6 @@ async def _run(
                 await asyncio.sleep(POLL_S)
         finally:
             await asyncio.to_thread(_end, connections)
-
-
-def _news(connections: list[Connection]) -> list[dict[str, str]]:
-    return [news for connection in connections for news in connection.news()]
 
 
 def _end(connections: list[Connection]) -> None:

@@ -13,8 +13,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from ...loading.photo_quality import photo_findings
-from ...progress import Progress, ProgressEvent
-from ...worker.helper_process import emit
+from ...progress import Progress
+from ...worker.helper_process import emit, emit_progress
 from .run_in_worker import run_command
 
 
@@ -25,11 +25,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _look(source: Path, threads: int) -> Iterator[str]:
-    for finding in photo_findings(source, Progress("check", _say), threads=threads):
+    for finding in photo_findings(source, Progress("check", emit_progress), threads=threads):
         emit(finding=asdict(finding))
         yield f"{finding.severity}: {finding.message} {finding.hint}".rstrip()
     yield "fact: All photos were looked at."
-
-
-def _say(event: ProgressEvent) -> None:
-    emit(fraction=event.fraction, message=event.message)

@@ -247,7 +247,6 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
     from ...loading.load import load_scene
     from ...loading.real_world import UnitsRequest
     from ...photos.photo_file import AS_WRITTEN, MaskReading
-    from ...scene.scene import save_scene
 
     source, settings = Path(job.source), job.settings
     turntable, equirectangular = settings.turntable, settings.equirectangular
@@ -262,10 +261,8 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
         *([] if reading == AS_WRITTEN else [reading.invert, reading.grow_px]),
         *_units_key(units),
     )  # fmt: skip
-    if (
-        job.command in ("mesh", "more", "bake")
-        and read_done(folder.stages / f"cameras-{key}") is None
-    ):
+    is_there = read_done(folder.stages / f"cameras-{key}") is not None
+    if job.command in ("mesh", "more", "bake") and not is_there:
         earlier = scene_of_finished_training(folder, job)
         if earlier is not None:
             _logger.warning(
@@ -304,13 +301,7 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
             if taken is not None:
                 warnings = (*read_warnings(taken["warnings"]), *scene.warnings)
                 scene = replace(scene, warnings=warnings, facts={**scene.facts, **taken["facts"]})
-        save_scene(scene, stage_folder)
-        return {
-            "views": len(scene.views),
-            "points": len(scene.points),
-            "warnings": [warning.to_json() for warning in scene.warnings],
-            "facts": scene.facts,
-        }
+        return saved_scene(scene, stage_folder)
 
     def whole(stage_folder: Path) -> bool:
         if wanted is not None and read_done(wanted.folder(folder.stages)) is None:
@@ -333,6 +324,17 @@ def _units_key(units: UnitsRequest) -> list[str]:
         with contextlib.suppress(OSError), Path(units.control_points).open("rb") as stream:
             content = hashlib.sha256(stream.read(MAX_FILE_BYTES + 1)).hexdigest()
     return ["units", units.georeference, units.markers, content]
+
+
+def saved_scene(scene: Scene, stage_folder: Path) -> dict[str, Any]:
+    """Save the scene of a stage; return the content of ``done.json``."""
+    from ...scene.scene import save_scene
+
+    save_scene(scene, stage_folder)
+    return {
+        "views": len(scene.views), "points": len(scene.points),
+        "warnings": [warning.to_json() for warning in scene.warnings], "facts": scene.facts,
+    }  # fmt: skip
 
 
 def is_whole_scene(stage_folder: Path) -> bool:

@@ -33,7 +33,13 @@ from ...regions.shapes import Region
 from ..store.job_file import JobFile, training_keys
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done, run_stage, stage_key
-from .cameras import MASKED, is_whole_scene, regions_listed, scene_of_finished_training
+from .cameras import (
+    MASKED,
+    is_whole_scene,
+    regions_listed,
+    saved_scene,
+    scene_of_finished_training,
+)
 from .training_cost import compile_if_needed
 
 if TYPE_CHECKING:
@@ -240,7 +246,13 @@ def _run_making(
         from ...scene.scene import load_saved_scene
 
         scene = load_saved_scene(cameras.folder)
-        _refuse_own_masks(scene, settings.training.mask_mode)
+        own = sum(view.mask_path is not None for view in scene.views)
+        if own and scene.mask_mode(settings.training.mask_mode) != "background":
+            raise UsageError(
+                f"{own} of {len(scene.views)} photos have masks of their own, which may hide the "
+                "object: no masks are made for them.",
+                _OWN_HINT,
+            )
         if settings.mask_model:
             photos = [os.path.abspath(view.photo_path) for view in scene.views]
             _run_model(job, photos, stage_folder, progress, threads)
@@ -253,17 +265,6 @@ def _run_making(
         return all((stage_folder / f"{index:06d}.png").is_file() for index in range(count))
 
     return run_stage(folder.stages, "masks", key, progress, work, whole=whole)
-
-
-def _refuse_own_masks(scene: Scene, mask_mode: str) -> None:
-    """Raise where photos have masks that may hide the object itself."""
-    own = sum(view.mask_path is not None for view in scene.views)
-    if own and scene.mask_mode(mask_mode) != "background":
-        raise UsageError(
-            f"{own} of {len(scene.views)} photos have masks of their own, which may hide the "
-            "object: no masks are made for them.",
-            _OWN_HINT,
-        )
 
 
 def _run_model(
@@ -319,7 +320,7 @@ def _write_masked_scene(
 
     from ...masks.segmentation import encoded
     from ...photos.photo_file import MASK_THRESHOLD, read_mask
-    from ...scene.scene import MASKS_MADE, load_saved_scene, save_scene
+    from ...scene.scene import MASKS_MADE, load_saved_scene
 
     scene = load_saved_scene(cameras.folder)
     files = {mask.photo: path for mask, path in used_masks(where, masks)}
@@ -363,10 +364,4 @@ def _write_masked_scene(
         text = f"{len(empty)} photos do not show the object and are not used: {listed}."
         warnings.append(ReportWarning("photos-without-object", text, _MAKE_HINT))
     masked = dataclasses.replace(scene, views=tuple(views), facts=facts, warnings=tuple(warnings))
-    save_scene(masked, stage_folder)
-    return {
-        "views": len(views),
-        "points": len(scene.points),
-        "warnings": [warning.to_json() for warning in warnings],
-        "facts": facts,
-    }
+    return saved_scene(masked, stage_folder)

@@ -149,7 +149,10 @@ def export_results(
             for picture in sorted(textured.folder.glob("comparison-*.jpg")):
                 shutil.copy2(picture, target / picture.name)
             shutil.copy2(textured.folder / "preview.png", target / "preview.png")
-            figures = _region_figures(trained, meshed, textured)
+            seconds = {"mesh": meshed.done["seconds"], "texture": textured.done["seconds"]}
+            figures = _json_values(
+                {**meshed.done, **textured.done, "training": trained.key, "seconds": seconds}
+            )
             figures["world"] = _in_world_units(meshed, figures, scene.world_from_scene)
             write_json(target / "figures.json", _json_values(figures))
         shutil.copy2(regions[0][2].folder / "preview.png", new / "preview.png")
@@ -195,13 +198,6 @@ def _job_report(
         "cameras": {k: v for k, v in cameras.done.items() if k != "finished_unix_s"},
         "training": {k: v for k, v in trained.done.items() if k != "finished_unix_s"},
     }
-
-
-def _region_figures(trained: Stage, meshed: Stage, textured: Stage) -> dict[str, Any]:
-    figures = {**meshed.done, **textured.done}
-    figures["training"] = trained.key
-    figures["seconds"] = {"mesh": meshed.done["seconds"], "texture": textured.done["seconds"]}
-    return _json_values(figures)
 
 
 def _in_world_units(
