@@ -32,7 +32,7 @@ from ...names import FACES, GATHER, POINTS, region_names
 from ...settings import key_values
 from ...worker.spawn import host_and_pid_namespace, process_start_ticks
 from ..store.job_file import JobFile, read_job
-from ..store.job_folder import JobFolder
+from ..store.job_folder import JobFolder, has_type
 from ..store.stage_folder import STAGE_VERSIONS, stage_key
 
 # -- Exit codes of ``run-part``: what an engine may do with a part that is not done ---------------
@@ -147,33 +147,13 @@ def done_state(root: Path, name: str, plan: str) -> PartState | None:
     return state if all(path is not None and path.exists() for path in paths) else None
 
 
-_TEXTS = ("state", "plan", "place", "token", "message", "error", "hint")
-_NUMBERS = ("begun_s", "heartbeat_s", "fraction", "seconds")
-_WHOLE = ("pid", "pid_started", "attempts", "peak_memory_bytes")
-
-
 def _state_of(values: Any) -> PartState:
     known: dict[str, Any] = {f.name: values[f.name] for f in fields(PartState)}
-    code, outputs = known["exit_code"], known["outputs"]
-    good = (
-        all(isinstance(known[name], str) for name in _TEXTS)
-        and all(_is_number(known[name], int | float) for name in _NUMBERS)
-        and all(_is_number(known[name], int) for name in _WHOLE)
-        and (code is None or _is_number(code, int))
-        and isinstance(outputs, list)
-        and all(isinstance(output, str) for output in outputs)
-        and known["state"] in STATES
-        and isinstance(known["figures"], dict)
-        and all(_is_number(figure, int | float) for figure in known["figures"].values())
-    )
-    if not good:
+    types = {f.name: str(f.type) for f in fields(PartState)}
+    if known["state"] not in STATES or not all(has_type(types[n], x) for n, x in known.items()):
         raise TypeError("a value has the wrong type")
-    numbers = {name: float(known[name]) for name in _NUMBERS}
-    return PartState(**{**known, **numbers, "outputs": tuple(outputs)})
-
-
-def _is_number(value: Any, kinds: Any) -> bool:
-    return isinstance(value, kinds) and not isinstance(value, bool)
+    numbers = {name: float(x) for name, x in known.items() if types[name] == "float"}
+    return PartState(**{**known, **numbers, "outputs": tuple(known["outputs"])})
 
 
 def new_state(plan: str, attempt: int) -> PartState:

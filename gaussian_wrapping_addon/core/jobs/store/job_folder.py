@@ -109,32 +109,29 @@ class JobStatus:
         """
         given = dict(values)
         known = {f.name: given[f.name] for f in fields(cls) if f.name in given}
-        if wrong := [name for name, value in known.items() if not _is_kind(name, value)]:
-            raise TypeError(f"{wrong[0]} is {type(known[wrong[0]]).__name__}")
+        for f in fields(cls):
+            if f.name in known and not has_type(str(f.type), known[f.name]):
+                raise TypeError(f"{f.name} is {type(known[f.name]).__name__}")
+        if known.get("state", "NEW") not in STATES:
+            raise ValueError("state is none")
         # Version 0.1.0 marked a rolled-back job only by its error.
         old = known.get("state") == "DONE" and bool(known.get("error"))
         return cls(**{"put_back": old, **known})
 
 
-_WHOLE_NUMBERS = ("pid", "pid_started", "exit_code")
-_NUMBERS = ("fraction", "seconds_left", "heartbeat_s")
-_FLAGS = ("put_back",)
-_MAY_BE_NONE = ("seconds_left", "exit_code")
+_TYPES: dict[str, Any] = {"str": str, "int": int, "float": int | float, "bool": bool}
 
 
-def _is_kind(name: str, value: Any) -> bool:
-    """Tell whether a value has the type of a status field."""
-    if value is None:
-        return name in _MAY_BE_NONE
-    if isinstance(value, bool) or name in _FLAGS:
-        return name in _FLAGS and isinstance(value, bool)
-    if name in _WHOLE_NUMBERS:
-        return isinstance(value, int)
-    if name in _NUMBERS:
-        return isinstance(value, int | float)
-    if name == "figures":
-        return isinstance(value, dict) and all(_is_kind("fraction", v) for v in value.values())
-    return isinstance(value, str) and (name != "state" or value in STATES)
+def has_type(annotation: str, value: Any) -> bool:
+    """Tell whether a JSON value has the type of a dataclass's field, as that is written."""
+    if annotation.endswith(" | None"):
+        return value is None or has_type(annotation.removesuffix(" | None"), value)
+    if annotation == "dict[str, float]":
+        return isinstance(value, dict) and all(has_type("float", x) for x in value.values())
+    if annotation == "tuple[str, ...]":
+        return isinstance(value, list) and all(isinstance(x, str) for x in value)
+    is_flag = isinstance(value, bool)  # an int for Python
+    return isinstance(value, _TYPES[annotation]) and is_flag == (annotation == "bool")
 
 
 def _read_small(path: Path) -> Any:
