@@ -167,10 +167,10 @@ def json_object(line: str | bytes) -> dict[str, Any] | None:
     return values if isinstance(values, dict) else None
 
 
-def last_line(text: str | bytes, otherwise: str = "no output") -> str:
-    """Return the last line of a child's output, or other words where it has none."""
+def last_line(text: str | bytes) -> str:
+    """Return the last line of a child's output, or words where it has none."""
     text = text if isinstance(text, str) else text.decode(errors="replace")
-    return (text.strip().splitlines() or [otherwise])[-1]
+    return (text.strip().splitlines() or ["no output"])[-1]
 
 
 def ending_of(code: int) -> str:

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ``estimate`` command in the worker's Python: time, memory and disk of a training.
-
-Writes one JSON object per line to stdout, in the protocol of :mod:`~.run_in_worker`.
-"""
+"""The ``estimate`` command in the worker's Python: time, memory and disk of a training."""
 
 from __future__ import annotations
 

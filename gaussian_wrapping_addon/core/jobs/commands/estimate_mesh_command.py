@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ``estimate-mesh`` command in the worker's Python: triangles, time and memory of a mesh.
-
-Needs a finished training. Writes one JSON object per line to stdout, in the protocol of
-:mod:`~.run_in_worker`.
-"""
+"""The ``estimate-mesh`` command: triangles, time and memory of a finished training's mesh."""
 
 from __future__ import annotations
 

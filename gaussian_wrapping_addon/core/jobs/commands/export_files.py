@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ``export`` command in the worker's Python: GLB, OBJ, PLY and splat files with sidecars.
-
-Needs no Blender (USD and FBX do: ``ops/export.py``). Writes one JSON object per
-line to stdout, in the protocol of :mod:`~.run_in_worker`.
-"""
+"""The ``export`` command: GLB, OBJ, PLY and splat files; USD and FBX need Blender (``ops``)."""
 
 from __future__ import annotations
 

@@ -110,8 +110,7 @@ async def _tell_workers(scheduler: Scheduler) -> None:
 
 # -- The ``farm ssh`` command: a scheduler here, and a worker on each of a list of computers ------
 #
-# Runs in the worker's Python; writes one JSON object per line, in the protocol of commands. A
-# worker ends with its connection: it reads its input, which ends with this process, however that
+# A worker ends with its connection: it reads its input, which ends with this process, however that
 # ends.
 
 _END_S = 5.0

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The part of ``check`` that decodes photos, in the worker's Python.
 
-Writes one JSON object per line to stdout, in the protocol of :mod:`~.run_in_worker`, with each
-finding as ``{"line", "finding"}``.
+The line of a finding has it as ``"finding"``, too.
 """
 
 from __future__ import annotations

@@ -17,17 +17,7 @@ from ...errors import DatasetError, UsageError, WrapError
 from ...files import read_bounded, write_bytes, write_json
 from ...limits import MIN_IMAGES
 from ...machine import helper_memory_limit_bytes
-from ...masks.mask_folder import (
-    MOST_MASK_BYTES,
-    MadeMask,
-    MaskList,
-    check_model_file,
-    digest,
-    mask_names,
-    publish,
-    read_list,
-    used_masks,
-)
+from ...masks import mask_folder
 from ...progress import Progress, ReportWarning
 from ...regions.shapes import Region
 from ..store.job_file import JobFile, training_keys
@@ -192,9 +182,9 @@ def run_masks(
             return earlier
     made = _run_making(folder, job, cameras, progress.span(0.0, 0.95), threads, device)
     masks = _list_of(folder, cameras, made)
-    where = publish(folder.root, made.folder, masks)
-    masks = read_list(where) or masks
-    key = stage_key(STAGE_VERSIONS[MASKED], cameras.key, digest(where, masks))
+    where = mask_folder.publish(folder.root, made.folder, masks)
+    masks = mask_folder.read_list(where) or masks
+    key = stage_key(STAGE_VERSIONS[MASKED], cameras.key, mask_folder.digest(where, masks))
     if of_finished:
         train_key, _ = training_keys(key, job)
         if read_done(folder.stages / f"train-{train_key}") is None:
@@ -219,7 +209,7 @@ def _making_key(job: JobFile, cameras: Stage) -> str:
     """Return the key of the masks. Constants of the method are left out: edited masks stay."""
     settings = job.settings
     if settings.mask_model:
-        check_model_file(Path(settings.mask_model))
+        mask_folder.check_model_file(Path(settings.mask_model))
         state = Path(settings.mask_model).stat()
         how = [settings.mask_model, state.st_size, state.st_mtime_ns, settings.mask_model_range]
     else:
@@ -299,22 +289,22 @@ def check_mask_model(job: JobFile, folder: JobFolder, progress: Progress) -> Non
         _run_model(job, [], Path(temporary), progress, 1)
 
 
-def _list_of(folder: JobFolder, cameras: Stage, made: Stage) -> MaskList:
+def _list_of(folder: JobFolder, cameras: Stage, made: Stage) -> mask_folder.MaskList:
     from ...scene.scene import load_saved_scene
 
     views = load_saved_scene(cameras.folder).views
     names = [view.camera.name for view in views]
     entries = []
-    for view, name, file in zip(views, names, mask_names(names), strict=True):
+    for view, name, file in zip(views, names, mask_folder.mask_names(names), strict=True):
         path, root = view.photo_path, folder.root
         inside = path.is_relative_to(root)
         image = path.relative_to(root).as_posix() if inside else str(path)
-        entries.append(MadeMask(name, file, image))
-    return MaskList(made.key, tuple(entries))
+        entries.append(mask_folder.MadeMask(name, file, image))
+    return mask_folder.MaskList(made.key, tuple(entries))
 
 
 def _write_masked_scene(
-    stage_folder: Path, cameras: Stage, where: Path, masks: MaskList
+    stage_folder: Path, cameras: Stage, where: Path, masks: mask_folder.MaskList
 ) -> dict[str, Any]:
     """Copy masks and scene, without the photos that are left out."""
 
@@ -323,14 +313,14 @@ def _write_masked_scene(
     from ...scene.scene import MASKS_MADE, load_saved_scene
 
     scene = load_saved_scene(cameras.folder)
-    files = {mask.photo: path for mask, path in used_masks(where, masks)}
+    files = {mask.photo: path for mask, path in mask_folder.used_masks(where, masks)}
     views, empty = [], []
     for index, view in enumerate(scene.views):
         path = files.get(view.camera.name)
         if path is None:
             continue
         copy = stage_folder / f"{index:06d}.png"
-        write_bytes(copy, read_bounded(path, MOST_MASK_BYTES))
+        write_bytes(copy, read_bounded(path, mask_folder.MOST_MASK_BYTES))
         kept = read_mask(copy, upright=False) >= MASK_THRESHOLD
         if kept.shape != (view.camera.height, view.camera.width):
             raise DatasetError(
