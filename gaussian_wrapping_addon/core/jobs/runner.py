@@ -10,7 +10,7 @@ from collections.abc import Callable
 from ..devices import choose_device
 from ..parallel import default_threads
 from ..progress import Progress, ProgressEvent
-from .parts.runner import Engine, InProcess, JobProgress, PartRunner, Walk
+from .parts.runner import Engine, FarmEngine, InProcess, JobProgress, PartRunner, Walk
 from .stages.masks import check_mask_model
 from .store.job_file import JobFile, reject_region_conflicts
 from .store.job_folder import JobFolder
@@ -41,8 +41,6 @@ def run_job(
     here: Engine = InProcess(folder.root, runner, overall.part)
     engine = here
     if job.settings.computers:
-        from .parts.farm_engine import FarmEngine
-
         engine = FarmEngine(folder.root, job.settings)
     try:
         report = overall.report if engine is here else overall.side_by_side(folder.root)

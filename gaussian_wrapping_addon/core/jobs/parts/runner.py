@@ -8,18 +8,22 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
+from ... import limits
 from ...array_file import is_whole
 from ...devices import DeviceChoice
 from ...devices.checks import is_device_failure
 from ...errors import EXIT_CANCELLED, EXIT_DONE, Cancelled, WorkerError, WrapError
+from ...farm.dask import DaskTasks, request_of
 from ...machine import describe_machine
 from ...meshing.tiles.store import is_planned, load_plan
 from ...names import TILE_KINDS, region_names
+from ...parallel import default_threads
 from ...progress import Progress, ProgressEvent, ReportWarning
-from ...settings import to_json
-from ...worker.helper_process import peak_memory_bytes
+from ...settings import JobSettings, to_json
+from ...settings.job import LOCAL
+from ...worker.helper_process import child_command, peak_memory_bytes
 from ..stages.bake import require_training, run_bake
 from ..stages.cameras import run_cameras
 from ..stages.masks import run_masks
@@ -363,7 +367,9 @@ def planned_tiles(folder: JobFolder, plan: PartState) -> PlannedTiles | None:
     )
 
 
-# -- What runs parts: the interface, and the engine that runs them in this process ----------------
+# -- What runs parts: the interface, the engine of this process, and that of a Dask cluster -------
+
+PART_MODULE = "jobs.part_process"
 
 
 @dataclass(frozen=True)
@@ -442,6 +448,58 @@ class InProcess:
     def close(self, *, cancelled: bool) -> None:
         """Forget what is queued."""
         self._queue.clear()
+
+
+class FarmEngine:
+    """Runs each part by ``run-part`` on a Dask cluster.
+
+    ``root``: the job folder, which all computers see; ``settings``: ``computers``, ``processes``,
+    ``certificates``, ``threads`` and ``device`` are read.
+    Raises MissingExtraError, UsageError, WorkerError: as :class:`~.dask.DaskTasks`.
+    """
+
+    trusts_states = True
+
+    def __init__(self, root: Path, settings: JobSettings) -> None:
+        self._root, self._settings = root, settings
+        self._is_local = settings.computers == LOCAL
+        self._tasks = DaskTasks(settings.computers, settings.processes, settings.certificates)
+        self._parts: dict[str, Part] = {}
+        self._begun_s = time.time()
+
+    @property
+    def slots(self) -> int:
+        """Parts that run at a time."""
+        return self._tasks.slots
+
+    def start(self, part: Part, plan: str, attempt: int) -> None:
+        """Submit a part."""
+        arguments: dict[str, Any] = {
+            "part": part.name, "threads": self._threads(part), "device": self._settings.device,
+            "attempt": attempt, "driven": True,
+        }  # fmt: skip
+        command = child_command(PART_MODULE)[:-1] if self._is_local else None
+        self._parts[part.name] = part
+        # The same part of another walk is another task: what it left is not known to Dask.
+        key = f"{part.name}-{plan}-{attempt}-{int(self._begun_s * 1000):x}"
+        self._tasks.submit(part.name, key, request_of(self._root, PART_MODULE, arguments, command))
+
+    def _threads(self, part: Part) -> int:
+        """Return the threads of a part: all there are, or a share where others run beside it."""
+        if self._settings.threads or not self._is_local or not part.is_one_of_many:
+            return self._settings.threads
+        return max(1, default_threads() // self._settings.processes)
+
+    def wait(self, seconds: float) -> list[Outcome]:
+        """Return what has ended."""
+        return [
+            Outcome(self._parts.pop(e.name), e.code, error=e.error, hint=e.hint, place=e.host)
+            for e in self._tasks.ended(seconds)
+        ]
+
+    def close(self, *, cancelled: bool) -> None:
+        """End all parts: they see the cancel file, or that nobody holds the folder."""
+        self._tasks.close(limits.CANCEL_ALONE_S if cancelled else 0.0)
 
 
 # -- Walk the parts of a job: start what is ready, take what has ended, plan what came to light

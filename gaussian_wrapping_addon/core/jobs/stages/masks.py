@@ -30,7 +30,7 @@ from .cameras import (
     saved_scene,
     scene_of_finished_training,
 )
-from .training_cost import compile_if_needed
+from .training import compile_if_needed
 
 if TYPE_CHECKING:
     from ...gaussians.model import OrientedGaussians

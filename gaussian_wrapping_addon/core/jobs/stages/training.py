@@ -8,16 +8,16 @@ import gc
 import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from ...array_file import is_whole
-from ...devices import DeviceChoice
+from ...devices import DeviceChoice, stage_device
 from ...errors import ParseError, ResourceError, UsageError, WorkerError
 from ...files import read_json, write_json
-from ...progress import Progress, ReportWarning, read_warnings
+from ...progress import COMPILING, Progress, ReportWarning, read_warnings
 from ...settings import MeshingSettings, TrainingSettings, to_json
 from ...worker.helper_process import own_peak_bytes
 from ..store.job_file import JobFile, blocks_key, training_keys
@@ -30,7 +30,6 @@ from ..store.rollback import (
     shorter_training,
 )
 from ..store.stage_folder import Stage, read_done, record_interrupted_time, run_stage
-from .training_cost import compile_if_needed, estimated_cost, fitting_device
 
 if TYPE_CHECKING:
     import numpy as np
@@ -257,9 +256,7 @@ class TrainingStages:
             return trained
         self._fit_device(coarse_gaussians(self._settings))
         self._root.mkdir(parents=True, exist_ok=True)
-        estimated, warnings = estimated_cost(
-            self._scene, self.job, self._root, progress, self.threads, self.device
-        )
+        estimated, warnings = self._estimated(self._root, progress)
         inside = self._inside_regions()
 
         def whole(folder: Path) -> bool:
@@ -385,7 +382,7 @@ class TrainingStages:
 
     def _joined(self, stage_folder: Path, progress: Progress) -> dict[str, Any]:
         """Join the blocks; return the content of ``done.json``."""
-        self._fit_device()
+        self._fit_device(self._settings.max_gaussians)
         compile_if_needed(self._settings, stage_folder, progress, self.threads, self.device)
         result = self._join(stage_folder, progress)
         done = self._written(stage_folder, Trained(result, self._settings, ()))
@@ -435,11 +432,9 @@ class TrainingStages:
         from ...training.trainer import train
         from .cameras import start_splat_of
 
-        self._fit_device()
+        self._fit_device(self._settings.max_gaussians)
         scene = self._scene
-        estimated, warnings = estimated_cost(
-            scene, self.job, stage_folder, progress, self.threads, self.device
-        )
+        estimated, warnings = self._estimated(stage_folder, progress)
         inside = self._inside_regions()
         _logger.info("training on %s", self.device.device)
 
@@ -543,9 +538,42 @@ class TrainingStages:
         photos = _photos(scene, settings)
         return confirmed_depths(plan.coarse, folder, photos, settings, plan.views, views)
 
-    def _fit_device(self, gaussians: int | None = None) -> None:
+    def _fit_device(self, gaussians: int) -> None:
         """Train on the processor where the GPU's memory does not suffice for so many Gaussians."""
-        self.device = fitting_device(self._scene, self.job, self.device, gaussians)
+        from ...training.estimate import gpu_bytes, scene_facts
+
+        if self.device.is_cuda:
+            needed = gpu_bytes(scene_facts(self._scene), self._settings, gaussians)
+            setting = self.job.settings.device
+            self.device = stage_device(self.device, setting, needed, "Training")
+
+    def _estimated(
+        self, stage_folder: Path, progress: Progress
+    ) -> tuple[dict[str, Any], list[ReportWarning]]:
+        """Estimate the cost, for ``done.json``, or raise where the disk is too full.
+
+        The renderer is compiled for it.
+        """
+        from ...training import estimate
+        from ...training.splat_start import wrapping_settings
+        from .cameras import start_splat_of
+
+        training, threads = self._settings, self.threads
+        if start_splat_of(self.job) is not None:
+            training = wrapping_settings(training)
+        compile_if_needed(self._settings, stage_folder, progress, threads, self.device)
+        progress.update(0.0, "timing this machine")
+        speeds = estimate.speeds(threads, self.device.device)
+        machine = estimate.this_machine(stage_folder, threads, *speeds)
+        done = [int(path.stem.rpartition("-")[2]) for path in checkpoints(stage_folder)]
+        facts, first = estimate.scene_facts(self._scene), max(done, default=0)
+        expected = estimate.estimate_training(facts, training, machine, first=first)
+        warnings = estimate.check_resources(expected, machine)
+        _logger.info("estimate: %s", expected.sentence())
+        for warning in warnings:
+            _logger.warning("%s", warning.text)
+        progress.update(0.0, f"training will take {expected.span()}")
+        return {**asdict(expected), "speed": machine.speed}, warnings
 
     def _backend(self) -> Backend:
         from ...training.device_backend import chosen_backend
@@ -569,6 +597,19 @@ class TrainingStages:
             return found
 
         return inside
+
+
+def compile_if_needed(
+    settings: TrainingSettings, folder: Path, progress: Progress, threads: int, device: DeviceChoice
+) -> None:
+    """Compile the renderer if that was never done on this machine, and say so."""
+    from ...training.estimate import renderer_is_compiled
+    from ...training.warm_up import compile_kernels
+
+    if device.is_cuda or renderer_is_compiled():
+        return
+    progress.enter(COMPILING, "compiling the renderer, about a minute, only this once")
+    compile_kernels(settings, folder, progress, threads=threads)
 
 
 def plan_files(stage: Stage) -> list[Path]:
