@@ -24,7 +24,6 @@ from ...progress import Progress, ProgressEvent, ReportWarning
 from ...settings import JobSettings, to_json
 from ...settings.job import LOCAL
 from ...worker.helper_process import child_command, peak_memory_bytes
-from ..stages.bake import require_training, run_bake
 from ..stages.cameras import run_cameras
 from ..stages.masks import run_masks
 from ..stages.meshing import (
@@ -40,7 +39,7 @@ from ..stages.meshing import (
     run_mesh,
     tile_file,
 )
-from ..stages.texture import export_results, run_texture
+from ..stages.texture import export_results, require_training, run_bake, run_texture
 from ..stages.training import TrainingStages, plan_files
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
