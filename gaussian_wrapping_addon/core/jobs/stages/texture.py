@@ -186,7 +186,8 @@ def run_bake(
         figures = {
             "version": BAKE_VERSION, "name": request.name, "vertices": len(textured.mesh.vertices),
             "faces": len(textured.mesh.faces), "faces_given": len(given.faces),
-            "udims": list(textured.udims), "texture": textured.statistics, "mesh_rendering": rendering,
+            "udims": list(textured.udims), "texture": textured.statistics,
+            "mesh_rendering": rendering,
         }  # fmt: skip
         write_json(files / BAKE_FILE, figures)
         return figures
