@@ -62,8 +62,7 @@ def worker_python(preference: str = "") -> str:
     """Return the interpreter for workers, or the folder of a worker environment.
 
     In this order: the preference, the environment variable, the environment made by the add-on, the
-    running Python if it has torch. Raises UsageError: the interpreter named does not exist, or none
-    is set up.
+    running Python if it has torch. Raises UsageError: there is none.
     """
     chosen = preference or os.environ.get(PYTHON_VARIABLE, "")
     if chosen and not Path(chosen).exists():
@@ -108,7 +107,6 @@ def _writing(root: Path) -> Iterator[None]:
 def prepare_job(folder: Path, job: JobFile) -> JobFolder:
     """Write a job into its folder, to be started or submitted.
 
-    ``folder``: new, empty, or a job folder.
     Raises WrapError: the folder cannot be used, or a job runs there; the earlier job stays.
     """
     target = JobFolder(real_path(folder))
@@ -295,8 +293,7 @@ class JobClient:
     def cancel(self) -> None:
         """Ask the worker to stop; it stops within about two seconds and keeps a checkpoint.
 
-        Raises ParseError: ``cancel`` in the job folder is a link or another thing that is not a
-        file.
+        Raises ParseError: ``cancel`` in the job folder is not a regular file.
         """
         with contextlib.suppress(OSError):
             touch_regular(self.folder.cancel_path)
