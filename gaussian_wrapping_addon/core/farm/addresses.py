@@ -108,8 +108,7 @@ _SECRET = 0o600
 def checked_folder(folder: str) -> Path:
     """Return the folder of the certificates; that of the environment where none is given.
 
-    Raises UsageError: none is named, or files are missing in it, or damaged, or the key is of
-    another.
+    Raises UsageError: none is named, or files are missing in it or damaged.
     """
     named = folder or os.environ.get(FOLDER_VARIABLE, "")
     if not named:
@@ -146,9 +145,8 @@ def _no_password() -> str:
 def make_certificates(folder: Path) -> None:
     """Make an authority and a certificate; the authority's key is not kept.
 
-    Raises MissingExtraError: the package for certificates is missing; UsageError: there are some
-    already: computers that have them would be left behind; ResourceError: the folder cannot be
-    written.
+    Raises MissingExtraError; UsageError: there are some already: computers that have them would be
+    left behind; ResourceError: the folder cannot be written.
     """
     load_extra("farm", "Certificates")
     from cryptography import x509

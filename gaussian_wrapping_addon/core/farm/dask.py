@@ -83,9 +83,8 @@ class _Bound:
 class DaskTasks:
     """A connection to a Dask cluster.
 
-    ``address``: ``"local"``, or that of a scheduler: ``tls://HOST:PORT``, ``tcp://`` on this
-    computer only; ``processes``: workers of a local cluster; ``certificates``: folder of the
-    certificates for ``tls://``.
+    ``address``: ``"local"``, with so many ``processes``, or that of a scheduler:
+    ``tls://HOST:PORT``, with a folder of ``certificates``, or ``tcp://`` on this computer only.
     Raises MissingExtraError: the worker lacks Dask; UsageError: the address is none, is not
     encrypted, or the certificates are missing; WorkerError: no scheduler answers there.
     """
@@ -170,10 +169,7 @@ class DaskTasks:
         return {k: v for k, v in found.items() if k not in self._refusing} or found
 
     def ended(self, seconds: float) -> list[Ended]:
-        """Return which children have ended; wait at most so long for the first.
-
-        Raises FarmLostError: the scheduler is gone.
-        """
+        """Return which children have ended; wait so long at most. Raises FarmLostError."""
         until_s = time.monotonic() + seconds
         while True:
             found = [name for name, future in self._futures.items() if future.done()]
@@ -189,8 +185,8 @@ class DaskTasks:
     def _look_after_workers(self) -> None:
         """Submit for any worker what waits for some that are gone: Dask would wait for ever.
 
-        Raises FarmLostError: a cluster of this computer has no workers any more: Dask starts one
-        again that dies at work, and gives up one that dies while it starts.
+        Raises FarmLostError: all workers of this computer are gone. Dask starts one again that dies
+        at work, and gives up one that dies while it starts.
         """
         now_s = time.monotonic()
         watched = self._bound or self._cluster is not None
@@ -268,7 +264,6 @@ def _send_child_as_source(log_level: int) -> None:
 async def check_scheduler(address: str, security: Any) -> None:
     """Ask a scheduler for its name: a client would wait for ever for one that accepts and hangs.
 
-    ``security``: see :func:`security_of`.
     Raises WorkerError: it does not answer.
     """
     from distributed.core import rpc
@@ -292,11 +287,9 @@ def no_scheduler(address: str, error: Exception) -> WorkerError:
 def request_of(
     folder: Path, module: str, arguments: dict[str, Any], command: list[str] | None
 ) -> dict[str, Any]:
-    """Return a request for :func:`.child.run_child` about a folder.
+    """Return a request for :func:`.child.run_child` about a folder; ``command``: for this computer.
 
     The folder is named relative to the shared folder of this computer, if it lies in it.
-
-    ``command``: for children on this computer.
     """
     shared = os.environ.get(child.SHARED_VARIABLE, "")
     is_shared = bool(shared) and command is None and folder.is_relative_to(Path(shared).resolve())

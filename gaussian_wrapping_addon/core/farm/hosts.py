@@ -76,9 +76,8 @@ class Wanted:
 
 
 def make_job(wanted: Wanted, address: str, name: str, worker: str) -> Job:
-    """Return a job that runs a worker, not submitted yet.
+    """Return a job, not submitted yet, in whose script the line ``worker`` runs a worker.
 
-    ``address``: of the scheduler; ``worker``: the line of the script that runs the worker.
     Raises UsageError: the commands of the batch system are not on this computer.
     """
     from dask_jobqueue.pbs import PBSJob
@@ -148,12 +147,9 @@ class Host:
 
 
 def read_hosts(path: Path, usual: Host) -> list[Host]:
-    """Read computers from a file: a line has a name, and ``KEY=VALUE`` where one differs.
+    """Read computers from a file: a line has a name, and ``KEY=VALUE`` where not as ``usual``.
 
-    ``usual``: what applies where a line says nothing: ``shared``, ``certificates``, ``python``,
-    ``batch``, ``slots``.
-    Raises ParseError: a line is none of these, or the file is too large or no file; OSError: it
-    cannot be read.
+    Raises ParseError: a line is none of these, or the file is too large; OSError.
     """
     data = read_bounded(path, MAX_FILE_BYTES, follow_links=True)
     try:

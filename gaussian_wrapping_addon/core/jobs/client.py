@@ -152,10 +152,9 @@ class JobClient:
         cls, folder: Path, *, python: str | None = None, keep_running: bool = False,
         device: str | None = None,
     ) -> JobClient:  # fmt: skip
-        """Start a worker for the job in ``folder``; finished stages are re-used.
+        """Start a worker for the job in ``folder``; ``device``, if given, replaces its setting.
 
-        ``device``: replaces the job's setting; ``None`` keeps it.
-        Raises DeviceError: as for :meth:`start`.
+        Raises DeviceError: as :meth:`start`.
         """
         target = JobFolder(real_path(folder))
         if not target.is_job():

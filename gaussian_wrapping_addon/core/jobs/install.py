@@ -627,8 +627,7 @@ def _delete_unused(environment: WorkerEnvironment, keep: Path | None = None) -> 
 def remove(environment: WorkerEnvironment) -> None:
     """Delete an environment made by the add-on, and nothing else.
 
-    Raises UsageError: the folder has no marker of ours, or a set-up is running in it; OSError: a
-    file cannot be deleted.
+    Raises UsageError: it has no marker of ours, or a set-up runs there; OSError: a file stays.
     """
     root = environment.root
     if root.is_symlink() or not environment.is_ours():

@@ -403,11 +403,9 @@ def extra_hashes_file(requirements: Path, extra: Extra) -> Path | None:
 
 
 def load_extra(name: str, needed_by: str) -> Any:
-    """Import the module of an extra.
+    """Import the module of an extra; ``needed_by``: what needs it, such as the names of files.
 
-    ``name``: of the extra; ``needed_by``: what needs it, such as the names of files.
-    Raises MissingExtraError: it is not installed, in another version, or broken; says how to
-    install it.
+    Raises MissingExtraError: it is missing, of another version, or broken; says how to install it.
     """
     extra = extra_named(name)
     try:
@@ -429,11 +427,7 @@ def load_extra(name: str, needed_by: str) -> Any:
 
 
 def load_extras(needed_by: Mapping[str, str]) -> None:
-    """Import several extras; see :func:`load_extra`.
-
-    ``needed_by``: what needs each of the extras.
-    Raises MissingExtraError: names all that are missing.
-    """
+    """Import several extras, by what needs each. Raises MissingExtraError: names all missing."""
     missing: list[MissingExtraError] = []
     for name, files in needed_by.items():
         try:

@@ -194,11 +194,11 @@ def run_helper(
 ) -> None:  # fmt: skip
     """Run ``core.<module>`` on ``folder`` and wait for it, forwarding its progress.
 
-    Raises Cancelled: the user asked to stop; the helper has been ended; DatasetError, MeshingError,
-    UsageError: the helper reported such a failure; ResourceError: the helper reported one, or the
-    deadline passed; MemoryShortageError: the system gave the helper too little memory; WorkerError:
-    the helper crashed, or reached ``memory_bytes``: the message names the signal and its last line,
-    the log has the end of its output. Or the worker's Python lacks a package.
+    Raises Cancelled: the helper has been ended; DatasetError, MeshingError, UsageError,
+    ResourceError: as it reported; ResourceError: the deadline passed; MemoryShortageError: the
+    system gave it too little memory; WorkerError: it crashed, reached ``memory_bytes``, or a
+    package is missing: the message names the signal and its last line, the log has the end of its
+    output.
     """
     command = child_command("worker.helper_entry", module, str(folder), str(memory_bytes or 0))
     process = spawn(command)

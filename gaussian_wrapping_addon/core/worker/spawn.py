@@ -53,14 +53,10 @@ def spawn(
     stdout: int | IO[Any] | None = subprocess.PIPE, stderr: int | IO[Any] | None = subprocess.PIPE,
     environment: dict[str, str] | None = None, folder: Path | None = None,
 ) -> subprocess.Popen[bytes]:  # fmt: skip
-    """Start a child in a new process group; it inherits no open files.
+    """Start a child in a new process group; it inherits no open files. Raises OSError.
 
-    ``command``: program and arguments, without a shell. Our own Python is started isolated
-    (``-I``).
-    ``stdin``, ``stdout``, ``stderr``: as in ``subprocess``; by default a child has no input.
-    ``environment``: default: :func:`child_environment`.
-    ``folder``: working directory; default: the parent's.
-    Raises OSError: the program does not start.
+    ``command``: without a shell; our own Python is started isolated (``-I``). By default a child
+    has no input, and :func:`child_environment`.
     """
     return subprocess.Popen(
         command, stdin=stdin, stdout=stdout, stderr=stderr, cwd=folder,
@@ -69,11 +65,9 @@ def spawn(
 
 
 def run_to_end(command: list[str], deadline_s: float) -> tuple[int, str, str]:
-    """Start a child and wait for it; return its exit code and output.
+    """Start a child and wait for it; return its exit code, and the text of stdout and stderr.
 
-    Returns ``code``; ``output, error_output``: text of stdout and stderr.
-    Raises OSError: the program does not start; subprocess.TimeoutExpired: the deadline passed; the
-    child has been ended.
+    Raises OSError: it does not start; subprocess.TimeoutExpired: the deadline passed, it was ended.
     """
     process = spawn(command)
     try:

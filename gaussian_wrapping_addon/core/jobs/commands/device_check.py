@@ -22,8 +22,7 @@ def require_device(setting: str) -> None:
     """Raise where a setting names a GPU that this machine or the worker's Python cannot use.
 
     The driver is asked first, at once and without a process. Other settings are not looked at.
-    Raises DeviceError: says why; WorkerError: the worker's Python does not start, or does not
-    answer.
+    Raises DeviceError: says why; WorkerError: the worker's Python does not answer.
     """
     if not setting.startswith("cuda"):
         return

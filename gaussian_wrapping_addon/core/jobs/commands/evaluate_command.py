@@ -182,8 +182,8 @@ def _against_photos(
 def job_mesh(folder: Path, region: str | None) -> Path:
     """Return the world-frame mesh of a job's region.
 
-    Raises UsageError: the folder is not a job; it has several regions and none was named, or not
-    the one named; DatasetError: the job has no results.
+    Raises UsageError: this is no job, or it has no such region, or several; DatasetError: no
+    results.
     """
     if not (folder / JOB_MARKER).exists():
         raise UsageError(
@@ -208,8 +208,7 @@ def job_mesh(folder: Path, region: str | None) -> Path:
 def job_cameras(folder: Path) -> list[Camera]:
     """Return the cameras of a job's ``result/scene.json``, in world coordinates.
 
-    Raises DatasetError: the job has no results yet; ParseError: the file is not in the format that
-    jobs write.
+    Raises DatasetError: the job has no results yet; ParseError: the file is not as jobs write it.
     """
     from ...scene.camera import Camera, Similarity
 

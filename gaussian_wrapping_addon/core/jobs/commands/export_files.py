@@ -74,8 +74,8 @@ class StoredMesh:
 def result_of(folder: Path) -> Path:
     """Return the result folder of a job folder or of a result folder.
 
-    Raises UsageError: the folder is neither; DatasetError: the job has no result yet, or its folder
-    holds links.
+    Raises UsageError: it is neither; DatasetError: there is no result yet, or its folder holds
+    links.
     """
     for path in (folder / "result", folder):
         if (path / "scene.json").is_file():
@@ -109,8 +109,7 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
     """Write every file of a request; yield each once it and its sidecar are complete.
 
     Raises UsageError: an unknown format, shading or region; DatasetError, ParseError: the result is
-    incomplete; MeshingError: a mesh or a Gaussian is not finite; nothing of it is written;
-    ResourceError: the folder cannot be written.
+    incomplete; MeshingError: a mesh or Gaussian is not finite; ResourceError: it cannot be written.
     """
     from ...texture.file_checks import write_errors
 

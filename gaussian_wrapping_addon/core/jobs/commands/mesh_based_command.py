@@ -99,8 +99,7 @@ def no_test_photos(name: str, is_job: bool) -> UsageError:
 def job_scene(folder: Path) -> tuple[Scene, list[str]]:
     """Return the scene of a job's result and the names of the photos held out of its training.
 
-    Raises DatasetError: the job has no result, or the stage that its cameras came from is gone;
-    ParseError: a file is not in the format that jobs write.
+    Raises DatasetError: the job has no result, or lacks its cameras; ParseError: a file is damaged.
     """
     import numpy as np
 

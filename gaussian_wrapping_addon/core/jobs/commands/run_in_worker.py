@@ -42,10 +42,7 @@ def run_in_worker(
 ) -> int:
     """Run a command in the worker's Python, log its output, and return its exit code.
 
-    ``request``: what the child's module takes; plain JSON values.
-    ``python``: the worker's interpreter.
-    ``module``, ``what``: the child's module, and its name in errors; all commands use the protocol
-    above.
+    ``request``: plain JSON values, for the child's ``module``; ``what``: its name in errors;
     ``grace_s``: time in which it may end by itself when this is interrupted.
     Raises WorkerError: it does not start, or ends without reporting an error.
     """
@@ -108,10 +105,8 @@ def run_command(
 ) -> int:  # fmt: skip
     """Emit the lines and warnings of ``work`` as they come, or its error; return the exit code.
 
-    The process ends when its caller does.
-
-    ``leave``: called in another thread before the process ends with its caller: takes away what
-    ``work`` has left elsewhere.
+    The process ends when its caller does. Before that, ``leave`` is called in another thread: it
+    takes away what ``work`` has left elsewhere.
     """
     watched = (Caller(),) if leave is None else (Caller(), leave)
     threading.Thread(target=exit_with_caller, args=watched, daemon=True).start()

@@ -246,8 +246,7 @@ def write_parts(folder: Path, graph: PartsGraph) -> None:
 def read_parts(folder: Path) -> PartsGraph:
     """Read and check ``parts.json`` of a job folder.
 
-    Raises UsageError: there is none; ParseError: it is damaged, of another version, too large, or
-    its parts do not fit together.
+    Raises UsageError: there is none; ParseError: it is damaged, of another version, or too large.
     """
     path = folder / PARTS_NAME
     try:

@@ -56,8 +56,7 @@ class PartLease:
     def take(self, is_cancelled: Callable[[], bool] | None = None) -> bool:
         """Begin to hold the part; return false if another process has done it meanwhile.
 
-        ``is_cancelled``: with it, wait until a process that runs the part has ended, or has done
-        it.
+        With ``is_cancelled``, wait until a process that runs the part has ended, or has done it.
         Raises PartHeldError: another process runs it; Cancelled: while waiting.
         """
         while (held := self._held()) is not None:
@@ -98,8 +97,7 @@ class PartLease:
     def finish(self, state: str, **changes: object) -> graph.PartState:
         """Write how the part has ended, unless another process holds it.
 
-        Raises OSError: it cannot be written that the part is done; that it is not need not be
-        known.
+        Raises OSError: it cannot be written that the part is done; a failure need not be known.
         """
         if not self._is_held:
             return self._state

@@ -181,8 +181,8 @@ class PartRunner:
     def run(self, part: Part, progress: Progress) -> PartResult:
         """Run a part whose needs are done.
 
-        Raises BegunAgain: the region of the part is to be planned anew; WrapError: any typed
-        failure of a stage; WorkerError: what it needs is not there.
+        Raises BegunAgain: its region is to be planned anew; WrapError: any typed failure of a
+        stage.
         """
         if part.kind in TILE_KINDS:
             return self._run_tile(part, progress)
@@ -450,10 +450,8 @@ class InProcess:
 
 
 class FarmEngine:
-    """Runs each part by ``run-part`` on a Dask cluster.
+    """Runs each part by ``run-part`` on a Dask cluster; all its computers see the folder ``root``.
 
-    ``root``: the job folder, which all computers see; ``settings``: ``computers``, ``processes``,
-    ``certificates``, ``threads`` and ``device`` are read.
     Raises MissingExtraError, UsageError, WorkerError: as :class:`~.dask.DaskTasks`.
     """
 
@@ -564,8 +562,7 @@ class Walk:
     def run(self) -> None:
         """Run all parts.
 
-        Raises Cancelled: the job was cancelled; PartError: parts failed for good; all that do not
-        need them are done; WrapError: what an engine raises.
+        Raises Cancelled; PartError: parts failed for good; all that do not need them are done.
         """
         while True:
             if self.is_cancelled():

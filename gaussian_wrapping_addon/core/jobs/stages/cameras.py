@@ -240,9 +240,8 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
     """Load the scene, or re-use a finished cameras stage.
 
     ``mesh``, ``bake`` and ``more`` use the cameras of the finished training even if the photos have
-    changed since, or an earlier version has loaded them. Raises DatasetError, ParseError: the input
-    cannot be used; UsageError: a splat is to get metres by photos, or a video by GPS, which they
-    have none of.
+    changed since, or an earlier version has loaded them. Raises DatasetError, ParseError,
+    UsageError: the input cannot be used, or has nothing by which it could get metres as asked.
     """
     from ...loading.load import load_scene
     from ...loading.real_world import UnitsRequest

@@ -140,8 +140,7 @@ def requested_region(
 def reject_short_edges(job: JobFile, cameras: Stage) -> None:
     """Refuse edges far too short for their region, which would else fail after the training.
 
-    The region of all Gaussians is known only then, and is left out. Raises ResourceError: names the
-    region.
+    The region of all Gaussians is known only then, and is left out. Raises ResourceError.
     """
     lengths = {
         request: meshing.edge_length
@@ -178,14 +177,10 @@ def region_field(
     scene: Scene, arrays: GaussianArrays, region: Region, training: TrainingSettings,
     meshing: MeshingSettings, *, threads: int, device: str = "cpu",
 ) -> VacancyField:  # fmt: skip
-    """Return the field in and around a region, limited to the mesher's halo.
+    """Return the field in and around a region (scene frame), limited to the mesher's halo.
 
-    ``region``: scene frame; ``training``: ``mask_mode``, ``holdout_every`` and the size of the
-    photos that masks are read at; ``meshing``: ``unseen`` and ``cameras`` are read.
-    ``device``: torch device of the field. If the kernels of a GPU cannot run, the field is
-    evaluated on the processor and the log says why.
-    Raises DatasetError: a mask does not fit its photo, or masks cover every photo that was trained
-    on.
+    If the kernels of a GPU cannot run, it is evaluated on the processor and the log says why.
+    Raises DatasetError: a mask does not fit its photo, or masks cover all photos of the training.
     """
     photos = PhotoStore(scene, training.max_image_px)
     views = field_views(scene, photos, training.holdout_every, meshing.cameras)
@@ -445,11 +440,9 @@ def run_mesh(
     ``request``: the region's entry in the job's settings; ``name`` is that of its folder.
     ``device``: the job's; vacancy is evaluated and depth maps are rendered there. Everything else
     gets arrays and CPU tensors.
-    ``load``: returns what :func:`load_region` does for a device; ``tile_processes``: how many
-    processes made the tiles, for the report; ``warnings``: of what was tried before.
-    Raises TilesPlanned: the region is planned in tiles, which are to be made before this is called
-    again; MeshingError, ResourceError: the region holds no surface, or its mesh does not fit into
-    memory.
+    ``load``: returns what :func:`load_region` does for a device; ``warnings``: of what was tried
+    before. Raises TilesPlanned: the planned tiles are to be made before this is called again;
+    MeshingError, ResourceError: the region holds no surface, or its mesh does not fit into memory.
     """
     meshing = job.meshing_of(request)
     key = mesh_key(job, request, name, trained.key)

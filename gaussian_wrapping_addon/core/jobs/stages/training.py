@@ -101,10 +101,9 @@ def train_with_oom_retry(
 ) -> Trained[Result]:  # fmt: skip
     """Train; after running out of memory, train again with reduced settings, at most twice.
 
-    The retries are recorded in the folder of the training stage, so that an interrupted run resumes
-    with the same settings. ``discard_checkpoints`` removes those of the failed attempt, which fit
-    no other settings. Raises ResourceError: the last retry also ran out of memory. Other exceptions
-    of ``train`` propagate.
+    The retries are recorded in the folder of the stage: an interrupted run resumes with the same
+    settings. ``discard_checkpoints`` removes those of the failed attempt, which fit no other
+    settings. Raises ResourceError: the last retry also ran out of memory.
     """
     reasons = _read_retries(folder)
     for _ in reasons:

@@ -183,8 +183,7 @@ def make_job(
 ) -> JobFile:  # fmt: skip
     """Check the settings, read the region files, and return the job.
 
-    ``edge_lengths``: edge lengths, world units, of regions that have their own, keyed by their
-    entry in ``settings.regions``.
+    ``edge_lengths``: of regions that have their own, world units, by entry in ``settings.regions``.
     Raises UsageError, DatasetError: a setting is out of range; the source or a region file is
     missing or unreadable; two regions have the same name.
     """
@@ -350,13 +349,10 @@ def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:
 
 
 def reject_region_conflicts(result: Path, job: JobFile) -> None:
-    """Raise if a region of a job would overwrite the result of a different region.
+    """Raise if a region of a job would overwrite the result of a different region in ``result``.
 
-    A region of the same name is the same region, meshed again.
-
-    ``result``: the result folder of the job; need not exist.
-    Raises UsageError: two regions of the job, or one of it and one meshed before, conflict; names
-    both; ParseError: a region in the job file is invalid.
+    A region of the same name is the same region, meshed again. Raises UsageError: names both
+    regions; ParseError: a region in the job file is invalid.
     """
     region_names(job.settings.regions, job.region_bodies)
     folders = {
@@ -367,12 +363,10 @@ def reject_region_conflicts(result: Path, job: JobFile) -> None:
 
 
 def reject_folder_conflicts(result: Path, folders: dict[str, str]) -> None:
-    """Raise if a region's result folder belongs to a region with another name.
+    """Raise UsageError if a region's result folder belongs to a region with another name.
 
-    A region of the same name is the same region, meshed again.
-
-    ``folders``: folder name by region name, as the region's file gives it.
-    Raises UsageError: two regions conflict; names both.
+    ``folders``: folder name by region name, as the region's file gives it. A region of the same
+    name is the same region, meshed again.
     """
     there = {path.parent.name: path for path in sorted(result.glob("*/region.json"))}
     for wanted, name in folders.items():
@@ -462,13 +456,10 @@ def write_sidecar(
     path: Path, frame: FileFrame, world_from_scene: Similarity, blender_from_scene: Similarity, *,
     placed: bool, result: Path, contents: dict[str, Any],
 ) -> None:  # fmt: skip
-    """Write the sidecar of ``path``.
+    """Write the sidecar of the exported file ``path``.
 
-    ``path``: the exported file; ``frame``: frame of its coordinates; ``placed``: whether the target
-    of ``frame`` is the scene as placed, else the world of the input.
-    ``result``: the result folder of the job; entries missing there are left out.
-    ``contents``: content of the file: region, level, shading, number of vertices and faces,
-    textures.
+    ``placed``: whether the target of ``frame`` is the scene as placed, else the world of the input;
+    ``result``: the job's, may lack entries; ``contents``: region, level, shading, counts, textures.
     """
     units = _units(result, frame, world_from_scene)
     in_metres = units is not None and units["applied"]

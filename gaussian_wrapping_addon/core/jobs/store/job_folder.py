@@ -104,8 +104,7 @@ class JobStatus:
     def from_json(cls, values: Any) -> JobStatus:
         """Build from JSON values, ignoring unknown entries.
 
-        Raises TypeError, ValueError: an entry has the wrong type: the file is not ours, or is being
-        written.
+        Raises TypeError, ValueError: an entry is wrong: the file is not ours, or is being written.
         """
         given = dict(values)
         known = {f.name: given[f.name] for f in fields(cls) if f.name in given}
@@ -156,9 +155,8 @@ class JobFolder:
     def create(self) -> None:
         """Create the folder, or accept an existing job folder or an empty folder.
 
-        Raises UsageError: the path is a file, a folder with other content, or too long;
-        DatasetError: it holds links or other entries that no job makes, see :meth:`check_entries`;
-        ResourceError: it cannot be written.
+        Raises UsageError: it is a file, holds other content, or its path is too long; DatasetError:
+        see :meth:`check_entries`; ResourceError: it cannot be written.
         """
         try:
             if self.root.exists() and not self.root.is_dir():
@@ -179,10 +177,8 @@ class JobFolder:
 
         Before any command reads or writes more than the status: the folder may come from elsewhere,
         and a link in it would lead writes and deletions out of it. The folder itself may be reached
-        through links.
-
-        ``but``: names of folders that are not looked into; they must be folders all the same.
-        Raises DatasetError: names the entry.
+        through links. ``but``: names of folders that are not looked into. Raises DatasetError:
+        names the entry.
         """
         reject_foreign_entries(self.root, but=but)
 

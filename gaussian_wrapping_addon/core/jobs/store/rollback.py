@@ -37,12 +37,8 @@ EARLIER = ".earlier"
 def new_result(result: Path, last: tuple[str, ...] = ()) -> Iterator[Path]:
     """Yield an empty folder for the new result; move its content into place when the block ends.
 
-    Each entry of the folder replaces the one of its name in ``result``; others stay. If the block
-    or the swap raises, the result is unchanged.
-
-    ``result``: the result folder; created if missing.
-    ``last``: entries that describe the others and are replaced after them.
-    Raises OSError: an entry cannot be replaced.
+    Each entry of the folder replaces the one of its name in ``result``, those in ``last`` after the
+    others, which they describe. If the block or the swap raises, the result is unchanged.
     """
     begun = not result.exists()
     result.mkdir(exist_ok=True)
@@ -207,8 +203,7 @@ _INSTEAD = "Train anew instead: run wrap with the total number of --iterations."
 def continue_training_job(folder: JobFolder, job: JobFile, iterations: int) -> JobFile:
     """Return the job that trains ``job`` for more iterations, then meshes again.
 
-    Raises UsageError: the number is not positive; DatasetError: the folder holds no finished
-    training, or no checkpoint to continue from.
+    Raises UsageError: not a positive number; DatasetError: no finished training, or no checkpoint.
     """
     if iterations < 1:
         raise UsageError(f"--iterations {iterations} adds nothing.", "Give a positive number.")
@@ -254,11 +249,9 @@ def shorter_training(stages: Path, base_key: str, extra_iterations: int) -> Path
 
 
 def link_checkpoints(source: Path, target: Path, others: tuple[str, ...] = ()) -> None:
-    """Link the checkpoints of a finished stage into a new one; copy them if links are unsupported.
+    """Link checkpoints of a finished stage into a new one, and ``others`` that exist; else copy.
 
     Files of a stage are replaced, never modified, so that a link cannot change its source.
-
-    ``others``: further files to link, if they exist.
     """
     for path in reversed(checkpoints(source)):
         # The JSON file last: without it, the arrays are ignored.

@@ -65,10 +65,8 @@ def stage_key(*parts: Any) -> str:
 def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
     """List the files of an input with size and modification time, for :func:`stage_key`.
 
-    An input that is gone has none.
-
-    Photos are not read: size and time detect a change, as in build systems. Raises DatasetError:
-    the folder holds too many files to be a set of photos, such as a whole disk.
+    An input that is gone has none. Photos are not read: size and time detect a change, as in build
+    systems. Raises DatasetError: there are too many files for photos, as on a whole disk.
     """
     if source.is_file() and source.suffix.lower() == ".ply":
         state = source.stat()
