@@ -19,7 +19,7 @@ from types import FrameType
 
 from .. import limits
 from ..devices import choose_device
-from ..errors import EXIT_RESOURCES, Cancelled, UsageError, WorkerError, WrapError
+from ..errors import Cancelled, UsageError, WorkerError, WrapError
 from ..files import seconds_since_written
 from ..names import TILE_KINDS
 from ..parallel import default_threads
@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> int:
         return _run(folder, request)
     except WrapError as error:
         emit(error=error.message, hint=error.hint)
-        return parts.part_exit_code(error)
+        return parts.part_exit_code(error, error.exit_code)
 
 
 def _run(folder: JobFolder, request: dict[str, object]) -> int:
@@ -194,10 +194,7 @@ def _hold(
         failure = failure_of(error, folder.root)
         if not failure.is_known:
             _logger.exception("unexpected failure")
-        if isinstance(error, WrapError):
-            code = parts.part_exit_code(error)
-        else:
-            code = parts.MAY_WORK_ELSEWHERE if failure.code == EXIT_RESOURCES else parts.NEVER
+        code = parts.part_exit_code(error, failure.code)
         lease.finish("FAILED", error=failure.error, hint=failure.hint, exit_code=code)
         emit(error=failure.error, hint=failure.hint)
         return code

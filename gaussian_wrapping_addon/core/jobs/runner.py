@@ -39,9 +39,7 @@ def run_job(
         folder, job, lambda: walk.graph, threads=threads, device=device, begun_s=begun_s
     )
     here: Engine = InProcess(folder.root, runner, overall.part)
-    engine = here
-    if job.settings.computers:
-        engine = FarmEngine(folder.root, job.settings)
+    engine = FarmEngine(folder.root, job.settings) if job.settings.computers else here
     try:
         report = overall.report if engine is here else overall.side_by_side(folder.root)
         walk = Walk(folder, job, engine, here, report, is_cancelled)

@@ -6,16 +6,11 @@ The child writes one JSON object to stdout: ``{"device"}``, or ``{"error", "hint
 
 from __future__ import annotations
 
-import subprocess
-
 from ...devices import choose_device, reject_absent_gpu
 from ...errors import DeviceError, WorkerError, WrapError
-from ...worker.environment import not_started
-from ...worker.helper_process import child_command, emit, json_object, last_line
-from ...worker.spawn import run_to_end
+from ...worker.helper_process import child_command, emit
 from ..client import worker_python
-
-CHECK_DEADLINE_S = 120.0
+from .doctor import answers_of
 
 
 def require_device(setting: str) -> None:
@@ -28,21 +23,15 @@ def require_device(setting: str) -> None:
         return
     reject_absent_gpu(setting)
     python = worker_python()
-    try:
-        command = child_command("jobs.commands.device_check", setting, python=python)
-        _, output, error_output = run_to_end(command, CHECK_DEADLINE_S)
-    except OSError as error:
-        raise not_started(python, error) from None
-    except subprocess.TimeoutExpired:
-        raise WorkerError(f"{python} does not answer.", "Run batch.py doctor.") from None
-    for line in reversed(output.splitlines()):
-        values = json_object(line) or {}
+    command = child_command("jobs.commands.device_check", setting, python=python)
+    answers, said = answers_of(command, python, "Run batch.py doctor.")
+    for values in reversed(answers):
         if "error" in values:
             raise DeviceError(str(values["error"]), str(values.get("hint", "")))
         if "device" in values:
             return
     raise WorkerError(
-        f"The check of the device {setting} ended without a result: {last_line(error_output)}.",
+        f"The check of the device {setting} ended without a result: {said}.",
         "Run batch.py doctor to check the worker's Python.",
     )
 

@@ -22,7 +22,7 @@ from ...worker.spawn import run_to_end
 MIN_PYTHON = (3, 11)
 MIN_MEMORY_BYTES = 4 * 2**30
 MIN_DISK_BYTES = 2 * 2**30
-DOCTOR_DEADLINE_S = 120.0
+DEADLINE_S = 120.0
 
 REQUIRED = {
     "numpy": "numpy", "torch": "torch", "numba": "numba", "scipy": "scipy", "shull": "shull",
@@ -130,30 +130,37 @@ def main(arguments: list[str]) -> int:
     return EXIT_DONE if all(f.good for f in findings) else EXIT_BAD_DATA
 
 
+def answers_of(command: list[str], python: str, hint: str) -> tuple[list[dict[str, Any]], str]:
+    """Return the JSON objects that a child of the worker's Python writes, and its last error line.
+
+    Raises WorkerError: it does not start or, with the hint, does not end in time.
+    """
+    try:
+        _, output, error_output = run_to_end(command, DEADLINE_S)
+    except OSError as error:
+        raise not_started(python, error) from None
+    except subprocess.TimeoutExpired:
+        raise WorkerError(f"{python} does not answer.", hint) from None
+    answers = [values for line in output.splitlines() if (values := json_object(line))]
+    return answers, last_line(error_output)
+
+
 def diagnose_worker(python: str) -> list[Diagnosis]:
     """Diagnose another interpreter, in a child process.
 
     Raises WorkerError: the interpreter does not start or reports nothing.
     """
-    try:
-        command = child_command("jobs.commands.doctor", python=python)
-        _, output, error_output = run_to_end(command, DOCTOR_DEADLINE_S)
-    except OSError as error:
-        raise not_started(python, error) from None
-    except subprocess.TimeoutExpired:
-        raise WorkerError(
-            f"{python} does not answer.", "Press Set Up Worker, or choose another Python."
-        ) from None
+    hint = "Press Set Up Worker, or choose another Python."
+    answers, said = answers_of(child_command("jobs.commands.doctor", python=python), python, hint)
     findings: list[Diagnosis] = []
-    for line in output.splitlines():
-        values = json_object(line) or {}
+    for values in answers:
         if "error" in values:
             raise WorkerError(str(values["error"]), str(values.get("hint", "")))
         with contextlib.suppress(TypeError):
             findings.append(Diagnosis(**values))
     if not findings:
         raise WorkerError(
-            f"{python} reported nothing: {last_line(error_output)}.",
+            f"{python} reported nothing: {said}.",
             "Press Set Up Worker, or choose a Python 3.11 or newer with the worker's packages.",
         )
     return findings

@@ -24,7 +24,6 @@ from ...errors import (
     ParseError,
     UsageError,
     WorkerError,
-    WrapError,
 )
 from ...farm import child
 from ...files import overwrite_json, read_json, resolve_inside, write_json
@@ -47,11 +46,11 @@ OTHER_CODE = child.OTHER_CODE
 CANCELLED = EXIT_CANCELLED
 
 
-def part_exit_code(error: WrapError) -> int:
-    """Return the exit code of a part that ended with an error."""
-    if error.exit_code == EXIT_CANCELLED:
+def part_exit_code(error: Exception, job_code: int) -> int:
+    """Return the exit code of a part that ended with an error, by what a job's would be."""
+    if job_code == EXIT_CANCELLED:
         return CANCELLED
-    elsewhere = error.exit_code == EXIT_RESOURCES or isinstance(error, WorkerError | DeviceError)
+    elsewhere = job_code == EXIT_RESOURCES or isinstance(error, WorkerError | DeviceError)
     return MAY_WORK_ELSEWHERE if elsewhere else NEVER
 
 

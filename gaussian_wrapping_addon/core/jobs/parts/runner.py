@@ -143,10 +143,6 @@ def stage_of(part: Part) -> str:
 class BegunAgain(Exception):  # noqa: N818 - no error: the region's parts are planned anew
     """A GPU failed at a tile; the tiles of its region are removed and made on the processor."""
 
-    def __init__(self, region: str) -> None:
-        super().__init__(region)
-        self.region = region
-
 
 @dataclass(frozen=True)
 class PartResult:

@@ -327,11 +327,11 @@ def estimate_region_pivots(
 ) -> PivotEstimate:  # fmt: skip
     """Estimate the mesh of a region by pivots from the Gaussians and depth samples in it."""
     if depth_samples is None:
-        samples, near = 0, arrays.means[region.contains(arrays.means, 0.0)]
+        count, near = 0, arrays.means[region.contains(arrays.means, 0.0)]
     else:
-        samples, near = len(depth_samples), depth_samples.points
+        count, near = len(depth_samples), depth_samples.points
     return estimate.estimate_pivot_mesh(
-        arrays, region, meshing.pivots, samples,
+        arrays, region, meshing.pivots, count,
         box=meshing.pivot_box, alone=meshing.pivot_samples == "none",
         evaluation_s=estimate.evaluation_seconds(vacancy, near),
     )  # fmt: skip
