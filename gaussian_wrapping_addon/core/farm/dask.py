@@ -103,13 +103,10 @@ class DaskTasks:
         self._looked_s = self._seen_s = time.monotonic()
         self._cluster: LocalCluster | None = None
         self._processes = processes
-        dask.config.set(
-            {
-                "distributed.scheduler.allowed-failures": KILLED_WORKERS,
-                "distributed.comm.retry.count": 3,
-                "distributed.admin.log-length": 100,
-            }
-        )
+        dask.config.set({
+            "distributed.scheduler.allowed-failures": KILLED_WORKERS,
+            "distributed.comm.retry.count": 3, "distributed.admin.log-length": 100,
+        })  # fmt: skip
         target: Any = self._address
         if self._address == LOCAL:
             self._cluster = target = LocalCluster(

@@ -328,42 +328,37 @@ class Extra:
         return tuple(f"{p.name}{p.versions}" for p in self.packages)
 
 
+def _pinned(pins: str) -> tuple[Requirement, ...]:
+    named = (pin.partition("==") for pin in pins.split())
+    return tuple(Requirement(name, f"=={version}") for name, _, version in named)
+
+
 EXTRAS = (
     Extra(
-        "heif", (Requirement("pillow-heif", "==1.8.1"),), "pillow_heif",
+        "heif", _pinned("pillow-heif==1.8.1"), "pillow_heif",
         "HEIC Photos", "HEIC and HEIF photos of phones",
     ),
     Extra(
-        "raw", (Requirement("rawpy", "==0.28.0"),), "rawpy",
+        "raw", _pinned("rawpy==0.28.0"), "rawpy",
         "Camera RAW", "RAW photos of cameras (DNG, CR2, CR3, NEF, ARW, RAF, ORF, RW2 and others)",
     ),
     Extra(
-        "markers", (Requirement("opencv-python-headless", "==4.11.0.86"),), "cv2",
+        "markers", _pinned("opencv-python-headless==4.11.0.86"), "cv2",
         "Printed Markers", "printed markers in photos",
     ),
     Extra(
         "masks",
-        (
-            Requirement("flatbuffers", "==25.12.19"), Requirement("onnxruntime", "==1.27.0"),
-            Requirement("packaging", "==26.4"), Requirement("protobuf", "==6.33.5"),
-        ),
+        _pinned("flatbuffers==25.12.19 onnxruntime==1.27.0 packaging==26.4 protobuf==6.33.5"),
         "onnxruntime", "Mask Models", "segmentation models (ONNX)",
     ),
     Extra(
         "farm",
-        (
-            Requirement("cffi", "==2.1.1"), Requirement("click", "==8.5.1"),
-            Requirement("cloudpickle", "==3.1.3"), Requirement("cryptography", "==50.0.2"),
-            Requirement("dask", "==2026.8.0"), Requirement("dask-jobqueue", "==0.9.0"),
-            Requirement("distributed", "==2026.8.0"),
-            Requirement("importlib-metadata", "==8.9.0"), Requirement("locket", "==1.0.0"),
-            Requirement("msgpack", "==1.2.4"), Requirement("packaging", "==26.4"),
-            Requirement("partd", "==1.4.2"), Requirement("psutil", "==7.2.2"),
-            Requirement("pycparser", "==3.12"), Requirement("pyyaml", "==6.0.4"),
-            Requirement("sortedcontainers", "==2.4.0"), Requirement("tblib", "==3.2.2"),
-            Requirement("toolz", "==1.2.0"), Requirement("tornado", "==6.6.1"),
-            Requirement("urllib3", "==2.8.0"), Requirement("zict", "==3.0.0"),
-            Requirement("zipp", "==4.1.2"),
+        _pinned(
+            "cffi==2.1.1 click==8.5.1 cloudpickle==3.1.3 cryptography==50.0.2 dask==2026.8.0"
+            " dask-jobqueue==0.9.0 distributed==2026.8.0 importlib-metadata==8.9.0 locket==1.0.0"
+            " msgpack==1.2.4 packaging==26.4 partd==1.4.2 psutil==7.2.2 pycparser==3.12"
+            " pyyaml==6.0.4 sortedcontainers==2.4.0 tblib==3.2.2 toolz==1.2.0 tornado==6.6.1"
+            " urllib3==2.8.0 zict==3.0.0 zipp==4.1.2"
         ),
         "distributed", "Several Computers", "several processes or computers (Dask)",
     ),

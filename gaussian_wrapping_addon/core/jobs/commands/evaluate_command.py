@@ -219,12 +219,8 @@ def job_cameras(folder: Path) -> list[Camera]:
     values = read_json(path)
     try:
         world_from_scene = Similarity.from_json(values["world_from_scene"])
-        return [
-            Camera.from_json({k: v for k, v in entry.items() if k != "photo"}).moved(
-                world_from_scene
-            )
-            for entry in values["cameras"]
-        ]
+        entries = [{k: v for k, v in e.items() if k != "photo"} for e in values["cameras"]]
+        return [Camera.from_json(entry).moved(world_from_scene) for entry in entries]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ParseError(
             path, "cameras", f"not as expected ({error}).", "Export the job again with resume."

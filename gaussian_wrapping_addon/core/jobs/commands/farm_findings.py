@@ -147,11 +147,8 @@ class MeetingFolder:
 
     def requests(self, number: int, deadline_s: float) -> list[dict[str, Any]]:
         """Return what the worker of a number is asked: as a job asks, then without the folder."""
-        arguments = {
-            "token": FROM_HERE_NAME,
-            "reply": f"worker-{number}.txt",
-            "deadline_s": deadline_s,
-        }
+        reply = f"worker-{number}.txt"
+        arguments = {"token": FROM_HERE_NAME, "reply": reply, "deadline_s": deadline_s}
         seen = request_of(self.root, MODULE, arguments, None)
         unseen = {**seen, "arguments": {**arguments, "token": ""}, "folder": ".",
                   "is_shared": False}  # fmt: skip
@@ -259,15 +256,12 @@ def _values(answer: Answer) -> dict[str, Any]:
     if not isinstance(told, dict):
         return {}
     rows = told.get("bad")
+    rows = rows if isinstance(rows, list) else []
     return {
         **{name: short(str(text)) for name, text in told.items() if isinstance(text, str)},
         **{name: short(str(told.get(name, ""))) for name in ("code", "python", "gpu", *COMPARED)},
         **{name: _whole(told.get(name)) for name in ("cores", "memory_bytes", "free_bytes")},
-        "bad": [
-            (str(row[0]), str(row[1]))
-            for row in (rows if isinstance(rows, list) else [])
-            if isinstance(row, list) and len(row) == 2
-        ],
+        "bad": [(str(r[0]), str(r[1])) for r in rows if isinstance(r, list) and len(r) == 2],
     }
 
 
@@ -307,12 +301,8 @@ async def _shared(values: Mapping[str, Any], meeting: MeetingFolder) -> list[tup
     if values["token"] != meeting.token:
         return [("Its shared folder is not the one of this computer.", _MOUNT)]
     if not await meeting.sees(values.get("reply", "")):
-        return [
-            (
-                "What it writes into the shared folder is not seen here.",
-                "Use a folder of a file server (NFS, SMB), not one that is copied to and fro.",
-            )
-        ]
+        hint = "Use a folder of a file server (NFS, SMB), not one that is copied to and fro."
+        return [("What it writes into the shared folder is not seen here.", hint)]
     return []
 
 

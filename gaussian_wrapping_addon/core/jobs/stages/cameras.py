@@ -211,18 +211,13 @@ def write_scene_summary(path: Path, scene: Scene) -> None:
     from ...limits import SCENE_RADIUS
 
     units = scene.facts.get("georeference")
-    write_json(
-        path,
-        {
-            **({} if units is None else {"georeference": units}),
-            "version": 1,
-            "world_from_scene": scene.world_from_scene.to_json(),
-            "radius": SCENE_RADIUS,
-            "cameras": [
-                {**view.camera.to_json(), "photo": str(view.photo_path)} for view in scene.views
-            ],
-        },
-    )
+    cameras = [{**view.camera.to_json(), "photo": str(view.photo_path)} for view in scene.views]
+    values = {
+        **({} if units is None else {"georeference": units}), "version": 1,
+        "world_from_scene": scene.world_from_scene.to_json(), "radius": SCENE_RADIUS,
+        "cameras": cameras,
+    }  # fmt: skip
+    write_json(path, values)
 
 
 # -- Cameras stage: load the input as a scene, or re-use the cameras of a finished training -------

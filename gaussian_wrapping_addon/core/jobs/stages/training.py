@@ -349,15 +349,11 @@ class TrainingStages:
         remove_checkpoints(folder)
         block = plan.blocks[index]
         return {
-            "plan": plan.digest,
-            "photos": len(block.views),
-            "still": len(block.still),
-            "gaussians": len(result.gaussians),
-            "iterations": result.iterations,
-            "device": result.device,
-            "warnings": [warning.to_json() for warning in result.warnings],
+            "plan": plan.digest, "photos": len(block.views), "still": len(block.still),
+            "gaussians": len(result.gaussians), "iterations": result.iterations,
+            "device": result.device, "warnings": [w.to_json() for w in result.warnings],
             "peak_memory_bytes": own_peak_bytes(),
-        }
+        }  # fmt: skip
 
     def _whole_training(self) -> Stage | None:
         """Return the finished training that the blocks are for: they may be gone then."""
