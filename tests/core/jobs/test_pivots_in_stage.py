@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from gaussian_wrapping_addon.core.errors import ResourceError
 from gaussian_wrapping_addon.core.field.samples import DepthSamples
 from gaussian_wrapping_addon.core.jobs.stages import meshing
 from gaussian_wrapping_addon.core.meshing import pivot_meshing
-from gaussian_wrapping_addon.core.meshing.surface_points import Field
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.meshing.meshing_scenes import (
@@ -28,9 +26,8 @@ def mesh_here(folder: Path):
     points = np.random.default_rng(0).normal(size=(500, 3))
     points /= np.linalg.norm(points, axis=1)[:, None]
     return meshing.mesh_by_pivots_in_stage(
-        folder, Field(ShapeField(sphere(), 0.05), cast(Any, None), 1),
-        gaussians_on(sphere(), cube(1.5), 800, 0.05),
-        cube(1.5), MeshingSettings(method="pivots"), Progress(), seed=0,
+        folder, ShapeField(sphere(), 0.05), gaussians_on(sphere(), cube(1.5), 800, 0.05),
+        cube(1.5), MeshingSettings(method="pivots"), Progress(), seed=0, threads=1,
         depth_samples=DepthSamples(points, -points, np.full(500, 0.02)),
     )  # fmt: skip
 

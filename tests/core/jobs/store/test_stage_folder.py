@@ -46,7 +46,7 @@ def test_an_interrupted_stage_is_run_again_in_the_same_folder(tmp_path: Path) ->
 
     with pytest.raises(Cancelled):
         run_stage(tmp_path, "train", "abc", Progress(), interrupted)
-    record_interrupted_time(tmp_path / "train-abc", 100.0)
+    record_interrupted_time(tmp_path, "train", "abc", 100.0)
     stage = run_stage(tmp_path, "train", "abc", Progress(), work)
     assert not stage.reused
     assert stage.done["seconds"] >= 100.0
