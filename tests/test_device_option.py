@@ -200,7 +200,7 @@ def test_no_stage_depends_on_the_device(tmp_path: Path) -> None:
     folder = write_finished_sphere(tmp_path)
     job = read_job(folder.job_path)
     others = [replace(job, settings=replace(job.settings, device=d)) for d in ("cpu", "cuda:1")]
-    assert {training_keys(6, "c", j) for j in (job, *others)} == {training_keys(6, "c", job)}
+    assert {training_keys("c", j) for j in (job, *others)} == {training_keys("c", job)}
     assert {mesh_key(j, "auto", "auto", "t") for j in (job, *others)} == {
         mesh_key(job, "auto", "auto", "t")
     }

@@ -19,7 +19,6 @@ from ..worker.environment import load_extra
 
 # -- Addresses of Dask schedulers: how they are written, and which are allowed --------------------
 
-
 CONNECT_S = 5.0
 _EXAMPLE = "Give one such as tls://computer:8786."
 _SHOWN_CHARACTERS = 100
@@ -55,11 +54,8 @@ class Address:
 def scheduler_address(text: str) -> Address:
     """Return an address of a Dask scheduler that may be used.
 
-    Raises
-    ------
-    UsageError
-        It is none, or would send names and commands over a network that others can read: all but
-        the addresses of this computer must be ``tls://``.
+    Raises UsageError: it is none, or would send names and commands over a network that others can
+    read: all but the addresses of this computer must be ``tls://``.
     """
     given = text.strip()
     address = _parsed(given) if "://" in given and re.fullmatch(COMPUTERS, given) else None
@@ -87,10 +83,7 @@ def _parsed(text: str) -> Address | None:
 def check_reachable(address: Address) -> None:
     """Connect to an address and hang up; nothing is sent.
 
-    Raises
-    ------
-    FarmError
-        Nothing accepts connections there.
+    Raises FarmError: nothing accepts connections there.
     """
     try:
         socket.create_connection((address.host, address.port), CONNECT_S).close()
@@ -106,7 +99,6 @@ def check_reachable(address: Address) -> None:
 #
 # One authority signs one certificate for all: who holds the folder belongs to the farm.
 
-
 CA_NAME, CERTIFICATE_NAME, KEY_NAME = "ca.pem", "farm.pem", "farm-key.pem"
 FOLDER_VARIABLE = "GW_CERTIFICATES"
 VALID_DAYS = 825
@@ -116,10 +108,7 @@ _SECRET = 0o600
 def checked_folder(folder: str) -> Path:
     """Return the folder of the certificates; that of the environment where none is given.
 
-    Raises
-    ------
-    UsageError
-        None is named, or files are missing in it, or damaged, or the key is of another.
+    Raises UsageError: none is named, or files are missing in it or damaged.
     """
     named = folder or os.environ.get(FOLDER_VARIABLE, "")
     if not named:
@@ -137,7 +126,9 @@ def checked_folder(folder: str) -> Path:
             "all computers.",
         )
     try:
-        _context_of(path)
+        # As Dask does later, where an error looks like one of the network.
+        context = ssl.create_default_context(cafile=str(path / CA_NAME))
+        context.load_cert_chain(path / CERTIFICATE_NAME, path / KEY_NAME, password=_no_password)
     except (OSError, ValueError) as error:  # SSLError is one
         said = getattr(error, "reason", None) or getattr(error, "strerror", None)
         raise UsageError(
@@ -147,12 +138,6 @@ def checked_folder(folder: str) -> Path:
     return path
 
 
-def _context_of(folder: Path) -> None:
-    """Load all three files, as Dask does later, where an error looks like one of the network."""
-    context = ssl.create_default_context(cafile=str(folder / CA_NAME))
-    context.load_cert_chain(folder / CERTIFICATE_NAME, folder / KEY_NAME, password=_no_password)
-
-
 def _no_password() -> str:
     raise ValueError("the key has a password")
 
@@ -160,14 +145,8 @@ def _no_password() -> str:
 def make_certificates(folder: Path) -> None:
     """Make an authority and a certificate; the authority's key is not kept.
 
-    Raises
-    ------
-    MissingExtraError
-        The package for certificates is missing.
-    UsageError
-        There are some already: computers that have them would be left behind.
-    ResourceError
-        The folder cannot be written.
+    Raises MissingExtraError; UsageError: there are some already: computers that have them would be
+    left behind; ResourceError: the folder cannot be written.
     """
     load_extra("farm", "Certificates")
     from cryptography import x509

@@ -60,19 +60,12 @@ def sendable_clock() -> Callable[[], float]:
 def run_child(request: dict[str, Any]) -> dict[str, Any]:
     """Run a module of the add-on in a child process and wait for it.
 
-    Parameters
-    ----------
-    request : dict
-        ``module``; ``arguments``, JSON values; ``folder``, relative to the shared folder where
-        ``is_shared``; ``command``, of the interpreter with its options up to the module, or
-        ``None`` for that of this computer.
-
-    Returns
-    -------
-    dict
-        ``code``, ``error``, ``hint``, ``host``, the last ``lines`` of its output, the ``answer``
-        that it gave (``None`` for none), and whether it is ``refused``: whatever this computer is
-        asked, it cannot do.
+    ``request``: ``module``; ``arguments``, JSON values; ``folder``, relative to the shared folder
+    where ``is_shared``; ``command``, of the interpreter with its options up to the module, or
+    ``None`` for that of this computer.
+    Returns dict: ``code``, ``error``, ``hint``, ``host``, the last ``lines`` of its output, the
+    ``answer`` that it gave (``None`` for none), and whether it is ``refused``: whatever this
+    computer is asked, it cannot do.
     """
     host = os.uname().nodename if hasattr(os, "uname") else os.environ.get("COMPUTERNAME", "")
     try:
@@ -108,21 +101,14 @@ def run_child(request: dict[str, Any]) -> dict[str, Any]:
     if code and not problem:
         reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
         problem = f"Its process {reason}: {said[-1] if said else 'no output'}."
-    hint = str(told.get("hint", ""))
     return {
-        "code": code, "error": problem, "hint": hint, "host": host,
+        "code": code, "error": problem, "hint": str(told.get("hint", "")), "host": host,
         "lines": [*lines, *said][-LAST_LINES:], "answer": answer, "refused": code == OTHER_CODE,
     }  # fmt: skip
 
 
 def _command(request: dict[str, Any], host: str) -> list[str]:
-    """Return the command line of the child.
-
-    Raises
-    ------
-    OSError
-        The shared folder or the add-on is not there.
-    """
+    """Return the child's command line. Raises OSError: shared folder or add-on are not there."""
     folder = Path(request["folder"])
     if request["is_shared"]:
         shared = os.environ.get(SHARED_VARIABLE, "")

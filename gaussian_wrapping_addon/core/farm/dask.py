@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 #
 # Names and results travel over the network, data over the folder that all computers share.
 
-
 _logger = logging.getLogger(__name__)
 
 HTTP = "127.0.0.1:0"
@@ -84,23 +83,10 @@ class _Bound:
 class DaskTasks:
     """A connection to a Dask cluster.
 
-    Parameters
-    ----------
-    address : str
-        ``"local"``, or that of a scheduler: ``tls://HOST:PORT``, ``tcp://`` on this computer only.
-    processes : int
-        Workers of a local cluster.
-    certificates : str
-        Folder of the certificates for ``tls://``.
-
-    Raises
-    ------
-    MissingExtraError
-        The worker lacks Dask.
-    UsageError
-        The address is none, is not encrypted, or the certificates are missing.
-    WorkerError
-        No scheduler answers there.
+    ``address``: ``"local"``, with so many ``processes``, or that of a scheduler:
+    ``tls://HOST:PORT``, with a folder of ``certificates``, or ``tcp://`` on this computer only.
+    Raises MissingExtraError: the worker lacks Dask; UsageError: the address is none, is not
+    encrypted, or the certificates are missing; WorkerError: no scheduler answers there.
     """
 
     def __init__(self, address: str, processes: int, certificates: str = "") -> None:
@@ -117,13 +103,10 @@ class DaskTasks:
         self._looked_s = self._seen_s = time.monotonic()
         self._cluster: LocalCluster | None = None
         self._processes = processes
-        dask.config.set(
-            {
-                "distributed.scheduler.allowed-failures": KILLED_WORKERS,
-                "distributed.comm.retry.count": 3,
-                "distributed.admin.log-length": 100,
-            }
-        )
+        dask.config.set({
+            "distributed.scheduler.allowed-failures": KILLED_WORKERS,
+            "distributed.comm.retry.count": 3, "distributed.admin.log-length": 100,
+        })  # fmt: skip
         target: Any = self._address
         if self._address == LOCAL:
             self._cluster = target = LocalCluster(
@@ -154,17 +137,8 @@ class DaskTasks:
     def submit(self, name: str, key: str, request: dict[str, Any]) -> None:
         """Have a child run somewhere (see :func:`.child.run_child`), not where one was refused.
 
-        Parameters
-        ----------
-        name : str
-            By which it is found again.
-        key : str
-            Unique: by it the scheduler knows the task.
-
-        Raises
-        ------
-        FarmLostError
-            The scheduler is gone.
+        ``name``: by which it is found again; ``key``: unique: by it the scheduler knows the task.
+        Raises FarmLostError: the scheduler is gone.
         """
         if self._client.status not in _CONNECTED:
             raise self._lost()
@@ -192,13 +166,7 @@ class DaskTasks:
         return {k: v for k, v in found.items() if k not in self._refusing} or found
 
     def ended(self, seconds: float) -> list[Ended]:
-        """Return which children have ended; wait at most so long for the first.
-
-        Raises
-        ------
-        FarmLostError
-            The scheduler is gone.
-        """
+        """Return which children have ended; wait so long at most. Raises FarmLostError."""
         until_s = time.monotonic() + seconds
         while True:
             found = [name for name, future in self._futures.items() if future.done()]
@@ -214,11 +182,8 @@ class DaskTasks:
     def _look_after_workers(self) -> None:
         """Submit for any worker what waits for some that are gone: Dask would wait for ever.
 
-        Raises
-        ------
-        FarmLostError
-            A cluster of this computer has no workers any more: Dask starts one again that dies at
-            work, and gives up one that dies while it starts.
+        Raises FarmLostError: all workers of this computer are gone. Dask starts one again that dies
+        at work, and gives up one that dies while it starts.
         """
         now_s = time.monotonic()
         watched = self._bound or self._cluster is not None
@@ -296,15 +261,7 @@ def _send_child_as_source(log_level: int) -> None:
 async def check_scheduler(address: str, security: Any) -> None:
     """Ask a scheduler for its name: a client would wait for ever for one that accepts and hangs.
 
-    Parameters
-    ----------
-    security : distributed.Security or None
-        See :func:`security_of`.
-
-    Raises
-    ------
-    WorkerError
-        It does not answer.
+    Raises WorkerError: it does not answer.
     """
     from distributed.core import rpc
 
@@ -327,14 +284,9 @@ def no_scheduler(address: str, error: Exception) -> WorkerError:
 def request_of(
     folder: Path, module: str, arguments: dict[str, Any], command: list[str] | None
 ) -> dict[str, Any]:
-    """Return a request for :func:`.child.run_child` about a folder.
+    """Return a request for :func:`.child.run_child` about a folder; ``command``: for this computer.
 
     The folder is named relative to the shared folder of this computer, if it lies in it.
-
-    Parameters
-    ----------
-    command : list of str or None
-        For children on this computer.
     """
     shared = os.environ.get(child.SHARED_VARIABLE, "")
     is_shared = bool(shared) and command is None and folder.is_relative_to(Path(shared).resolve())
@@ -348,10 +300,7 @@ def request_of(
 def security_of(address: str, certificates: str) -> Any:
     """Return what Dask needs for an address; ``None`` where nothing is encrypted.
 
-    Raises
-    ------
-    UsageError
-        Certificates are needed and missing.
+    Raises UsageError: certificates are needed and missing.
     """
     if not address.startswith("tls://"):
         return None
@@ -368,7 +317,6 @@ def security_of(address: str, certificates: str) -> Any:
 
 
 # -- Ask each worker of a Dask cluster something, beside its work and within a time limit ---------
-
 
 _CLOCK_READINGS = 3
 """Of which the one with the shortest round trip counts: the first ones open connections."""
@@ -399,28 +347,15 @@ class Answer:
 
 
 async def ask_workers(
-    address: Address,
-    certificates: str,
-    requests: Callable[[int], Sequence[dict[str, Any]]],
-    judge: Callable[[Answer], Awaitable[Judged]],
-    limit_s: float,
-) -> AsyncIterator[Judged]:
+    address: Address, certificates: str, requests: Callable[[int], Sequence[dict[str, Any]]],
+    judge: Callable[[Answer], Awaitable[Judged]], limit_s: float,
+) -> AsyncIterator[Judged]:  # fmt: skip
     """Have each worker run children at once, whatever it works on; yield what comes of them.
 
-    Parameters
-    ----------
-    requests : callable
-        Returns the requests for the worker of a number; the next one is made where one had no
-        answer.
-    judge : callable
-        Receives the answers.
-    limit_s : float
-        Time for each worker.
-
-    Raises
-    ------
-    WorkerError
-        No scheduler answers.
+    ``requests``: returns the requests for the worker of a number; the next one is made where one
+    had no answer.
+    ``judge``: receives the answers; ``limit_s``: time for each worker.
+    Raises WorkerError: no scheduler answers.
     """
     from distributed import Client
 

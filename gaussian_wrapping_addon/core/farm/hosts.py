@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 # job; defaults of a site are read from its ``jobqueue.yaml``. The worker in the script is ours:
 # parts need its environment.
 
-
 SYSTEMS = ("slurm", "pbs")
 MAX_WORKERS = 1000
 _MEMORY = re.compile(r"[0-9]{1,6}(\.[0-9]{1,3})?(MB|GB|TB|MiB|GiB|TiB)")
@@ -52,13 +51,7 @@ class Wanted:
     """Folder of the jobs' output; empty: as the system does."""
 
     def validated(self) -> Wanted:
-        """Return this.
-
-        Raises
-        ------
-        UsageError
-            A value cannot stand in a script.
-        """
+        """Return this. Raises UsageError: a value cannot stand in a script."""
         if self.system not in SYSTEMS:
             raise UsageError(
                 f"{self.system!r} is no batch system.", f"Give {' or '.join(SYSTEMS)}."
@@ -83,19 +76,9 @@ class Wanted:
 
 
 def make_job(wanted: Wanted, address: str, name: str, worker: str) -> Job:
-    """Return a job that runs a worker, not submitted yet.
+    """Return a job, not submitted yet, in whose script the line ``worker`` runs a worker.
 
-    Parameters
-    ----------
-    address : str
-        Of the scheduler.
-    worker : str
-        The line of the script that runs the worker.
-
-    Raises
-    ------
-    UsageError
-        The commands of the batch system are not on this computer.
+    Raises UsageError: the commands of the batch system are not on this computer.
     """
     from dask_jobqueue.pbs import PBSJob
     from dask_jobqueue.slurm import SLURMJob
@@ -122,13 +105,7 @@ def make_job(wanted: Wanted, address: str, name: str, worker: str) -> Job:
 
 
 async def submit(job: Job) -> str:
-    """Submit a job; return its number.
-
-    Raises
-    ------
-    FarmError
-        The batch system refuses it.
-    """
+    """Submit a job; return its number. Raises FarmError: the batch system refuses it."""
     try:
         await job.start()
     except (RuntimeError, ValueError, OSError) as error:
@@ -144,7 +121,6 @@ async def submit(job: Job) -> str:
 #
 # The client of the system knows the user's keys, agents, jump hosts and names of computers. It
 # never asks: a computer that wants a password fails at once.
-
 
 MAX_HOSTS = 1000
 MAX_FILE_BYTES = 1 << 20
@@ -171,20 +147,9 @@ class Host:
 
 
 def read_hosts(path: Path, usual: Host) -> list[Host]:
-    """Read computers from a file: a line has a name, and ``KEY=VALUE`` where one differs.
+    """Read computers from a file: a line has a name, and ``KEY=VALUE`` where not as ``usual``.
 
-    Parameters
-    ----------
-    usual : Host
-        What applies where a line says nothing: ``shared``, ``certificates``, ``python``, ``batch``,
-        ``slots``.
-
-    Raises
-    ------
-    ParseError
-        A line is none of these, or the file is too large or no file.
-    OSError
-        It cannot be read.
+    Raises ParseError: a line is none of these, or the file is too large; OSError.
     """
     data = read_bounded(path, MAX_FILE_BYTES, follow_links=True)
     try:
@@ -208,23 +173,14 @@ def read_hosts(path: Path, usual: Host) -> list[Host]:
 
 
 def hosts_named(names: Iterable[str], usual: Host) -> list[Host]:
-    """Return computers by their names.
-
-    Raises
-    ------
-    UsageError
-        A name is none.
-    """
+    """Return computers by their names. Raises UsageError: a name is none."""
     return [_host([name], usual) for name in names]
 
 
 def checked_hosts(hosts: list[Host]) -> list[Host]:
     """Return computers of which there are some, each once.
 
-    Raises
-    ------
-    UsageError
-        There is none, one is named twice, or they are too many.
+    Raises UsageError: there is none, one is named twice, or they are too many.
     """
     names = [host.name for host in hosts]
     twice = [name for name in names if names.count(name) > 1] if len(names) <= MAX_HOSTS else []
@@ -240,10 +196,7 @@ def checked_hosts(hosts: list[Host]) -> list[Host]:
 def ssh_command(host: Host, address: str) -> list[str]:
     """Return the command that runs a worker on a computer until its input ends.
 
-    Raises
-    ------
-    UsageError
-        There is no ``ssh`` here.
+    Raises UsageError: there is no ``ssh`` here.
     """
     program = shutil.which("ssh")
     if program is None:

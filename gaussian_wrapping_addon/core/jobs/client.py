@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import json
 import os
 import signal
 import subprocess
@@ -27,7 +26,7 @@ from ..errors import (
 )
 from ..files import open_regular, real_path, touch_regular
 from ..worker.environment import not_started, ready_worker
-from ..worker.helper_process import child_command
+from ..worker.helper_process import child_command, ending_of, json_object
 from ..worker.spawn import is_here, kill_group, process_alive, spawn
 from .stages.training import killed_hint, killed_mesh_hint
 from .store.job_file import JobFile, read_job, reject_region_conflicts, write_job
@@ -62,13 +61,8 @@ KILLED_BAKE_HINT = (
 def worker_python(preference: str = "") -> str:
     """Return the interpreter for workers, or the folder of a worker environment.
 
-    In this order: the preference, the environment variable, the environment made by the add-on,
-    the running Python if it has torch.
-
-    Raises
-    ------
-    UsageError
-        The interpreter named does not exist, or none is set up.
+    In this order: the preference, the environment variable, the environment made by the add-on, the
+    running Python if it has torch. Raises UsageError: there is none.
     """
     chosen = preference or os.environ.get(PYTHON_VARIABLE, "")
     if chosen and not Path(chosen).exists():
@@ -113,15 +107,7 @@ def _writing(root: Path) -> Iterator[None]:
 def prepare_job(folder: Path, job: JobFile) -> JobFolder:
     """Write a job into its folder, to be started or submitted.
 
-    Parameters
-    ----------
-    folder : Path
-        New, empty, or a job folder.
-
-    Raises
-    ------
-    WrapError
-        The folder cannot be used, or a job runs there; the earlier job stays.
+    Raises WrapError: the folder cannot be used, or a job runs there; the earlier job stays.
     """
     target = JobFolder(real_path(folder))
     source = Path(job.source)
@@ -150,54 +136,25 @@ class JobClient:
 
     @classmethod
     def start(
-        cls,
-        folder: Path,
-        job: JobFile,
-        *,
-        python: str | None = None,
-        keep_running: bool = False,
+        cls, folder: Path, job: JobFile, *, python: str | None = None, keep_running: bool = False
     ) -> JobClient:
-        """Write the job into ``folder`` and start its worker.
+        """Write the job into ``folder``, new, empty, or a job folder, and start its worker.
 
-        Parameters
-        ----------
-        folder : Path
-            New, empty, or a job folder.
-        job : JobFile
-            What to do.
-        python : str or None
-            Interpreter that has torch; ``None`` asks :func:`worker_python`.
-        keep_running : bool
-            Whether the worker continues when this process ends.
-
-        Raises
-        ------
-        DeviceError
-            The job names a GPU that the driver does not find; nothing was written.
+        ``python``: interpreter that has torch; ``None`` asks :func:`worker_python`.
+        ``keep_running``: whether the worker continues when this process ends.
+        Raises DeviceError: the job names a GPU that the driver does not find; nothing was written.
         """
         _reject_absent_device(job)
         return cls._launch(prepare_job(folder, job), python, keep_running)
 
     @classmethod
     def resume(
-        cls,
-        folder: Path,
-        *,
-        python: str | None = None,
-        keep_running: bool = False,
+        cls, folder: Path, *, python: str | None = None, keep_running: bool = False,
         device: str | None = None,
-    ) -> JobClient:
-        """Start a worker for the job in ``folder``; finished stages are re-used.
+    ) -> JobClient:  # fmt: skip
+        """Start a worker for the job in ``folder``; ``device``, if given, replaces its setting.
 
-        Parameters
-        ----------
-        device : str or None
-            Replaces the job's setting; ``None`` keeps it.
-
-        Raises
-        ------
-        DeviceError
-            As for :meth:`start`.
+        Raises DeviceError: as :meth:`start`.
         """
         target = JobFolder(real_path(folder))
         if not target.is_job():
@@ -280,8 +237,8 @@ class JobClient:
         if status.active or status.state == "LOST":
             if code in KILLED_CODES:
                 return self._killed(status)
-            reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
-            return self._failed(status, f"The worker {reason}. {self.output_tail()}".strip())
+            words = f"The worker {ending_of(code)}. {self.output_tail()}"
+            return self._failed(status, words.strip())
         return status
 
     def _killed(self, status: JobStatus) -> JobStatus:
@@ -304,21 +261,18 @@ class JobClient:
     def _refusal(self) -> WorkerError | None:
         """Return the error of a worker that could not begin; the job's status is not of it."""
         for line in reversed(self._output_lines()):
-            with contextlib.suppress(ValueError, RecursionError):
-                values = json.loads(line)
-                if isinstance(values, dict) and values.get("error"):
-                    return WorkerError(str(values["error"]), str(values.get("hint", "")))
+            values = json_object(line) or {}
+            if values.get("error"):
+                return WorkerError(str(values["error"]), str(values.get("hint", "")))
         return None
 
     def _failed(self, status: JobStatus, error: str) -> JobStatus:
         log = self.folder.log_path.name
         begun = status.state != "NEW"
         return replace(
-            status,
-            state="LOST" if begun else "FAILED",
-            error=error,
+            status, state="LOST" if begun else "FAILED", error=error,
             hint=f"See {log} in the job folder, then resume." if begun else PYTHON_HINT,
-        )
+        )  # fmt: skip
 
     def output_tail(self) -> str:
         """Return the last line that the worker wrote to stdout and stderr."""
@@ -338,10 +292,7 @@ class JobClient:
     def cancel(self) -> None:
         """Ask the worker to stop; it stops within about two seconds and keeps a checkpoint.
 
-        Raises
-        ------
-        ParseError
-            ``cancel`` in the job folder is a link or another thing that is not a file.
+        Raises ParseError: ``cancel`` in the job folder is not a regular file.
         """
         with contextlib.suppress(OSError):
             touch_regular(self.folder.cancel_path)
@@ -371,10 +322,7 @@ class JobClient:
     def wait(self, timeout_s: float | None = None) -> JobStatus:
         """Wait until our worker process has ended and return the final status.
 
-        Raises
-        ------
-        WorkerError
-            The job was started by another process.
+        Raises WorkerError: the job was started by another process.
         """
         if self._process is None:
             raise WorkerError("This job was started by another process.", "Poll it instead.")

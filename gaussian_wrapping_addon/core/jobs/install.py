@@ -55,7 +55,6 @@ from .store.job_folder import JobFolder, JobStatus
 
 # -- Find the Python installations that a worker environment can be created from ------------------
 
-
 OLDEST = (3, 11)
 NEWEST_WITH_WHEELS = (3, 13)
 """Some packages (xatlas) have no wheels for newer versions yet, which are listed last."""
@@ -116,10 +115,7 @@ class FoundPython:
 def probe(path: str) -> FoundPython:
     """Query the properties of an interpreter.
 
-    Raises
-    ------
-    UsageError
-        It is not a Python, does not respond, is 32-bit or too old.
+    Raises UsageError: it is not a Python, does not respond, is 32-bit or too old.
     """
     other = "Choose another Python 3.11 to 3.13 (python.org, or your system's packages)."
     if _is_blender(path):
@@ -152,8 +148,7 @@ def candidates(own: str = "") -> list[str]:
     found = [shutil.which(name) or "" for name in names]
     if sys.platform == "darwin":
         found += [path for pattern in _MAC_PATTERNS for path in sorted(glob.glob(pattern))]
-    launcher = shutil.which("py") if sys.platform == "win32" else None
-    if launcher:
+    if sys.platform == "win32" and (launcher := shutil.which("py")):
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
             done = subprocess.run(
                 [launcher, "-0p"], stdin=subprocess.DEVNULL, capture_output=True, check=False,
@@ -192,7 +187,6 @@ def find_pythons(own: str = "", paths: Iterable[str] | None = None) -> list[Foun
 # for CUDA, on Windows and macOS the one for the CPU. The other build comes from PyTorch's own
 # index. From an index, all other packages are installed by the hashes of their files, before
 # torch: its builds have other hashes on each index. A folder of wheels is taken as it is.
-
 
 CPU = "cpu"
 CUDA = "cuda"
@@ -243,18 +237,14 @@ def as_line(command: Command) -> str:
 
 def cuda_present() -> bool:
     """Tell whether an NVIDIA driver is installed; looks at files only."""
-    if sys.platform == "darwin":
-        return False
-    return bool(shutil.which("nvidia-smi")) or Path("/proc/driver/nvidia/version").exists()
+    is_there = shutil.which("nvidia-smi") or Path("/proc/driver/nvidia/version").exists()
+    return sys.platform != "darwin" and bool(is_there)
 
 
 def torch_index(choice: str, system: str = "") -> str:
     """Return the extra package index for a torch build on a system; ``""`` for none.
 
-    Raises
-    ------
-    UsageError
-        The system has no such build.
+    Raises UsageError: the system has no such build.
     """
     system = system or platform.system()
     if choice == CUDA and system == "Darwin":
@@ -265,10 +255,7 @@ def torch_index(choice: str, system: str = "") -> str:
 def all_commands(request: SetupRequest, python: FoundPython) -> list[Command]:
     """Return every command of a set-up, in order.
 
-    Raises
-    ------
-    UsageError
-        The Python or the build of torch cannot be used.
+    Raises UsageError: the Python or the build of torch cannot be used.
     """
     folder = request.environment.next_folder()
     if request.adds:
@@ -291,21 +278,20 @@ def all_commands(request: SetupRequest, python: FoundPython) -> list[Command]:
 
 def _installs(request: SetupRequest) -> list[Command]:
     """Return the arguments of pip, one call after the other."""
-    options, extras = _INSTALL, _extra_installs(request)
-    index = torch_index(request.torch)
+    extras, index = _extra_installs(request), torch_index(request.torch)
     if request.find_links:
         return [(*_only_wheels(request), "-r", request.requirements), *extras]
     also = ("--extra-index-url", index) if index else ()
     requirements = Path(request.requirements)
     hashes = hashes_file(requirements)
     if hashes is None:
-        return [(*options, *also, "-r", request.requirements), *extras]
+        return [(*_INSTALL, *also, "-r", request.requirements), *extras]
     (torch,) = (r for r in read_requirements(requirements) if r.name == "torch")
     # What the build for the processor needs is in the list with hashes.
     alone = ("--no-deps",) if request.torch == CPU else ()
     return [
-        (*options, "--require-hashes", "-r", str(hashes)),
-        (*options, *also, *alone, f"{torch.name}{torch.versions}"),
+        (*_INSTALL, "--require-hashes", "-r", str(hashes)),
+        (*_INSTALL, *also, *alone, f"{torch.name}{torch.versions}"),
         *extras,
     ]
 
@@ -321,10 +307,9 @@ def _extra_installs(request: SetupRequest) -> list[Command]:
     found: list[Command] = []
     for extra in map(extra_named, request.extras):
         hashes = extra_hashes_file(Path(request.requirements), extra)
-        if request.find_links:
-            found.append((*_only_wheels(request), "--no-deps", *extra.pins))
-        elif hashes is None:
-            found.append((*_INSTALL, "--no-deps", *extra.pins))
+        if request.find_links or hashes is None:
+            options = _only_wheels(request) if request.find_links else _INSTALL
+            found.append((*options, "--no-deps", *extra.pins))
         else:
             found.append((*_INSTALL, "--no-deps", "--require-hashes", "-r", str(hashes)))
     return found
@@ -345,10 +330,7 @@ def _additions(request: SetupRequest, python: FoundPython) -> list[Command]:
 def check_addition(request: SetupRequest) -> None:
     """Raise if there is no complete environment to add to, or nothing to add.
 
-    Raises
-    ------
-    UsageError
-        Says which, and the next step.
+    Raises UsageError: says which, and the next step.
     """
     if not request.extras:
         raise UsageError("No extra is named.", "Name what to add.")
@@ -361,10 +343,7 @@ def check_addition(request: SetupRequest) -> None:
 def check_folders(request: SetupRequest) -> None:
     """Raise if the folders of a set-up cannot be used; writes nothing.
 
-    Raises
-    ------
-    UsageError
-        A folder cannot be used; names it.
+    Raises UsageError: a folder cannot be used; names it.
     """
     root, wheels = request.environment.root, request.find_links
     try:
@@ -387,7 +366,6 @@ def check_folders(request: SetupRequest) -> None:
 #
 # A set-up builds in a folder that is not in use and switches to it at the end: if it is stopped,
 # the previous environment, or none, remains.
-
 
 _logger = logging.getLogger(__name__)
 
@@ -465,14 +443,10 @@ class SetupTask(threading.Thread):
         commands = all_commands(request, python)
         folder = environment.next_folder()
         marker = {
-            "made_by": "gaussian_wrapping_addon",
-            "kind": VENV if python.has_venv else PACKAGES,
-            "python": python.path,
-            "version": python.version_text,
-            "torch": request.torch,
-            "folder": folder.name,
-            "extras": list(request.extras),
-        }
+            "made_by": "gaussian_wrapping_addon", "kind": VENV if python.has_venv else PACKAGES,
+            "python": python.path, "version": python.version_text, "torch": request.torch,
+            "folder": folder.name, "extras": list(request.extras),
+        }  # fmt: skip
         check_folders(request)
         environment.root.mkdir(parents=True, exist_ok=True)
         if "torch" in names:
@@ -532,7 +506,7 @@ class SetupTask(threading.Thread):
         """Run a command to its end; the progress is the share of ``expected`` packages named."""
         log.write(f"$ {as_line(command)}\n")
         last: deque[str] = deque(maxlen=40)
-        self._process = process = start_process(
+        self._process = process = _start_process(
             child_command("jobs.install", *command, python=python),
             self.request.environment.root / TEMPORARY,
         )
@@ -597,26 +571,17 @@ def _check_disk(root: Path, needed_gib: int) -> None:
         )
 
 
-def start_process(command: list[str], temporary: Path) -> subprocess.Popen[bytes]:
-    """Start :func:`main` in a process group of its own, with temporary files in ``temporary``.
-
-    Raises
-    ------
-    WorkerError
-        The process does not start.
-    """
-    inherited = {
+def _start_process(command: list[str], temporary: Path) -> subprocess.Popen[bytes]:
+    """Start :func:`main` in a process group of its own, with temporary files in ``temporary``."""
+    variables = {
         k: v for k, v in child_environment().items() if k.upper() not in _IGNORED_VARIABLES
     }
-    temporary_variables = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
+    variables |= {**dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary)), "PIP_USER": "0"}
     try:
         return spawn(
-            command,
-            stdin=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            environment={**inherited, **temporary_variables, "PIP_USER": "0"},
+            command, stdin=subprocess.PIPE, stderr=subprocess.STDOUT, environment=variables,
             folder=temporary,
-        )
+        )  # fmt: skip
     except OSError as error:
         raise WorkerError(
             f"{command[0]} does not start: {error.strerror}.", "Choose another Python."
@@ -662,12 +627,7 @@ def _delete_unused(environment: WorkerEnvironment, keep: Path | None = None) -> 
 def remove(environment: WorkerEnvironment) -> None:
     """Delete an environment made by the add-on, and nothing else.
 
-    Raises
-    ------
-    UsageError
-        The folder has no marker of ours, or a set-up is running in it.
-    OSError
-        A file cannot be deleted.
+    Raises UsageError: it has no marker of ours, or a set-up runs there; OSError: a file stays.
     """
     root = environment.root
     if root.is_symlink() or not environment.is_ours():

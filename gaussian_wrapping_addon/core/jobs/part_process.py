@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The ``run-part`` command: run one part of a job in a process of its own.
 
-Runs in the worker's Python, on any computer that sees the job folder. Writes one JSON object per
-line to stdout, in the protocol of :mod:`.run_in_worker`. The exit code is one of
-:mod:`.graph`.
+Runs in the worker's Python, on any computer that sees the job folder. Lines are in the protocol of
+:mod:`.run_in_worker`, the exit code is one of :mod:`.graph`.
 """
 
 from __future__ import annotations
@@ -20,29 +19,15 @@ from types import FrameType
 
 from .. import limits
 from ..devices import choose_device
-from ..errors import EXIT_RESOURCES, Cancelled, UsageError, WorkerError, WrapError
+from ..errors import Cancelled, UsageError, WorkerError, WrapError
 from ..files import seconds_since_written
 from ..names import TILE_KINDS
 from ..parallel import default_threads
 from ..progress import Progress
 from ..worker.helper_process import emit, kill_helpers
 from ..worker.spawn import Caller, end_with_parent
-from .parts.graph import (
-    CANCELLED,
-    DONE,
-    MAY_WORK_ELSEWHERE,
-    NEVER,
-    OTHER_CODE,
-    STATES_FOLDER,
-    Part,
-    PartsGraph,
-    code_version,
-    part_exit_code,
-    plan_hash,
-    read_parts,
-    read_state,
-    states_folder,
-)
+from .parts import graph as parts
+from .parts.graph import Part, PartsGraph
 from .parts.lease import PartLease
 from .parts.runner import HERE, PartResult, PartRunner
 from .stages.meshing import TILES_FOLDER
@@ -56,7 +41,7 @@ _logger = logging.getLogger(__name__)
 TELL_EVERY_S = 30.0
 """Farms take a task that says nothing for minutes for dead."""
 POLL_S = 1.0
-MANY = frozenset((STATES_FOLDER, TILES_FOLDER))
+MANY = frozenset((parts.STATES_FOLDER, TILES_FOLDER))
 """Folders with files of every tile. A part of one tile does not look for links among them all:
 whatever opens one of their files refuses links, and what replaces one replaces the link."""
 
@@ -74,58 +59,48 @@ def main(arguments: list[str]) -> int:
         return _run(folder, request)
     except WrapError as error:
         emit(error=error.message, hint=error.hint)
-        return part_exit_code(error)
+        return parts.part_exit_code(error, error.exit_code)
 
 
 def _run(folder: JobFolder, request: dict[str, object]) -> int:
     if not folder.is_job():
         raise UsageError(f"{folder.root} is not a job folder.", "Give the --out of a job.")
     folder.check_entries(but=MANY)
-    graph = read_parts(folder.root)
-    if graph.code != code_version():
+    graph = parts.read_parts(folder.root)
+    version = parts.code_version()
+    if graph.code != version:
         emit(
-            error=f"This computer has version {code_version()} of the program, the job was planned "
+            error=f"This computer has version {version} of the program, the job was planned "
             f"by {graph.code}.",
             hint="Install the same version on all computers.",
         )
-        return OTHER_CODE
+        return parts.OTHER_CODE
     job = read_job(folder.job_path)
-    if plan_hash(job) != graph.plan:
+    if parts.plan_hash(job) != graph.plan:
         raise UsageError(f"{folder.root} was planned for another job.", "Plan it again: parts DIR.")
     part = graph.part(str(request["part"]))
     if part.kind not in TILE_KINDS:
         folder.check_entries()
     driven = bool(request["driven"])
-    if _was_done(folder, graph, part):
-        return DONE
-    _check_needs(folder, graph, part)
+    if parts.done_state(folder.root, part.name, graph.plan) is not None:
+        emit(line=f"part {part.name} was done before")
+        return parts.DONE
+    for name in part.needs:
+        if parts.done_state(folder.root, name, graph.plan) is None:
+            raise WorkerError(f"Part {part.name} needs {name}, which is not done.", "Run it first.")
+    job = _with_photos(job, graph, folder)
     if part.kind in HERE and not driven:
         folder.lock()
         try:
-            code = _hold(folder, _with_photos(job, graph, folder), graph, part, request)
-            if code == DONE:  # it is the last one
+            code = _hold(folder, job, graph, part, request)
+            if code == parts.DONE:  # it is the last one
                 result = str(folder.result) if folder.result.is_dir() else ""
                 folder.write_status(JobStatus("DONE", part.kind, 1.0, result=result))
                 discard_rollback(folder)
             return code
         finally:
             folder.unlock()
-    return _hold(folder, _with_photos(job, graph, folder), graph, part, request)
-
-
-def _was_done(folder: JobFolder, graph: PartsGraph, part: Part) -> bool:
-    state = read_state(folder.root, part.name)
-    if state is None or not state.done_in(folder.root, graph.plan):
-        return False
-    emit(line=f"part {part.name} was done before")
-    return True
-
-
-def _check_needs(folder: JobFolder, graph: PartsGraph, part: Part) -> None:
-    for name in part.needs:
-        state = read_state(folder.root, name)
-        if state is None or not state.done_in(folder.root, graph.plan):
-            raise WorkerError(f"Part {part.name} needs {name}, which is not done.", "Run it first.")
+    return _hold(folder, job, graph, part, request)
 
 
 def _with_photos(job: JobFile, graph: PartsGraph, folder: JobFolder) -> JobFile:
@@ -140,12 +115,9 @@ class _Watch:
     """Tells whether the part is to stop, and why."""
 
     def __init__(self, folder: JobFolder, lease: PartLease, driven: bool) -> None:
-        self._folder = folder
-        self._lease = lease
-        self._driven = driven
+        self._folder, self._lease, self._driven = folder, lease, driven
         self._caller = Caller()
-        self._terminated = False
-        self._driver_is_gone = False
+        self._terminated = self._driver_is_gone = False
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._terminate)
 
@@ -191,8 +163,8 @@ class _Watch:
 
     def _exit(self) -> None:
         kill_helpers()
-        self._lease.finish("FAILED", error="It was ended.", exit_code=MAY_WORK_ELSEWHERE)
-        os._exit(CANCELLED if self._folder.cancel_path.exists() else MAY_WORK_ELSEWHERE)
+        self._lease.finish("FAILED", error="It was ended.", exit_code=parts.MAY_WORK_ELSEWHERE)
+        os._exit(parts.CANCELLED if self._folder.cancel_path.exists() else parts.MAY_WORK_ELSEWHERE)
 
 
 def _hold(
@@ -208,12 +180,12 @@ def _hold(
         # Another process may still run it, for a walk that has ended.
         if not lease.take(watch.cancelled if request["driven"] else None):
             emit(line=f"part {part.name} was done by another process")
-            return DONE
+            return parts.DONE
         result = _work(folder, job, graph, part, request, lease, watch)
-        state = lease.finish("DONE", fraction=1.0, exit_code=DONE, outputs=result.outputs)
+        state = lease.finish("DONE", fraction=1.0, exit_code=parts.DONE, outputs=result.outputs)
     except Cancelled as cancelled:
         reason = watch.reason()
-        code = MAY_WORK_ELSEWHERE if reason else CANCELLED
+        code = parts.MAY_WORK_ELSEWHERE if reason else parts.CANCELLED
         message = f"Part {part.name} stopped: {reason}." if reason else cancelled.message
         lease.finish("FAILED", error=message, exit_code=code)
         emit(error=message, hint="")
@@ -222,29 +194,20 @@ def _hold(
         failure = failure_of(error, folder.root)
         if not failure.is_known:
             _logger.exception("unexpected failure")
-        code = part_exit_code(error) if isinstance(error, WrapError) else _code_of(failure.code)
+        code = parts.part_exit_code(error, failure.code)
         lease.finish("FAILED", error=failure.error, hint=failure.hint, exit_code=code)
         emit(error=failure.error, hint=failure.hint)
         return code
     finally:
         ended.set()
     emit(line=f"part {part.name} is done, {state.seconds:.0f} s")
-    return DONE
-
-
-def _code_of(job_code: int) -> int:
-    return MAY_WORK_ELSEWHERE if job_code == EXIT_RESOURCES else NEVER
+    return parts.DONE
 
 
 def _work(
-    folder: JobFolder,
-    job: JobFile,
-    graph: PartsGraph,
-    part: Part,
-    request: dict[str, object],
-    lease: PartLease,
-    watch: _Watch,
-) -> PartResult:
+    folder: JobFolder, job: JobFile, graph: PartsGraph, part: Part, request: dict[str, object],
+    lease: PartLease, watch: _Watch,
+) -> PartResult:  # fmt: skip
     threads = int(str(request["threads"])) or default_threads()
     wanted = str(request["device"] or job.settings.device)
     device = choose_device("cpu" if job.command == "bake" else wanted)
@@ -260,8 +223,8 @@ def _work(
 def begun_s(folder: JobFolder, graph: PartsGraph) -> float:
     """Return when the first part of a plan was begun; now, if none was."""
     begun = [time.time()]
-    for path in states_folder(folder.root).glob("*.json"):
-        state = read_state(folder.root, path.stem)
+    for path in (folder.root / parts.STATES_FOLDER).glob("*.json"):
+        state = parts.read_state(folder.root, path.stem)
         if state is not None and state.plan == graph.plan:
             begun.append(state.begun_s)
     return min(begun)

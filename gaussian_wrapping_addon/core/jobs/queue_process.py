@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The ``queue`` command: many jobs, one after another or side by side on a Dask cluster.
 
-Runs in the worker's Python; writes one JSON object per line, in the protocol of
-:mod:`.run_in_worker`. Each job is a process of its own that can be killed and begun again:
-it goes on from what it has finished.
+Each job is a process of its own that can be killed and begun again: it goes on from what it has
+finished. Lines are in the protocol of :mod:`.run_in_worker`.
 """
 
 from __future__ import annotations
@@ -36,16 +35,7 @@ from ..worker.helper_process import child_command, emit
 from ..worker.spawn import Caller, end_with_parent
 from . import worker
 from .client import JobClient
-from .parts.graph import (
-    CANCELLED,
-    DONE,
-    MAY_WORK_ELSEWHERE,
-    NEVER,
-    OTHER_CODE,
-    code_version,
-    plan_hash,
-    read_parts,
-)
+from .parts import graph as parts
 from .store.job_file import read_job
 from .store.job_folder import JobFolder
 from .worker import failure_of
@@ -58,7 +48,10 @@ SHOW_LIFE_S = 5.0
 HELD_S = limits.SILENT_S + 30.0
 """How long a job that another process holds is waited for: one that a killed queue has left ends
 within seconds here, and on another computer counts as ended after :data:`limits.SILENT_S`."""
-_CODES = {EXIT_DONE: DONE, EXIT_RESOURCES: MAY_WORK_ELSEWHERE, EXIT_CANCELLED: CANCELLED}
+_CODES = {
+    EXIT_DONE: parts.DONE, EXIT_RESOURCES: parts.MAY_WORK_ELSEWHERE,
+    EXIT_CANCELLED: parts.CANCELLED,
+}  # fmt: skip
 """What the exit codes of a job mean to who may begin it again; others: never."""
 
 
@@ -84,28 +77,28 @@ def main(arguments: list[str]) -> int:
         if not failure.is_known:
             raise
         emit(error=failure.error, hint=failure.hint)
-        return _CODES.get(failure.code, NEVER) if "job" in request else failure.code
+        return _CODES.get(failure.code, parts.NEVER) if "job" in request else failure.code
 
 
 def _run_job(folder: JobFolder, code: str) -> int:
-    if code != code_version():
+    if code != (version := parts.code_version()):
         emit(
-            error=f"This computer has version {code_version()} of the program, the queue {code}.",
+            error=f"This computer has version {version} of the program, the queue {code}.",
             hint="Install the same version on all computers.",
         )
-        return OTHER_CODE
+        return parts.OTHER_CODE
     caller = Caller()
     if not _is_free(folder, lambda: caller.ended() or folder.cancel_path.exists()):
         emit(
             error=f"Another process is working in {folder.root}.",
             hint="Wait for it, or cancel it; then give the same command again.",
         )
-        return MAY_WORK_ELSEWHERE
+        return parts.MAY_WORK_ELSEWHERE
     if _is_done(folder):  # by a worker whose computer was lost before it could say so
-        return DONE
-    ended = _CODES.get(worker.main([str(folder.root), "1"]), NEVER)
+        return parts.DONE
+    ended = _CODES.get(worker.main([str(folder.root), "1"]), parts.NEVER)
     status = folder.read_status()
-    if ended != DONE and status.error:
+    if ended != parts.DONE and status.error:
         emit(error=status.error, hint=status.hint)
     return ended
 
@@ -125,7 +118,7 @@ def _is_done(folder: JobFolder) -> bool:
     if folder.read_status().state != "DONE" or not folder.result.is_dir():
         return False
     try:
-        return read_parts(folder.root).plan == plan_hash(read_job(folder.job_path))
+        return parts.read_parts(folder.root).plan == parts.plan_hash(read_job(folder.job_path))
     except WrapError:
         return False
 
@@ -211,7 +204,7 @@ class _Queue:
             attempts[name] += 1
             running.add(name)
             self._folder(name).cancel_path.unlink(missing_ok=True)
-            arguments = {"job": name, "code": code_version()}
+            arguments = {"job": name, "code": parts.code_version()}
             request = request_of(self.home.root, MODULE, arguments, command)
             tasks.submit(name, f"job-{name}-{begun}-{attempts[name]}", request)
 
@@ -228,8 +221,7 @@ class _Queue:
                     if _may_work(end) and attempts[end.name] < MOST_ATTEMPTS:
                         waiting.append(end.name)
                         continue
-                    code = self._exit_code(end)
-                    yield end.name, code, f"{end.error} {end.hint}".strip()
+                    yield end.name, self._exit_code(end), f"{end.error} {end.hint}".strip()
         except Cancelled:
             self.stopped = True
         finally:
@@ -237,10 +229,10 @@ class _Queue:
 
     def _exit_code(self, end: Ended) -> int:
         """Return the exit code of a job for people, from how its process ended."""
-        if end.code == DONE:
+        if end.code == parts.DONE:
             return EXIT_DONE
         status = self._folder(end.name).read_status()
-        if status.state == "FAILED" and status.exit_code and end.code != OTHER_CODE:
+        if status.state == "FAILED" and status.exit_code and end.code != parts.OTHER_CODE:
             return status.exit_code
         return EXIT_RESOURCES if _may_work(end) else EXIT_OTHER
 
@@ -280,4 +272,4 @@ class _Queue:
 
 def _may_work(end: Ended) -> bool:
     """Return whether a job that did not end well may work elsewhere, or if begun again."""
-    return end.code < 0 or end.code in (MAY_WORK_ELSEWHERE, OTHER_CODE, CANCELLED)
+    return end.code < 0 or end.code in (parts.MAY_WORK_ELSEWHERE, parts.OTHER_CODE, parts.CANCELLED)

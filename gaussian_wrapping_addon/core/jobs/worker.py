@@ -37,7 +37,6 @@ from .store.rollback import discard_rollback, roll_back
 
 # -- What a job that failed tells: exit code, error and next step of any exception ----------------
 
-
 FULL_DISK_HINT = "Make room on that disk, then resume: the last checkpoint is intact."
 MEMORY_HINT = "Close other programs, or choose a smaller preset."
 BUG_HINT = "Send the job folder's log.txt with a bug report."
@@ -59,10 +58,7 @@ class Failure:
 def failure_of(error: Exception, root: Path) -> Failure:
     """Describe an exception that ended a job.
 
-    Parameters
-    ----------
-    root : Path
-        The job folder: where a full disk is, if the error does not name a file.
+    ``root``: the job folder: where a full disk is, if the error does not name a file.
     """
     if isinstance(error, WrapError):
         cause = error.__cause__
@@ -82,7 +78,6 @@ def failure_of(error: Exception, root: Path) -> Failure:
 
 # -- The worker process: lock the job folder, run the job, keep ``status.json`` up to date --------
 
-
 _logger = logging.getLogger(__name__)
 
 HEARTBEAT_S = 5.0
@@ -95,29 +90,23 @@ class _Reporter:
     """Write progress events to the status file at a bounded rate and poll for cancelling."""
 
     def __init__(self, folder: JobFolder, status: JobStatus) -> None:
-        self.folder = folder
-        self.status = status
-        self._guard = threading.Lock()
-        self._written_s = 0.0
-        self._logged_s = 0.0
+        self.folder, self.status = folder, status
+        self._guard, self._final_status = threading.Lock(), threading.Lock()
+        self._written_s = self._logged_s = 0.0
         self._stop = threading.Event()
-        self._final_status = threading.Lock()
         self.stop_requested = False
 
     def event(self, event: ProgressEvent) -> None:
         """Handle a progress event of the runner; fraction and time left are of the whole job."""
         now_s = time.monotonic()
         changed = event.stage != self.status.stage
+        finite = {name: value for name, value in event.figures.items() if math.isfinite(value)}
         with self._guard:
             self.status = replace(
-                self.status,
-                stage=event.stage,
-                fraction=event.fraction,
-                message=event.message,
-                phase=event.phase,
-                seconds_left=event.seconds_left,
-                figures=_merged({} if changed else self.status.figures, event.figures),
-            )
+                self.status, stage=event.stage, fraction=event.fraction, message=event.message,
+                phase=event.phase, seconds_left=event.seconds_left,
+                figures={**({} if changed else self.status.figures), **finite},
+            )  # fmt: skip
         if changed or now_s - self._written_s > STATUS_EVERY_S:
             self.write()
         if changed or now_s - self._logged_s > HEARTBEAT_S:
@@ -182,11 +171,6 @@ class _Reporter:
             self._stop.set()
 
 
-def _merged(known: dict[str, float], news: dict[str, float]) -> dict[str, float]:
-    """Return the known figures updated by newer ones; values that are not finite are left out."""
-    return {**known, **{name: value for name, value in news.items() if math.isfinite(value)}}
-
-
 class _LogFile(logging.FileHandler):
     """A log that is a regular file and nothing else."""
 
@@ -209,15 +193,6 @@ def _log_to(path: Path) -> logging.Handler:
     return handler
 
 
-def _roll_back(folder: JobFolder) -> JobStatus | None:
-    """Restore the folder after a failed mesh; the failure is reported all the same."""
-    try:
-        return roll_back(folder)
-    except OSError:
-        _logger.exception("the earlier job cannot be restored")
-        return None
-
-
 def main(arguments: list[str]) -> int:
     """Run the job of ``arguments = [folder, "1" or "0"]``; return the exit code.
 
@@ -232,15 +207,12 @@ def main(arguments: list[str]) -> int:
         # Nothing of the folder is touched, its log and status included.
         emit(error=refused.message, hint=refused.hint)
         return refused.exit_code
-    reporter = _Reporter(
-        folder,
-        JobStatus(
-            state="RUNNING",
-            pid=os.getpid(),
-            pid_started=process_start_ticks(os.getpid()),
-            place=host_and_pid_namespace(),
-        ),
-    )
+    pid = os.getpid()
+    begun = JobStatus(
+        state="RUNNING", pid=pid, pid_started=process_start_ticks(pid),
+        place=host_and_pid_namespace(),
+    )  # fmt: skip
+    reporter = _Reporter(folder, begun)
 
     def request_stop(_number: int, _frame: FrameType | None) -> None:
         reporter.stop_requested = True
@@ -280,7 +252,12 @@ def main(arguments: list[str]) -> int:
     result = str(folder.result) if folder.result.is_dir() else ""
     if state == "DONE":
         discard_rollback(folder)
-    earlier = _roll_back(folder) if state == "FAILED" and not can_resume else None
+    earlier = None
+    if state == "FAILED" and not can_resume:
+        try:
+            earlier = roll_back(folder)
+        except OSError:  # the failure is reported all the same
+            _logger.exception("the earlier job cannot be restored")
     finished = {"fraction": 1.0, "seconds_left": 0.0, "message": ""} if state == "DONE" else {}
     last = {**finished, "state": state, "phase": "", "result": result}
     if earlier is not None:

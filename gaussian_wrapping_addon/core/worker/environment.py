@@ -30,7 +30,6 @@ from ..files import read_json, write_json
 # with a venv, or with packages if the Python cannot create a venv, and ``ready.json``, without
 # which no job uses it. The marker names the folder in use; a set-up builds another one beside it.
 
-
 MARKER = "gaussian-wrapping-worker.json"
 READY = "ready.json"
 VENV = "venv"
@@ -119,9 +118,8 @@ def _read_object(path: Path, key: str, value: str | None = None) -> dict[str, An
         values = read_json(path, follow_links=True)
     except (OSError, ParseError):
         return {}
-    if not isinstance(values, dict) or key not in values:
-        return {}
-    return values if value is None or values[key] == value else {}
+    is_ours = isinstance(values, dict) and key in values and value in (None, values[key])
+    return values if is_ours else {}
 
 
 def interpreter_of(worker: str) -> tuple[str, str]:
@@ -182,11 +180,8 @@ def unregister_environment(root: Path) -> None:
 def known_environments() -> list[WorkerEnvironment]:
     """Return the environments that may exist, in order of preference."""
     registered = _read_object(user_data() / _POINTER, "root").get("root")
-    roots = [
-        installed_root(),
-        Path(registered) if isinstance(registered, str) else None,
-        default_root(),
-    ]
+    named = Path(registered) if isinstance(registered, str) else None
+    roots = [installed_root(), named, default_root()]
     return [WorkerEnvironment(root) for root in dict.fromkeys(roots) if root is not None]
 
 
@@ -197,7 +192,6 @@ def ready_worker() -> str:
 
 # -- The pinned packages of ``requirements-worker.txt``, and errors of a worker's Python ----------
 
-
 FILE_NAME = "requirements-worker.txt"
 HASHES_NAME = "requirements-worker-hashes.txt"
 """The same packages and what they need, by the hashes of their files; without torch."""
@@ -207,12 +201,9 @@ _COMPARE = {
     ">": operator.gt, "<": operator.lt,
 }  # fmt: skip
 NO_ROOM = (
-    "failed to map segment",
-    "annot allocate memory",
-    "cannot apply additional memory protection",
-    "cannot enable executable stack",
-    "paging file is too small",
-)
+    "failed to map segment", "annot allocate memory", "cannot apply additional memory protection",
+    "cannot enable executable stack", "paging file is too small",
+)  # fmt: skip
 """What the loaders of Linux, macOS and Windows say where a library finds no room in memory."""
 _LLVM = "llvmlite.binding"
 
@@ -240,10 +231,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 def requirements_file() -> Path:
     """Return the add-on's requirements file, in the installed package or in the repository.
 
-    Raises
-    ------
-    UsageError
-        The file is missing.
+    Raises UsageError: the file is missing.
     """
     for folder in (_PACKAGE_ROOT, _PACKAGE_ROOT.parent):
         if (folder / FILE_NAME).is_file():
@@ -260,10 +248,7 @@ def hashes_file(requirements: Path) -> Path | None:
 def read_requirements(path: Path) -> list[Requirement]:
     """Return the packages of a list; its syntax is left to pip.
 
-    Raises
-    ------
-    UsageError
-        The file cannot be read or names no package.
+    Raises UsageError: the file cannot be read or names no package.
     """
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
@@ -318,7 +303,6 @@ def not_started(python: str, error: OSError) -> WorkerError:
 # dependencies: what its packages need must be in ``requirements-worker.txt`` or among its
 # packages.
 
-
 EXTRA_HASHES_NAME = "requirements-worker-{}-hashes.txt"
 """Files of an extra by their hashes, written by ``tools.worker_hashes``."""
 
@@ -344,42 +328,37 @@ class Extra:
         return tuple(f"{p.name}{p.versions}" for p in self.packages)
 
 
+def _pinned(pins: str) -> tuple[Requirement, ...]:
+    named = (pin.partition("==") for pin in pins.split())
+    return tuple(Requirement(name, f"=={version}") for name, _, version in named)
+
+
 EXTRAS = (
     Extra(
-        "heif", (Requirement("pillow-heif", "==1.8.1"),), "pillow_heif",
+        "heif", _pinned("pillow-heif==1.8.1"), "pillow_heif",
         "HEIC Photos", "HEIC and HEIF photos of phones",
     ),
     Extra(
-        "raw", (Requirement("rawpy", "==0.28.0"),), "rawpy",
+        "raw", _pinned("rawpy==0.28.0"), "rawpy",
         "Camera RAW", "RAW photos of cameras (DNG, CR2, CR3, NEF, ARW, RAF, ORF, RW2 and others)",
     ),
     Extra(
-        "markers", (Requirement("opencv-python-headless", "==4.11.0.86"),), "cv2",
+        "markers", _pinned("opencv-python-headless==4.11.0.86"), "cv2",
         "Printed Markers", "printed markers in photos",
     ),
     Extra(
         "masks",
-        (
-            Requirement("flatbuffers", "==25.12.19"), Requirement("onnxruntime", "==1.27.0"),
-            Requirement("packaging", "==26.4"), Requirement("protobuf", "==6.33.5"),
-        ),
+        _pinned("flatbuffers==25.12.19 onnxruntime==1.27.0 packaging==26.4 protobuf==6.33.5"),
         "onnxruntime", "Mask Models", "segmentation models (ONNX)",
     ),
     Extra(
         "farm",
-        (
-            Requirement("cffi", "==2.1.1"), Requirement("click", "==8.5.1"),
-            Requirement("cloudpickle", "==3.1.3"), Requirement("cryptography", "==50.0.2"),
-            Requirement("dask", "==2026.8.0"), Requirement("dask-jobqueue", "==0.9.0"),
-            Requirement("distributed", "==2026.8.0"),
-            Requirement("importlib-metadata", "==8.9.0"), Requirement("locket", "==1.0.0"),
-            Requirement("msgpack", "==1.2.4"), Requirement("packaging", "==26.4"),
-            Requirement("partd", "==1.4.2"), Requirement("psutil", "==7.2.2"),
-            Requirement("pycparser", "==3.12"), Requirement("pyyaml", "==6.0.4"),
-            Requirement("sortedcontainers", "==2.4.0"), Requirement("tblib", "==3.2.2"),
-            Requirement("toolz", "==1.2.0"), Requirement("tornado", "==6.6.1"),
-            Requirement("urllib3", "==2.8.0"), Requirement("zict", "==3.0.0"),
-            Requirement("zipp", "==4.1.2"),
+        _pinned(
+            "cffi==2.1.1 click==8.5.1 cloudpickle==3.1.3 cryptography==50.0.2 dask==2026.8.0"
+            " dask-jobqueue==0.9.0 distributed==2026.8.0 importlib-metadata==8.9.0 locket==1.0.0"
+            " msgpack==1.2.4 packaging==26.4 partd==1.4.2 psutil==7.2.2 pycparser==3.12"
+            " pyyaml==6.0.4 sortedcontainers==2.4.0 tblib==3.2.2 toolz==1.2.0 tornado==6.6.1"
+            " urllib3==2.8.0 zict==3.0.0 zipp==4.1.2"
         ),
         "distributed", "Several Computers", "several processes or computers (Dask)",
     ),
@@ -389,14 +368,10 @@ EXTRAS = (
 def extra_named(name: str) -> Extra:
     """Return an extra by its name.
 
-    Raises
-    ------
-    UsageError
-        There is none of this name; lists those there are.
+    Raises UsageError: there is none of this name; lists those there are.
     """
-    for extra in EXTRAS:
-        if extra.name == name:
-            return extra
+    if found := [extra for extra in EXTRAS if extra.name == name]:
+        return found[0]
     known = ", ".join(extra.name for extra in EXTRAS)
     raise UsageError(f"There is no extra {name}.", f"Give one or several of: {known}.")
 
@@ -404,10 +379,7 @@ def extra_named(name: str) -> Extra:
 def read_extra_names(text: str) -> tuple[str, ...]:
     """Return the names in a list such as ``heif,raw``, each once, in the order of the table.
 
-    Raises
-    ------
-    UsageError
-        A name is unknown.
+    Raises UsageError: a name is unknown.
     """
     given = {extra_named(word.strip()).name for word in text.split(",") if word.strip()}
     return tuple(extra.name for extra in EXTRAS if extra.name in given)
@@ -426,19 +398,9 @@ def extra_hashes_file(requirements: Path, extra: Extra) -> Path | None:
 
 
 def load_extra(name: str, needed_by: str) -> Any:
-    """Import the module of an extra.
+    """Import the module of an extra; ``needed_by``: what needs it, such as the names of files.
 
-    Parameters
-    ----------
-    name : str
-        Of the extra.
-    needed_by : str
-        What needs it, such as the names of files.
-
-    Raises
-    ------
-    MissingExtraError
-        It is not installed, in another version, or broken; says how to install it.
+    Raises MissingExtraError: it is missing, of another version, or broken; says how to install it.
     """
     extra = extra_named(name)
     try:
@@ -460,18 +422,7 @@ def load_extra(name: str, needed_by: str) -> Any:
 
 
 def load_extras(needed_by: Mapping[str, str]) -> None:
-    """Import several extras; see :func:`load_extra`.
-
-    Parameters
-    ----------
-    needed_by : mapping
-        What needs each of the extras.
-
-    Raises
-    ------
-    MissingExtraError
-        Names all that are missing.
-    """
+    """Import several extras, by what needs each. Raises MissingExtraError: names all missing."""
     missing: list[MissingExtraError] = []
     for name, files in needed_by.items():
         try:

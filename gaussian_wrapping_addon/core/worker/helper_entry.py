@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import signal
-import sys
 import threading
 import time
 from pathlib import Path
@@ -14,7 +12,7 @@ from pathlib import Path
 from ..errors import WrapError
 from .environment import package_error
 from .helper_process import FAILURES, emit, limit_address_space, own_peak_bytes
-from .spawn import Caller
+from .spawn import Caller, end_with_parent
 
 _PARENT_POLL_S = 1.0
 
@@ -25,7 +23,7 @@ def main(arguments: list[str]) -> int:
     if memory_bytes:
         limit_address_space(memory_bytes)
     caller = Caller()
-    _request_parent_death_signal()
+    end_with_parent()  # while a native call holds the GIL, no thread of ours can poll
     threading.Thread(target=_exit_with_caller, args=(caller,), daemon=True).start()
     try:
         package = __name__.rpartition(".worker.")[0]
@@ -47,17 +45,6 @@ def _tell(error: WrapError) -> int:
     kind = next((name for name in names if name in FAILURES), "")
     emit(error=error.message, hint=error.hint, kind=kind)
     return error.exit_code
-
-
-def _request_parent_death_signal() -> None:
-    """Let Linux kill this process with the thread that started it: while a native call holds the
-    GIL, no thread of ours can poll."""
-    if not sys.platform.startswith("linux"):
-        return
-    import ctypes
-
-    set_parent_death_signal = 1  # PR_SET_PDEATHSIG of prctl(2)
-    ctypes.CDLL(None).prctl(set_parent_death_signal, int(signal.SIGKILL), 0, 0, 0)
 
 
 def _exit_with_caller(caller: Caller) -> None:

@@ -27,12 +27,11 @@ from ..errors import (
     WorkerError,
     WrapError,
 )
-from ..progress import Progress
+from ..progress import Progress, ProgressEvent
 from .environment import NO_ROOM, PACKAGES_OPTION, interpreter_of
 from .spawn import caller_option, kill_group, spawn
 
 # -- Peak memory of this process and of its helper processes --------------------------------------
-
 
 _largest_helper_bytes = 0
 
@@ -66,8 +65,7 @@ def peak_memory_bytes() -> dict[str, int]:
     return {"worker": own_bytes, "largest_helper": largest_helper_bytes()} if own_bytes else {}
 
 
-def record_helper_peak(peak_bytes: int) -> None:
-    """Record the peak reported by a helper process if it is the largest so far."""
+def _record_helper_peak(peak_bytes: int) -> None:
     global _largest_helper_bytes
     _largest_helper_bytes = max(_largest_helper_bytes, peak_bytes)
 
@@ -86,10 +84,9 @@ def limit_address_space(most_bytes: int) -> None:
         return
     import resource
 
-    limits = resource.getrlimit(resource.RLIMIT_AS)
     lowered = [
         most_bytes if limit == resource.RLIM_INFINITY else min(limit, most_bytes)
-        for limit in limits
+        for limit in resource.getrlimit(resource.RLIMIT_AS)
     ]
     resource.setrlimit(resource.RLIMIT_AS, (lowered[0], lowered[1]))
 
@@ -111,7 +108,6 @@ def is_limited_below(wanted_bytes: int) -> bool:
 # "message": "..."}``. A typed failure is ``{"error": "...", "hint": "...", "kind":
 # "DatasetError"}``. The last line of every helper that exits normally is ``{"peak_bytes": ...}``,
 # its peak memory.
-
 
 _logger = logging.getLogger(__name__)
 
@@ -138,11 +134,8 @@ _MAX_SAID = 300
 def child_command(module: str, *arguments: str, python: str | None = None) -> list[str]:
     """Return the argument list that runs ``core.<module>`` in a child interpreter.
 
-    Parameters
-    ----------
-    python : str or None
-        An interpreter, or the folder of a worker environment; None for the running interpreter
-        with its packages.
+    ``python``: an interpreter, or the folder of a worker environment; None for the running
+    interpreter with its packages.
     """
     entry = Path(__file__).with_name("worker_main.py")
     if python:
@@ -160,6 +153,31 @@ def emit(**values: Any) -> None:
     sys.stdout.flush()
 
 
+def emit_progress(event: ProgressEvent) -> None:
+    """Write how far a command is as such a line."""
+    emit(fraction=event.fraction, message=event.message)
+
+
+def json_object(line: str | bytes) -> dict[str, Any] | None:
+    """Return what a line of that protocol holds; ``None`` where it is no JSON object."""
+    try:
+        values = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return values if isinstance(values, dict) else None
+
+
+def last_line(text: str | bytes) -> str:
+    """Return the last line of a child's output, or words where it has none."""
+    text = text if isinstance(text, str) else text.decode(errors="replace")
+    return (text.strip().splitlines() or ["no output"])[-1]
+
+
+def ending_of(code: int) -> str:
+    """Return how a child has ended, from its exit code: a verb and what follows."""
+    return f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
+
+
 def kill_helpers() -> None:
     """Kill all running helpers; for a process about to exit without unwinding the stack."""
     for process in list(_running):
@@ -171,28 +189,16 @@ def kill_helpers() -> None:
 
 
 def run_helper(
-    module: str,
-    folder: Path,
-    progress: Progress,
-    *,
-    deadline_s: float = limits.HELPER_DEADLINE_S,
+    module: str, folder: Path, progress: Progress, *, deadline_s: float = limits.HELPER_DEADLINE_S,
     memory_bytes: int | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Run ``core.<module>`` on ``folder`` and wait for it, forwarding its progress.
 
-    Raises
-    ------
-    Cancelled
-        The user asked to stop; the helper has been ended.
-    DatasetError, MeshingError, UsageError
-        The helper reported such a failure.
-    ResourceError
-        The helper reported one, or the deadline passed.
-    MemoryShortageError
-        The system gave the helper too little memory.
-    WorkerError
-        The helper crashed, or reached ``memory_bytes``: the message names the signal and its last
-        line, the log has the end of its output. Or the worker's Python lacks a package.
+    Raises Cancelled: the helper has been ended; DatasetError, MeshingError, UsageError,
+    ResourceError: as it reported; ResourceError: the deadline passed; MemoryShortageError: the
+    system gave it too little memory; WorkerError: it crashed, reached ``memory_bytes``, or a
+    package is missing: the message names the signal and its last line, the log has the end of its
+    output.
     """
     command = child_command("worker.helper_entry", module, str(folder), str(memory_bytes or 0))
     process = spawn(command)
@@ -220,14 +226,14 @@ def run_helper(
                 source, line = lines.get(timeout=_POLL_S)
             except queue.Empty:
                 continue
-            values = _parse(line) if source == "out" else None
+            values = json_object(line) if source == "out" else None
             if values is None:
                 output_tail = [*output_tail, line.rstrip()][-_OUTPUT_TAIL_LINES:]
                 _logger.debug("%s: %s", module, line.rstrip())
             elif "error" in values:
                 failure = values
             elif "peak_bytes" in values:
-                record_helper_peak(int(values["peak_bytes"]))
+                _record_helper_peak(int(values["peak_bytes"]))
             else:
                 progress.update(float(values.get("fraction", 0.0)), str(values.get("message", "")))
     finally:
@@ -240,13 +246,12 @@ def run_helper(
         kind = FAILURES.get(str(failure.get("kind")), WorkerError)
         raise kind(str(failure["error"]), str(failure.get("hint", "")))
     if code != 0:
-        reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
         for line in output_tail:
             _logger.error("%s: %s", module, line)
         last = f": {output_tail[-1][:_MAX_SAID]}" if output_tail else "."
         if _is_short_of_memory(code, output_tail, memory_bytes):
-            raise MemoryShortageError(f"{module} {reason}{last}", _MEMORY_HINT)
-        raise WorkerError(f"{module} {reason}{last}", "See the log.")
+            raise MemoryShortageError(f"{module} {ending_of(code)}{last}", _MEMORY_HINT)
+        raise WorkerError(f"{module} {ending_of(code)}{last}", "See the log.")
 
 
 def _is_short_of_memory(code: int, output: Sequence[str], memory_bytes: int | None) -> bool:
@@ -265,11 +270,3 @@ def _is_short_of_memory(code: int, output: Sequence[str], memory_bytes: int | No
 def _drain(stream: IO[bytes], name: str, lines: queue.Queue[tuple[str, str]]) -> None:
     for raw in stream:
         lines.put((name, raw.decode(errors="replace")))
-
-
-def _parse(line: str) -> dict[str, Any] | None:
-    try:
-        values = json.loads(line)
-    except ValueError:
-        return None
-    return values if isinstance(values, dict) else None

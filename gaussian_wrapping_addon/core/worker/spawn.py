@@ -17,7 +17,6 @@ from typing import IO, Any
 
 # -- Start child processes in groups of their own and end them with their descendants -------------
 
-
 _THREADING = {
     # Idle OpenMP threads of torch wait instead of spinning: spinning threads occupy the cores that
     # our own threads compute on (measured: rendering took twice the processor time).
@@ -50,59 +49,25 @@ def group_options() -> dict[str, Any]:
 
 
 def spawn(
-    command: list[str],
-    *,
-    stdin: int | IO[Any] | None = subprocess.DEVNULL,
-    stdout: int | IO[Any] | None = subprocess.PIPE,
-    stderr: int | IO[Any] | None = subprocess.PIPE,
-    environment: dict[str, str] | None = None,
-    folder: Path | None = None,
-) -> subprocess.Popen[bytes]:
-    """Start a child in a new process group; it inherits no open files.
+    command: list[str], *, stdin: int | IO[Any] | None = subprocess.DEVNULL,
+    stdout: int | IO[Any] | None = subprocess.PIPE, stderr: int | IO[Any] | None = subprocess.PIPE,
+    environment: dict[str, str] | None = None, folder: Path | None = None,
+) -> subprocess.Popen[bytes]:  # fmt: skip
+    """Start a child in a new process group; it inherits no open files. Raises OSError.
 
-    Parameters
-    ----------
-    command : list of str
-        Program and arguments, without a shell. Our own Python is started isolated (``-I``).
-    stdin, stdout, stderr : int or file
-        As in ``subprocess``; by default a child has no input.
-    environment : dict, optional
-        Default: :func:`child_environment`.
-    folder : Path, optional
-        Working directory; default: the parent's.
-
-    Raises
-    ------
-    OSError
-        The program does not start.
+    ``command``: without a shell; our own Python is started isolated (``-I``). By default a child
+    has no input, and :func:`child_environment`.
     """
     return subprocess.Popen(
-        command,
-        stdin=stdin,
-        stdout=stdout,
-        stderr=stderr,
-        close_fds=True,
-        cwd=folder,
-        env=child_environment() if environment is None else environment,
-        **group_options(),
-    )
+        command, stdin=stdin, stdout=stdout, stderr=stderr, cwd=folder,
+        env=child_environment() if environment is None else environment, **group_options(),
+    )  # fmt: skip
 
 
 def run_to_end(command: list[str], deadline_s: float) -> tuple[int, str, str]:
-    """Start a child and wait for it; return its exit code and output.
+    """Start a child and wait for it; return its exit code, and the text of stdout and stderr.
 
-    Returns
-    -------
-    code : int
-    output, error_output : str
-        Text of stdout and stderr.
-
-    Raises
-    ------
-    OSError
-        The program does not start.
-    subprocess.TimeoutExpired
-        The deadline passed; the child has been ended.
+    Raises OSError: it does not start; subprocess.TimeoutExpired: the deadline passed, it was ended.
     """
     process = spawn(command)
     try:
@@ -111,10 +76,8 @@ def run_to_end(command: list[str], deadline_s: float) -> tuple[int, str, str]:
         kill_group(process)
         raise
     return (
-        process.returncode,
-        output.decode(errors="replace"),
-        error_output.decode(errors="replace"),
-    )
+        process.returncode, output.decode(errors="replace"), error_output.decode(errors="replace"),
+    )  # fmt: skip
 
 
 def kill_group(process: subprocess.Popen[Any], grace_s: float = 2.0) -> None:
@@ -135,7 +98,6 @@ def kill_group(process: subprocess.Popen[Any], grace_s: float = 2.0) -> None:
 #
 # glog, in pycolmap, catches SIGTERM when it is imported: the process then dies with a native
 # trace instead of the typed end that its own handler would bring.
-
 
 _UNKNOWN = ctypes.c_void_p(-1).value
 """What C returns for a signal without handlers: SIG_ERR."""
@@ -165,7 +127,6 @@ def kept_signal_handlers() -> Iterator[None]:
 #
 # A pid alone is used again. A parent alone says nothing to a child that starts when its caller is
 # dead already: it has another parent from the start. So each child is told who called it.
-
 
 CALLER_OPTION = "gwrap_caller"
 """``-X`` option of children: pid and start time of the process that started them."""
@@ -241,8 +202,6 @@ def _linux_stat(pid: int) -> list[str]:
 
 
 def _alive_windows(pid: int) -> bool:
-    import ctypes
-
     query_limited_information, still_active = 0x1000, 259
     kernel32 = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
     handle = kernel32.OpenProcess(query_limited_information, False, pid)
@@ -285,7 +244,6 @@ class Caller:
 # Elsewhere, and as well, a child looks after its caller (:mod:`.spawn`): that needs
 # the interpreter, which long native calls may hold.
 
-
 _SET_PARENT_DEATH_SIGNAL = 1
 """``PR_SET_PDEATHSIG`` of prctl(2). The signal comes when the thread that started this process
 ends: it must wait for it."""
@@ -295,8 +253,6 @@ def end_with_parent() -> None:
     """Have this process killed when the thread that started it ends."""
     if not sys.platform.startswith("linux"):
         return
-    import ctypes
-
     parent = os.getppid()
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)

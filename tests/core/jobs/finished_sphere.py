@@ -46,7 +46,7 @@ def write_finished_sphere(root: Path) -> JobFolder:
         STAGE_VERSIONS["cameras"], job.source, source_fingerprint(images), settings.seed
     )
     cameras = folder.stages / f"cameras-{key}"
-    training = folder.stages / (f"train-{training_keys(STAGE_VERSIONS['train'], key, job)[0]}")
+    training = folder.stages / (f"train-{training_keys(key, job)[0]}")
     for number, stage in enumerate((cameras, training)):
         stage.mkdir()
         done = {"finished_unix_s": 1.0 + number, "seconds": 1.0, "held_out": [], "warnings": []}

@@ -50,7 +50,7 @@ def folder(tmp_path: Path, job: JobFile) -> JobFolder:
     finish(folder, f"cameras-{key}", 1.0)
     scene = Scene((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), Similarity())
     save_scene(scene, folder.stages / f"cameras-{key}")
-    finish(folder, f"train-{training_keys(STAGE_VERSIONS['train'], key, job)[0]}", 2.0)
+    finish(folder, f"train-{training_keys(key, job)[0]}", 2.0)
     return folder
 
 
@@ -109,6 +109,6 @@ def test_cameras_without_a_finished_training_are_not_taken(folder: JobFolder, jo
 
 def test_the_newest_training_counts(folder: JobFolder, job: JobFile) -> None:
     finish(folder, "cameras-other", 3.0)
-    finish(folder, f"train-{training_keys(STAGE_VERSIONS['train'], 'other', job)[0]}", 4.0)
+    finish(folder, f"train-{training_keys('other', job)[0]}", 4.0)
     os.utime(Path(job.source) / "a.jpg", (1, 1))
     assert cameras_of(folder, replace(job, command="mesh")).key == "other"

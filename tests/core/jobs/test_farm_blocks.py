@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
-from gaussian_wrapping_addon.core.jobs.parts.graph import read_parts
+from gaussian_wrapping_addon.core.jobs.parts.graph import done_state, read_parts
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from tests.core.jobs import farm_jobs
@@ -61,14 +61,14 @@ def test_one_process_walks_all_blocks(alone: JobFolder) -> None:
 def test_the_coarse_training_is_not_done_without_its_plan(alone: JobFolder) -> None:
     """Who deletes a damaged plan, as is advised, has it made again by any engine."""
     state, plan = states(alone)["coarse"], read_parts(alone.root).plan
-    assert state.done_in(alone.root, plan)
+    assert done_state(alone.root, "coarse", plan) == state
     files = [alone.root / output for output in state.outputs if output.count("/") == 2]
     files = [path for path in files if path.is_file()]
     assert sorted(path.name for path in files) == ["blocks.json", "blocks.npz"]
     for path in files:
         aside = path.with_name("aside")
         path.rename(aside)
-        assert not state.done_in(alone.root, plan)
+        assert done_state(alone.root, "coarse", plan) is None
         aside.rename(path)
 
 

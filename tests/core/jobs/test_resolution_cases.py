@@ -74,7 +74,7 @@ def test_impossible_lengths_are_refused_before_the_training(
     settings = replace(earlier.settings, regions=regions)
     request = "auto" if region == "auto" else str(box)
     job = make_job("wrap", Path(earlier.source), settings, {request: 1e-8})
-    monkeypatch.setattr(part_runner, "run_training", train)
+    monkeypatch.setattr(part_runner.TrainingStages, "run", train)
     with pytest.raises(ResourceError, match="too many"):
         runner.run_job(folder, job, lambda _: None, lambda: False)
 

@@ -6,56 +6,32 @@ The child writes one JSON object to stdout: ``{"device"}``, or ``{"error", "hint
 
 from __future__ import annotations
 
-import json
-import subprocess
-from typing import Any
-
 from ...devices import choose_device, reject_absent_gpu
 from ...errors import DeviceError, WorkerError, WrapError
-from ...worker.environment import not_started
 from ...worker.helper_process import child_command, emit
-from ...worker.spawn import run_to_end
 from ..client import worker_python
-
-CHECK_DEADLINE_S = 120.0
+from .doctor import answers_of
 
 
 def require_device(setting: str) -> None:
     """Raise where a setting names a GPU that this machine or the worker's Python cannot use.
 
     The driver is asked first, at once and without a process. Other settings are not looked at.
-
-    Raises
-    ------
-    DeviceError
-        Says why.
-    WorkerError
-        The worker's Python does not start, or does not answer.
+    Raises DeviceError: says why; WorkerError: the worker's Python does not answer.
     """
     if not setting.startswith("cuda"):
         return
     reject_absent_gpu(setting)
     python = worker_python()
-    try:
-        command = child_command("jobs.commands.device_check", setting, python=python)
-        _, output, error_output = run_to_end(command, CHECK_DEADLINE_S)
-    except OSError as error:
-        raise not_started(python, error) from None
-    except subprocess.TimeoutExpired:
-        raise WorkerError(f"{python} does not answer.", "Run batch.py doctor.") from None
-    for line in reversed(output.splitlines()):
-        try:
-            values: Any = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(values, dict) and "error" in values:
+    command = child_command("jobs.commands.device_check", setting, python=python)
+    answers, said = answers_of(command, python, "Run batch.py doctor.")
+    for values in reversed(answers):
+        if "error" in values:
             raise DeviceError(str(values["error"]), str(values.get("hint", "")))
-        if isinstance(values, dict) and "device" in values:
+        if "device" in values:
             return
-    error_lines = error_output.strip().splitlines()
     raise WorkerError(
-        f"The check of the device {setting} ended without a result: "
-        f"{error_lines[-1] if error_lines else 'no output'}.",
+        f"The check of the device {setting} ended without a result: {said}.",
         "Run batch.py doctor to check the worker's Python.",
     )
 

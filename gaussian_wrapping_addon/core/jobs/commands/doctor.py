@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import importlib.metadata
-import json
 import platform
 import shutil
 import subprocess
@@ -17,13 +16,13 @@ from typing import Any
 from ...errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError, WrapError
 from ...machine import total_memory_bytes
 from ...worker.environment import EXTRAS, not_started, read_requirements, requirements_file
-from ...worker.helper_process import child_command, emit
+from ...worker.helper_process import child_command, emit, json_object, last_line
 from ...worker.spawn import run_to_end
 
 MIN_PYTHON = (3, 11)
 MIN_MEMORY_BYTES = 4 * 2**30
 MIN_DISK_BYTES = 2 * 2**30
-DOCTOR_DEADLINE_S = 120.0
+DEADLINE_S = 120.0
 
 REQUIRED = {
     "numpy": "numpy", "torch": "torch", "numba": "numba", "scipy": "scipy", "shull": "shull",
@@ -44,28 +43,14 @@ class Diagnosis:
 
 def diagnose(folder: str = ".") -> list[Diagnosis]:
     """Diagnose the running interpreter."""
-    found = [
-        Diagnosis(
-            "Python",
-            sys.version_info[:2] >= MIN_PYTHON,
-            f"{platform.python_version()} at {sys.executable}",
-            "Use Python 3.11 or newer.",
-        )
-    ]
-    found += _packages()
-    found += _extras()
-    found += _devices()
-    found.append(_memory())
+    good, python = sys.version_info[:2] >= MIN_PYTHON, platform.python_version()
     free_bytes = shutil.disk_usage(folder).free
-    found.append(
-        Diagnosis(
-            "Disk",
-            free_bytes > MIN_DISK_BYTES,
-            f"{free_bytes / 2**30:.1f} GiB free",
-            "Free at least 2 GiB.",
-        )
-    )
-    return found
+    free = f"{free_bytes / 2**30:.1f} GiB free"
+    return [
+        Diagnosis("Python", good, f"{python} at {sys.executable}", "Use Python 3.11 or newer."),
+        *_packages(), *_extras(), *_devices(), _memory(),
+        Diagnosis("Disk", free_bytes > MIN_DISK_BYTES, free, "Free at least 2 GiB."),
+    ]  # fmt: skip
 
 
 def _packages() -> list[Diagnosis]:
@@ -133,12 +118,8 @@ def _memory() -> Diagnosis:
     total_bytes = total_memory_bytes()
     if not total_bytes:
         return Diagnosis("Memory", True, "unknown")
-    return Diagnosis(
-        "Memory",
-        total_bytes >= MIN_MEMORY_BYTES,
-        f"{total_bytes / 2**30:.1f} GiB",
-        "At least 4 GiB are needed.",
-    )
+    found, good = f"{total_bytes / 2**30:.1f} GiB", total_bytes >= MIN_MEMORY_BYTES
+    return Diagnosis("Memory", good, found, "At least 4 GiB are needed.")
 
 
 def main(arguments: list[str]) -> int:
@@ -149,37 +130,37 @@ def main(arguments: list[str]) -> int:
     return EXIT_DONE if all(f.good for f in findings) else EXIT_BAD_DATA
 
 
-def diagnose_worker(python: str) -> list[Diagnosis]:
-    """Diagnose another interpreter, in a child process.
+def answers_of(command: list[str], python: str, hint: str) -> tuple[list[dict[str, Any]], str]:
+    """Return the JSON objects that a child of the worker's Python writes, and its last error line.
 
-    Raises
-    ------
-    WorkerError
-        The interpreter does not start or reports nothing.
+    Raises WorkerError: it does not start or, with the hint, does not end in time.
     """
     try:
-        command = child_command("jobs.commands.doctor", python=python)
-        _, output, error_output = run_to_end(command, DOCTOR_DEADLINE_S)
+        _, output, error_output = run_to_end(command, DEADLINE_S)
     except OSError as error:
         raise not_started(python, error) from None
     except subprocess.TimeoutExpired:
-        raise WorkerError(
-            f"{python} does not answer.", "Press Set Up Worker, or choose another Python."
-        ) from None
+        raise WorkerError(f"{python} does not answer.", hint) from None
+    answers = [values for line in output.splitlines() if (values := json_object(line))]
+    return answers, last_line(error_output)
+
+
+def diagnose_worker(python: str) -> list[Diagnosis]:
+    """Diagnose another interpreter, in a child process.
+
+    Raises WorkerError: the interpreter does not start or reports nothing.
+    """
+    hint = "Press Set Up Worker, or choose another Python."
+    answers, said = answers_of(child_command("jobs.commands.doctor", python=python), python, hint)
     findings: list[Diagnosis] = []
-    for line in output.splitlines():
-        try:
-            values: Any = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(values, dict) and "error" in values:
+    for values in answers:
+        if "error" in values:
             raise WorkerError(str(values["error"]), str(values.get("hint", "")))
         with contextlib.suppress(TypeError):
             findings.append(Diagnosis(**values))
     if not findings:
-        error_lines = error_output.strip().splitlines()
         raise WorkerError(
-            f"{python} reported nothing: {error_lines[-1] if error_lines else 'no output'}.",
+            f"{python} reported nothing: {said}.",
             "Press Set Up Worker, or choose a Python 3.11 or newer with the worker's packages.",
         )
     return findings

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ``estimate`` command in the worker's Python: time, memory and disk of a training.
-
-Writes one JSON object per line to stdout, in the protocol of :mod:`~.run_in_worker`.
-"""
+"""The ``estimate`` command in the worker's Python: time, memory and disk of a training."""
 
 from __future__ import annotations
 
@@ -29,15 +26,7 @@ def main(arguments: list[str]) -> int:
 
 def _estimate(job: JobFile) -> list[str | ReportWarning]:
     from ...parallel import default_threads
-    from ...training.estimate import (
-        MESH_AND_TEXTURE_SHARE,
-        block_estimates,
-        check_resources,
-        estimate_training,
-        renderer_is_compiled,
-        speeds,
-        this_machine,
-    )
+    from ...training import estimate
     from ...training.splat_start import wrapping_settings
     from ..stages.cameras import start_splat_of
 
@@ -47,10 +36,10 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
     if start_splat_of(job) is not None:
         training = wrapping_settings(training)
     threads = job.settings.threads or default_threads()
-    timed = device.is_cuda or renderer_is_compiled()
-    machine = this_machine(Path.cwd(), *speeds(threads, device.device))
-    expected = estimate_training(facts, training, machine)
-    low, high = MESH_AND_TEXTURE_SHARE
+    timed = device.is_cuda or estimate.renderer_is_compiled()
+    machine = estimate.this_machine(Path.cwd(), *estimate.speeds(threads, device.device))
+    expected = estimate.estimate_training(facts, training, machine)
+    low, high = estimate.MESH_AND_TEXTURE_SHARE
     points = f"{facts.points} sparse points" if facts.points else "camera poses still to be solved"
     where = device.card if device.is_cuda else f"{threads} threads"
     lines = [
@@ -64,7 +53,7 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
     ]
     if training.blocks > 1:
         names = ("coarse training", "one block", "joining")
-        parts = block_estimates(facts, training, machine)
+        parts = estimate.block_estimates(facts, training, machine)
         told = [
             f"{name} {part.span()}, {part.memory_bytes / 2**30:.1f} GB"
             for name, part in zip(names, parts, strict=True)
@@ -74,22 +63,14 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
         lines.append("solving the cameras: minutes before")
     if not timed:
         lines.append("not timed here: the first job compiles the renderer, about a minute, once")
-    return [*lines, *check_resources(expected, machine)]
+    return [*lines, *estimate.check_resources(expected, machine)]
 
 
 def input_facts(source: Path, settings: JobSettings | None = None) -> SceneFacts:
     """Return number and size of an input's photos and points, from headers and poses alone.
 
-    Parameters
-    ----------
-    source : Path
-    settings : JobSettings, optional
-        Of a video, they may say how many frames are used; else the most is assumed.
-
-    Raises
-    ------
-    DatasetError
-        The input holds no photo that can be read.
+    ``settings``: of a video, they may say how many frames are used; else the most is assumed.
+    Raises DatasetError: the input holds no photo that can be read.
     """
     from ...loading.other_inputs import FAR_VIEWS, NEAR_VIEWS, PHOTO_SIDE_PX, takes_for_panoramas
     from ...loading.source_kind import SPLAT, VIDEO, read_poses, source_kind
@@ -108,8 +89,7 @@ def input_facts(source: Path, settings: JobSettings | None = None) -> SceneFacts
         return SceneFacts(views, float(PHOTO_SIDE_PX**2), PHOTO_SIDE_PX, points)
     if kind.kind == VIDEO and kind.video is not None:
         return _video_facts(kind.video, settings or JobSettings())
-    points = 0
-    panoramas = False
+    points, panoramas = 0, False
     if kind.kind == "photos":
         root = photo_root(kind.folder)
         named = {p.relative_to(root).as_posix(): p for p in list_photos(root)}

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ``estimate-mesh`` command in the worker's Python: triangles, time and memory of a mesh.
-
-Needs a finished training. Writes one JSON object per line to stdout, in the protocol of
-:mod:`~.run_in_worker`.
-"""
+"""The ``estimate-mesh`` command: triangles, time and memory of a finished training's mesh."""
 
 from __future__ import annotations
 
@@ -17,7 +13,13 @@ from ...parallel import default_threads
 from ...progress import Progress, ReportWarning
 from ...settings import MeshingSettings, from_json
 from ..stages.cameras import scene_stage_name
-from ..stages.meshing import estimate_region_mesh, estimate_region_pivots, field_views, free_bytes
+from ..stages.meshing import (
+    estimate_region_mesh,
+    estimate_region_pivots,
+    field_views,
+    free_bytes,
+    requested_region,
+)
 from ..store.job_file import read_job
 from ..store.job_folder import JobFolder
 from ..store.rollback import finished_job, no_finished_training
@@ -49,13 +51,7 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     from ...gaussians.files import load_gaussians
     from ...meshing.spacing import checked_request
     from ...photos.store import PhotoStore
-    from ...regions.scene_regions import (
-        automatic_region,
-        on_scene_grid,
-        read_region,
-        region_in_scene,
-        whole_region,
-    )
+    from ...regions.files import parse_region_file, read_region_body
     from ...scene.frames import snapped_length
     from ...scene.scene import load_refined_scene
 
@@ -65,19 +61,16 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     folder.check_entries()
     meshing = from_json(MeshingSettings, request["meshing"], "meshing")
     threads = int(request["threads"]) or default_threads()
-    if request["region"] not in AUTOMATIC_REGIONS:
-        world_region = read_region(Path(request["region"]))
+    wanted, body = request["region"], None
+    if wanted not in AUTOMATIC_REGIONS:
+        body = read_region_body(Path(wanted))
+        parse_region_file(body, Path(wanted))  # raises before anything is loaded
     trained = _newest_stage(folder.stages, "train")
     scene_stage = _newest_stage(folder.stages, scene_stage_name(finished_job(folder)))
     scene = load_refined_scene(scene_stage, trained)
     gaussians = load_gaussians(trained / "gaussians.npz")
     arrays = gaussians.arrays()
-    if request["region"] not in AUTOMATIC_REGIONS:
-        region = region_in_scene(world_region, scene.world_from_scene)
-    else:
-        automatic = request["region"] == "auto"
-        region = automatic_region(scene) if automatic else whole_region(scene, arrays)
-        region = on_scene_grid(region)
+    region, _ = requested_region(wanted, body, scene, arrays)
     training = read_job(folder.job_path).settings.training
     photos = PhotoStore(scene, training.max_image_px)
     views = field_views(scene, photos, training.holdout_every, meshing.cameras)
@@ -100,7 +93,7 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
         by_pivots = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
         by_pivots.refuse(memory_bytes)
         return [*by_pivots.lines()]
-    expected = estimate_region_mesh(vacancy, cameras, region, meshing, edge_length, depth_samples)
+    expected = estimate_region_mesh(vacancy, region, meshing, edge_length, depth_samples)
     tiled = meshing.tiles != "off" and (meshing.tiles != "auto" or expected.tiles_for(memory_bytes))
     expected.refuse(memory_bytes, tiled=tiled)
     mode = "it would be meshed in tiles" if tiled else "it would be meshed whole"

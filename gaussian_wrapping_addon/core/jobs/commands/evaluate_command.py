@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ...errors import DatasetError, ParseError, UsageError, unwritable_error
 from ...files import read_json, write_json
 from ...names import JOB_MARKER
-from ...worker.helper_process import emit
+from ...worker.helper_process import emit_progress
 from ..store.job_folder import JobFolder
 from .run_in_worker import run_command
 
@@ -62,7 +62,7 @@ def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     from ...evaluation.layouts import read_mesh
     from ...machine import describe_machine
     from ...parallel import default_threads
-    from ...progress import Progress, ProgressEvent
+    from ...progress import Progress
     from ...worker.helper_process import peak_memory_bytes
 
     begun_s, begun_unix_s = time.monotonic(), time.time()
@@ -79,21 +79,14 @@ def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
             )
         path = source
 
-    def report_progress(event: ProgressEvent) -> None:
-        emit(fraction=event.fraction, message=event.message)
-
-    progress = Progress("evaluate", report_progress)
+    progress = Progress("evaluate", emit_progress)
     measure = _against_photos if given["metric"] == "mbr" else _against_truth
     mesh, result, lines = measure(given, source, lambda: read_mesh(path), threads, progress)
     report = {
-        "version": 1,
-        "started_unix_s": begun_unix_s,
-        "seconds": time.monotonic() - begun_s,
+        "version": 1, "started_unix_s": begun_unix_s, "seconds": time.monotonic() - begun_s,
         "mesh": {"path": str(path.resolve()), "vertices": len(mesh[0]), "faces": len(mesh[1])},
-        **result,
-        "machine": describe_machine(threads),
-        "peak_memory_bytes": peak_memory_bytes(),
-    }
+        **result, "machine": describe_machine(threads), "peak_memory_bytes": peak_memory_bytes(),
+    }  # fmt: skip
     return report, [f"{path.name}: {len(mesh[0])} vertices, {len(mesh[1])} faces", *lines]
 
 
@@ -139,11 +132,7 @@ _Mesh = tuple[Any, Any]
 
 
 def _against_truth(
-    given: dict[str, Any],
-    source: Path,
-    read: Callable[[], _Mesh],
-    threads: int,
-    progress: Progress,
+    given: dict[str, Any], source: Path, read: Callable[[], _Mesh], threads: int, progress: Progress
 ) -> tuple[_Mesh, dict[str, Any], list[str]]:
     """Return the mesh, its figures against the ground truth, and their table."""
     from ...evaluation.command import EvaluationRequest, evaluate_mesh, read_cameras, table
@@ -175,11 +164,7 @@ def _against_truth(
 
 
 def _against_photos(
-    given: dict[str, Any],
-    source: Path,
-    read: Callable[[], _Mesh],
-    threads: int,
-    progress: Progress,
+    given: dict[str, Any], source: Path, read: Callable[[], _Mesh], threads: int, progress: Progress
 ) -> tuple[_Mesh, dict[str, Any], list[str]]:
     """Return the mesh, its mesh-based rendering, and the figures as lines."""
     from .mesh_based_command import MeshBasedRequest, evaluate_mesh_based, table
@@ -197,12 +182,8 @@ def _against_photos(
 def job_mesh(folder: Path, region: str | None) -> Path:
     """Return the world-frame mesh of a job's region.
 
-    Raises
-    ------
-    UsageError
-        The folder is not a job; it has several regions and none was named, or not the one named.
-    DatasetError
-        The job has no results.
+    Raises UsageError: this is no job, or it has no such region, or several; DatasetError: no
+    results.
     """
     if not (folder / JOB_MARKER).exists():
         raise UsageError(
@@ -227,12 +208,7 @@ def job_mesh(folder: Path, region: str | None) -> Path:
 def job_cameras(folder: Path) -> list[Camera]:
     """Return the cameras of a job's ``result/scene.json``, in world coordinates.
 
-    Raises
-    ------
-    DatasetError
-        The job has no results yet.
-    ParseError
-        The file is not in the format that jobs write.
+    Raises DatasetError: the job has no results yet; ParseError: the file is not as jobs write it.
     """
     from ...scene.camera import Camera, Similarity
 
@@ -243,12 +219,8 @@ def job_cameras(folder: Path) -> list[Camera]:
     values = read_json(path)
     try:
         world_from_scene = Similarity.from_json(values["world_from_scene"])
-        return [
-            Camera.from_json({k: v for k, v in entry.items() if k != "photo"}).moved(
-                world_from_scene
-            )
-            for entry in values["cameras"]
-        ]
+        entries = [{k: v for k, v in e.items() if k != "photo"} for e in values["cameras"]]
+        return [Camera.from_json(entry).moved(world_from_scene) for entry in entries]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ParseError(
             path, "cameras", f"not as expected ({error}).", "Export the job again with resume."

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ``export`` command in the worker's Python: GLB, OBJ, PLY and splat files with sidecars.
-
-Needs no Blender (USD and FBX do: ``ops/export.py``). Writes one JSON object per
-line to stdout, in the protocol of :mod:`~.run_in_worker`.
-"""
+"""The ``export`` command: GLB, OBJ, PLY and splat files; USD and FBX need Blender (``ops``)."""
 
 from __future__ import annotations
 
@@ -78,12 +74,8 @@ class StoredMesh:
 def result_of(folder: Path) -> Path:
     """Return the result folder of a job folder or of a result folder.
 
-    Raises
-    ------
-    UsageError
-        The folder is neither.
-    DatasetError
-        The job has no result yet, or its folder holds links.
+    Raises UsageError: it is neither; DatasetError: there is no result yet, or its folder holds
+    links.
     """
     for path in (folder / "result", folder):
         if (path / "scene.json").is_file():
@@ -97,10 +89,7 @@ def result_of(folder: Path) -> Path:
 def frames_of(result: Path) -> tuple[Similarity, Similarity]:
     """Return ``world_from_scene`` and ``blender_from_scene`` of a result.
 
-    Raises
-    ------
-    ParseError
-        ``scene.json`` or ``placement.json`` holds no valid transform.
+    Raises ParseError: ``scene.json`` or ``placement.json`` holds no valid transform.
     """
     path = result / "scene.json"
     try:
@@ -119,16 +108,8 @@ def frames_of(result: Path) -> tuple[Similarity, Similarity]:
 def export_files(request: ExportRequest) -> Iterator[Path]:
     """Write every file of a request; yield each once it and its sidecar are complete.
 
-    Raises
-    ------
-    UsageError
-        An unknown format, shading or region.
-    DatasetError, ParseError
-        The result is incomplete.
-    MeshingError
-        A mesh or a Gaussian is not finite; nothing of it is written.
-    ResourceError
-        The folder cannot be written.
+    Raises UsageError: an unknown format, shading or region; DatasetError, ParseError: the result is
+    incomplete; MeshingError: a mesh or Gaussian is not finite; ResourceError: it cannot be written.
     """
     from ...texture.file_checks import write_errors
 
@@ -154,15 +135,10 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
         if "splat" in request.formats:
             yield _write_splat(request, *frames)
     except WrapError:
-        _remove_empty(made)
+        with contextlib.suppress(OSError):  # the innermost first, until one holds something
+            for folder in made:
+                folder.rmdir()
         raise
-
-
-def _remove_empty(folders: list[Path]) -> None:
-    """Remove folders, the innermost first, until one holds something."""
-    with contextlib.suppress(OSError):
-        for folder in folders:
-            folder.rmdir()
 
 
 def _meshes(request: ExportRequest) -> Iterator[StoredMesh]:
@@ -215,12 +191,9 @@ def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
 
 
 def _write_mesh(
-    request: ExportRequest,
-    mesh: StoredMesh,
-    format: str,
-    world_from_scene: Similarity,
+    request: ExportRequest, mesh: StoredMesh, format: str, world_from_scene: Similarity,
     blender_from_scene: Similarity,
-) -> Path:
+) -> Path:  # fmt: skip
     from ...texture.file_checks import vertex_colors, write_errors, write_mesh_ply
     from ...texture.files import write_glb, write_obj
 

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The commands ``farm slurm`` and ``farm pbs``: a scheduler here, its workers as jobs of a cluster.
 
-Runs in the worker's Python; writes one JSON object per line, in the protocol of commands. The jobs
-are cancelled at the end; where nobody could do that, a worker ends without its scheduler.
+The jobs are cancelled at the end; where nobody could do that, a worker ends without its scheduler.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The ``farm doctor`` command: whether each worker of a Dask cluster can run parts of jobs.
 
-Runs in the worker's Python; writes one JSON object per line, in the protocol of commands. The line
-of a worker has its findings as ``"worker"``, too, for the panel.
+The line of a worker has its findings as ``"worker"``, too, for the panel.
 """
 
 from __future__ import annotations

@@ -33,7 +33,6 @@ from .doctor import Diagnosis, diagnose
 # Runs on a Dask worker as the parts of a job do, as a child process of the worker's Python. Its
 # last line is ``{"answer": {...}}``.
 
-
 MODULE = "jobs.commands.farm_findings"
 COMPARED = ("torch", "numpy")
 """Packages that must have the same version on all computers: results depend on them."""
@@ -52,8 +51,7 @@ def main(arguments: list[str]) -> int:
     late.daemon = True  # nobody waits for the answer any more
     late.start()
     out = Path(request["out"])
-    answer = {**_exchanged(out, request), **versions(), **_findings(out)}
-    emit(answer=answer)
+    emit(answer={**_exchanged(out, request), **versions(), **_findings(out)})
     return 0
 
 
@@ -100,7 +98,6 @@ def _findings(out: Path) -> dict[str, Any]:
 # All files of the check lie in it, so that nothing is left once it is removed: a worker that
 # comes too late has no place to write to.
 
-
 _logger = logging.getLogger(__name__)
 
 SEEN_S = 10.0
@@ -115,10 +112,7 @@ _REMOVALS = 5
 class MeetingFolder:
     """Made with ``with``, which removes it again.
 
-    Parameters
-    ----------
-    shared : Path
-        The shared folder or one in it, which a job could lie in.
+    ``shared``: the shared folder or one in it, which a job could lie in.
     """
 
     def __init__(self, shared: Path) -> None:
@@ -153,7 +147,8 @@ class MeetingFolder:
 
     def requests(self, number: int, deadline_s: float) -> list[dict[str, Any]]:
         """Return what the worker of a number is asked: as a job asks, then without the folder."""
-        arguments = {"token": FROM_HERE_NAME, "reply": _reply(number), "deadline_s": deadline_s}
+        reply = f"worker-{number}.txt"
+        arguments = {"token": FROM_HERE_NAME, "reply": reply, "deadline_s": deadline_s}
         seen = request_of(self.root, MODULE, arguments, None)
         unseen = {**seen, "arguments": {**arguments, "token": ""}, "folder": ".",
                   "is_shared": False}  # fmt: skip
@@ -176,10 +171,6 @@ class MeetingFolder:
             await asyncio.sleep(_POLL_S)
 
 
-def _reply(number: int) -> str:
-    return f"worker-{number}.txt"
-
-
 def _text(path: Path) -> str:
     try:
         with path.open("rb") as stream:
@@ -189,7 +180,6 @@ def _text(path: Path) -> str:
 
 
 # -- What is found about one worker of a Dask cluster, and what is wrong with it ------------------
-
 
 MAX_CLOCK_S = 60.0
 """States of parts have the time of their computer; one of three minutes ago counts as left."""
@@ -243,10 +233,7 @@ async def finding_of(
 ) -> WorkerFinding:
     """Judge the answer of a worker.
 
-    Parameters
-    ----------
-    here : mapping
-        The versions of this computer, see :func:`.farm_findings.versions`.
+    ``here``: the versions of this computer, see :func:`.farm_findings.versions`.
     """
     values = _values(answer)
     problems = [
@@ -269,15 +256,12 @@ def _values(answer: Answer) -> dict[str, Any]:
     if not isinstance(told, dict):
         return {}
     rows = told.get("bad")
+    rows = rows if isinstance(rows, list) else []
     return {
         **{name: short(str(text)) for name, text in told.items() if isinstance(text, str)},
         **{name: short(str(told.get(name, ""))) for name in ("code", "python", "gpu", *COMPARED)},
         **{name: _whole(told.get(name)) for name in ("cores", "memory_bytes", "free_bytes")},
-        "bad": [
-            (str(row[0]), str(row[1]))
-            for row in (rows if isinstance(rows, list) else [])
-            if isinstance(row, list) and len(row) == 2
-        ],
+        "bad": [(str(r[0]), str(r[1])) for r in rows if isinstance(r, list) and len(r) == 2],
     }
 
 
@@ -317,12 +301,8 @@ async def _shared(values: Mapping[str, Any], meeting: MeetingFolder) -> list[tup
     if values["token"] != meeting.token:
         return [("Its shared folder is not the one of this computer.", _MOUNT)]
     if not await meeting.sees(values.get("reply", "")):
-        return [
-            (
-                "What it writes into the shared folder is not seen here.",
-                "Use a folder of a file server (NFS, SMB), not one that is copied to and fro.",
-            )
-        ]
+        hint = "Use a folder of a file server (NFS, SMB), not one that is copied to and fro."
+        return [("What it writes into the shared folder is not seen here.", hint)]
     return []
 
 

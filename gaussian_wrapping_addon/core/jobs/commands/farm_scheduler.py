@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ``farm scheduler`` command: a Dask scheduler that runs until it is ended.
-
-Runs in the worker's Python; writes one JSON object per line, in the protocol of commands.
-"""
+"""The ``farm scheduler`` command: a Dask scheduler that runs until it is ended."""
 
 from __future__ import annotations
 

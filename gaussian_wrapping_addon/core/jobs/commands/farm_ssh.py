@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 # -- A Dask scheduler in this process, its workers told as they come and go, and an orderly end
 
-
 END_S = 10.0
 """Longest time in which others are told that this process ends."""
 POLL_S = 0.5
@@ -73,10 +72,7 @@ class Ending:
 async def serving(address: Address, certificates: str) -> AsyncIterator[Scheduler]:
     """Run a scheduler that listens at an address, and tell which workers come and go.
 
-    Raises
-    ------
-    UsageError
-        It cannot listen there, or certificates are missing.
+    Raises UsageError: it cannot listen there, or certificates are missing.
     """
     from distributed import Scheduler
 
@@ -114,10 +110,8 @@ async def _tell_workers(scheduler: Scheduler) -> None:
 
 # -- The ``farm ssh`` command: a scheduler here, and a worker on each of a list of computers ------
 #
-# Runs in the worker's Python; writes one JSON object per line, in the protocol of commands. A
-# worker ends with its connection: it reads its input, which ends with this process, however that
+# A worker ends with its connection: it reads its input, which ends with this process, however that
 # ends.
-
 
 _END_S = 5.0
 _MAX_LINE_BYTES = 4000
@@ -211,7 +205,9 @@ async def _run(
             for host in hosts:
                 connections.append(Connection(host, str(address), start_s))
             while not ending.is_asked:
-                for news in await asyncio.to_thread(_news, connections):
+                for news in await asyncio.to_thread(
+                    lambda: [n for c in connections for n in c.news()]
+                ):
                     emit(**news)
                 if all(connection.has_ended for connection in connections):
                     raise FarmError(
@@ -220,10 +216,6 @@ async def _run(
                 await asyncio.sleep(POLL_S)
         finally:
             await asyncio.to_thread(_end, connections)
-
-
-def _news(connections: list[Connection]) -> list[dict[str, str]]:
-    return [news for connection in connections for news in connection.news()]
 
 
 def _end(connections: list[Connection]) -> None:

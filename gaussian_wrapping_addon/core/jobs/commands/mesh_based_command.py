@@ -39,12 +39,8 @@ def evaluate_mesh_based(
 ) -> dict[str, Any]:
     """Return the figures of a mesh in world coordinates as plain JSON values.
 
-    Raises
-    ------
-    UsageError
-        There are no test photos, or one of them is a training photo.
-    DatasetError, ParseError
-        Photos or cameras cannot be used.
+    Raises UsageError: there are no test photos, or one of them is a training photo; DatasetError,
+    ParseError: photos or cameras cannot be used.
     """
     from ...evaluation.mesh_based_rendering import MeshBasedSettings, mesh_based_rendering
     from ...evaluation.photo_views import LONG_SIDE_PX, folder_scene, photo_views
@@ -103,12 +99,7 @@ def no_test_photos(name: str, is_job: bool) -> UsageError:
 def job_scene(folder: Path) -> tuple[Scene, list[str]]:
     """Return the scene of a job's result and the names of the photos held out of its training.
 
-    Raises
-    ------
-    DatasetError
-        The job has no result, or the stage that its cameras came from is gone.
-    ParseError
-        A file is not in the format that jobs write.
+    Raises DatasetError: the job has no result, or lacks its cameras; ParseError: a file is damaged.
     """
     import numpy as np
 
@@ -129,8 +120,7 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
         poses = poses.reshape(len(shown), 3, 4)
         report = read_json(paths[1])
         held_out = [str(entry["name"]) for entry in report["training"]["held_out"]]
-        facts = report.get("cameras", {}).get("facts", {})
-        name = MASKED if MASKS_MADE in facts else "cameras"
+        name = MASKED if MASKS_MADE in report.get("cameras", {}).get("facts", {}) else "cameras"
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ParseError(paths[0], "cameras", f"not as expected ({error}).", again) from None
     for stage in sorted(job.stages.glob(f"{name}-*")):

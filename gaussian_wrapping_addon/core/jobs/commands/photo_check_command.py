@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The part of ``check`` that decodes photos, in the worker's Python.
 
-Writes one JSON object per line to stdout, in the protocol of :mod:`~.run_in_worker`, with each
-finding as ``{"line", "finding"}``.
+The line of a finding has it as ``"finding"``, too.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from ...loading.photo_quality import photo_findings
-from ...progress import Progress, ProgressEvent
-from ...worker.helper_process import emit
+from ...progress import Progress
+from ...worker.helper_process import emit, emit_progress
 from .run_in_worker import run_command
 
 
@@ -25,12 +24,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _look(source: Path, threads: int) -> Iterator[str]:
-    found = photo_findings(source, Progress("check", _say), threads=threads)
-    for finding in found:
+    for finding in photo_findings(source, Progress("check", emit_progress), threads=threads):
         emit(finding=asdict(finding))
         yield f"{finding.severity}: {finding.message} {finding.hint}".rstrip()
     yield "fact: All photos were looked at."
-
-
-def _say(event: ProgressEvent) -> None:
-    emit(fraction=event.fraction, message=event.message)

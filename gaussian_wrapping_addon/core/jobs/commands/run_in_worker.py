@@ -24,7 +24,7 @@ from ...errors import (
 )
 from ...progress import ReportWarning
 from ...worker.environment import not_started, package_error
-from ...worker.helper_process import child_command, emit
+from ...worker.helper_process import child_command, emit, ending_of, json_object, last_line
 from ...worker.spawn import Caller, kill_group, spawn
 
 # -- Start a command in the worker's Python and log what it says; the parent needs no packages ----
@@ -32,37 +32,19 @@ from ...worker.spawn import Caller, kill_group, spawn
 # The child writes one JSON object per line to stdout: ``{"message"}`` for progress, ``{"line"}``
 # for a table, ``{"warning", "code"}``, and ``{"error", "hint"}`` at the end.
 
-
 _logger = logging.getLogger("gaussian_wrapping")
 
 ERROR_TAIL_BYTES = 2000
 
 
 def run_in_worker(
-    request: dict[str, Any],
-    *,
-    python: str,
-    module: str,
-    what: str,
-    grace_s: float = 2.0,
+    request: dict[str, Any], *, python: str, module: str, what: str, grace_s: float = 2.0
 ) -> int:
     """Run a command in the worker's Python, log its output, and return its exit code.
 
-    Parameters
-    ----------
-    request : dict
-        What the child's module takes; plain JSON values.
-    python : str
-        The worker's interpreter.
-    module, what : str
-        The child's module, and its name in errors; all commands use the protocol above.
-    grace_s : float
-        Time in which it may end by itself when this is interrupted.
-
-    Raises
-    ------
-    WorkerError
-        It does not start, or ends without reporting an error.
+    ``request``: plain JSON values, for the child's ``module``; ``what``: its name in errors;
+    ``grace_s``: time in which it may end by itself when this is interrupted.
+    Raises WorkerError: it does not start, or ends without reporting an error.
     """
     text = json.dumps(request, allow_nan=False)
     with tempfile.TemporaryFile() as error_file:
@@ -74,7 +56,7 @@ def run_in_worker(
         try:
             assert process.stdout is not None
             for raw in process.stdout:
-                values = _parse(raw)
+                values = json_object(raw)
                 if values is not None:
                     understood = _log_line(values) or understood
                     error_shown = error_shown or "error" in values
@@ -88,21 +70,11 @@ def run_in_worker(
             not error_shown if code else not understood
         ):
             error_file.seek(max(0, error_file.seek(0, os.SEEK_END) - ERROR_TAIL_BYTES))
-            error_lines = error_file.read().decode(errors="replace").strip().splitlines()
-            reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
             raise WorkerError(
-                f"The {what} {reason}: {error_lines[-1] if error_lines else 'no output'}.",
+                f"The {what} {ending_of(code)}: {last_line(error_file.read())}.",
                 "Run batch.py doctor to check the worker's Python.",
             )
         return code
-
-
-def _parse(raw: bytes) -> dict[str, Any] | None:
-    try:
-        values = json.loads(raw)
-    except (ValueError, RecursionError):
-        return None
-    return values if isinstance(values, dict) else None
 
 
 def _log_line(values: dict[str, Any]) -> bool:
@@ -124,7 +96,6 @@ def _log_line(values: dict[str, Any]) -> bool:
 #
 # Writes one JSON object per line to stdout, which :mod:`.run_in_worker` reads.
 
-
 PARENT_POLL_S = 1.0
 
 
@@ -134,13 +105,8 @@ def run_command(
 ) -> int:  # fmt: skip
     """Emit the lines and warnings of ``work`` as they come, or its error; return the exit code.
 
-    The process ends when its caller does.
-
-    Parameters
-    ----------
-    leave : callable, optional
-        Called in another thread before the process ends with its caller: takes away what ``work``
-        has left elsewhere.
+    The process ends when its caller does. Before that, ``leave`` is called in another thread: it
+    takes away what ``work`` has left elsewhere.
     """
     watched = (Caller(),) if leave is None else (Caller(), leave)
     threading.Thread(target=exit_with_caller, args=watched, daemon=True).start()

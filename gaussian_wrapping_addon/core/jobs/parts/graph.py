@@ -24,7 +24,6 @@ from ...errors import (
     ParseError,
     UsageError,
     WorkerError,
-    WrapError,
 )
 from ...farm import child
 from ...files import overwrite_json, read_json, resolve_inside, write_json
@@ -32,11 +31,10 @@ from ...names import FACES, GATHER, POINTS, region_names
 from ...settings import key_values
 from ...worker.spawn import host_and_pid_namespace, process_start_ticks
 from ..store.job_file import JobFile, read_job
-from ..store.job_folder import JobFolder
+from ..store.job_folder import JobFolder, has_type
 from ..store.stage_folder import STAGE_VERSIONS, stage_key
 
 # -- Exit codes of ``run-part``: what an engine may do with a part that is not done ---------------
-
 
 DONE = EXIT_DONE
 NEVER = 1
@@ -48,16 +46,15 @@ OTHER_CODE = child.OTHER_CODE
 CANCELLED = EXIT_CANCELLED
 
 
-def part_exit_code(error: WrapError) -> int:
-    """Return the exit code of a part that ended with an error."""
-    if error.exit_code == EXIT_CANCELLED:
+def part_exit_code(error: Exception, job_code: int) -> int:
+    """Return the exit code of a part that ended with an error, by what a job's would be."""
+    if job_code == EXIT_CANCELLED:
         return CANCELLED
-    elsewhere = error.exit_code == EXIT_RESOURCES or isinstance(error, WorkerError | DeviceError)
+    elsewhere = job_code == EXIT_RESOURCES or isinstance(error, WorkerError | DeviceError)
     return MAY_WORK_ELSEWHERE if elsewhere else NEVER
 
 
 # -- The version of the code that runs parts: two computers must have the same --------------------
-
 
 _CORE = Path(__file__).resolve().parents[2]
 _DIGITS = 12
@@ -74,7 +71,6 @@ def code_version() -> str:
 
 
 # -- The state of each part of a job: ``parts/NAME.json``, written by the process that runs it ----
-
 
 STATES_FOLDER = "parts"
 STATES = ("RUNNING", "DONE", "FAILED")
@@ -116,22 +112,6 @@ class PartState:
         """The computer, for people."""
         return self.place.split(" ")[0]
 
-    def done_in(self, root: Path, plan: str) -> bool:
-        """Return whether the part is done for a plan, and what it has made is still there."""
-        return (
-            self.state == "DONE"
-            and self.plan == plan
-            and all(
-                (path := resolve_inside(root, output)) is not None and path.exists()
-                for output in self.outputs
-            )
-        )
-
-
-def states_folder(root: Path) -> Path:
-    """Return the folder of the states in a job folder."""
-    return root / STATES_FOLDER
-
 
 def state_path(root: Path, name: str) -> Path:
     """Return the state file of a part."""
@@ -140,55 +120,39 @@ def state_path(root: Path, name: str) -> Path:
 
 def write_state(root: Path, name: str, state: PartState) -> None:
     """Write the state of a part, atomically."""
-    states_folder(root).mkdir(exist_ok=True)
-    write_json(state_path(root, name), _values_of(state))
+    state_path(root, name).parent.mkdir(exist_ok=True)
+    write_json(state_path(root, name), asdict(state))
 
 
 def overwrite_state(root: Path, name: str, state: PartState) -> None:
     """Write the state of a part over the earlier one, where there is no room for another file."""
-    overwrite_json(state_path(root, name), _values_of(state))
-
-
-def _values_of(state: PartState) -> dict[str, Any]:
-    return {**asdict(state), "outputs": list(state.outputs)}
+    overwrite_json(state_path(root, name), asdict(state))
 
 
 def read_state(root: Path, name: str) -> PartState | None:
     """Return the state of a part; ``None`` where there is none, or it is damaged."""
     try:
-        values = read_json(state_path(root, name), most_bytes=limits.MAX_PART_STATE_BYTES)
-        return _state_of(values)
+        return _state_of(read_json(state_path(root, name), most_bytes=limits.MAX_PART_STATE_BYTES))
     except (OSError, ParseError, TypeError, ValueError, KeyError, OverflowError):
         return None
 
 
-_TEXTS = ("state", "plan", "place", "token", "message", "error", "hint")
-_NUMBERS = ("begun_s", "heartbeat_s", "fraction", "seconds")
-_WHOLE = ("pid", "pid_started", "attempts", "peak_memory_bytes")
+def done_state(root: Path, name: str, plan: str) -> PartState | None:
+    """Return the state of a part that is done for a plan, and whose outputs are still there."""
+    state = read_state(root, name)
+    if state is None or state.state != "DONE" or state.plan != plan:
+        return None
+    paths = [resolve_inside(root, output) for output in state.outputs]
+    return state if all(path is not None and path.exists() for path in paths) else None
 
 
 def _state_of(values: Any) -> PartState:
     known: dict[str, Any] = {f.name: values[f.name] for f in fields(PartState)}
-    code, outputs = known["exit_code"], known["outputs"]
-    good = (
-        all(isinstance(known[name], str) for name in _TEXTS)
-        and all(_is_number(known[name], int | float) for name in _NUMBERS)
-        and all(_is_number(known[name], int) for name in _WHOLE)
-        and (code is None or _is_number(code, int))
-        and isinstance(outputs, list)
-        and all(isinstance(output, str) for output in outputs)
-        and known["state"] in STATES
-        and isinstance(known["figures"], dict)
-        and all(_is_number(figure, int | float) for figure in known["figures"].values())
-    )
-    if not good:
+    types = {f.name: str(f.type) for f in fields(PartState)}
+    if known["state"] not in STATES or not all(has_type(types[n], x) for n, x in known.items()):
         raise TypeError("a value has the wrong type")
-    numbers = {name: float(known[name]) for name in _NUMBERS}
-    return PartState(**{**known, **numbers, "outputs": tuple(outputs)})
-
-
-def _is_number(value: Any, kinds: Any) -> bool:
-    return isinstance(value, kinds) and not isinstance(value, bool)
+    numbers = {name: float(x) for name, x in known.items() if types[name] == "float"}
+    return PartState(**{**known, **numbers, "outputs": tuple(known["outputs"])})
 
 
 def new_state(plan: str, attempt: int) -> PartState:
@@ -202,14 +166,12 @@ def new_state(plan: str, attempt: int) -> PartState:
 
 def keep_states(root: Path, names: Collection[str]) -> None:
     """Remove the states of all parts of a job but some."""
-    folder = states_folder(root)
-    for path in folder.glob("*.json") if folder.is_dir() else ():
+    for path in (root / STATES_FOLDER).glob("*.json"):
         if path.stem not in names:
             path.unlink(missing_ok=True)
 
 
 # -- The parts of a job, what each needs, and ``parts.json`` (docs/file-formats.md, Parts) --------
-
 
 VERSION = 1
 PARTS_NAME = "parts.json"
@@ -265,16 +227,9 @@ class PartsGraph:
     parts: tuple[Part, ...]
 
     def part(self, name: str) -> Part:
-        """Return a part by its name.
-
-        Raises
-        ------
-        UsageError
-            There is none of this name.
-        """
-        for part in self.parts:
-            if part.name == name:
-                return part
+        """Return a part by its name. Raises UsageError: there is none of this name."""
+        if found := [part for part in self.parts if part.name == name]:
+            return found[0]
         raise UsageError(f"The job has no part {name}.", f"Its parts are listed in {PARTS_NAME}.")
 
     def of_region(self, region: str) -> list[Part]:
@@ -284,34 +239,13 @@ class PartsGraph:
 
 def write_parts(folder: Path, graph: PartsGraph) -> None:
     """Write ``parts.json`` into a job folder, atomically."""
-    write_json(
-        folder / PARTS_NAME,
-        {
-            "version": VERSION,
-            "code": graph.code,
-            "plan": graph.plan,
-            "source": graph.source,
-            "parts": [
-                {f.name: _json_value(getattr(part, f.name)) for f in fields(Part)}
-                for part in graph.parts
-            ],
-        },
-    )
-
-
-def _json_value(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+    write_json(folder / PARTS_NAME, {"version": VERSION, **asdict(graph)})
 
 
 def read_parts(folder: Path) -> PartsGraph:
     """Read and check ``parts.json`` of a job folder.
 
-    Raises
-    ------
-    UsageError
-        There is none.
-    ParseError
-        It is damaged, of another version, too large, or its parts do not fit together.
+    Raises UsageError: there is none; ParseError: it is damaged, of another version, or too large.
     """
     path = folder / PARTS_NAME
     try:
@@ -325,8 +259,7 @@ def read_parts(folder: Path) -> PartsGraph:
         raise ParseError(path, "version", f"it is not {VERSION}.", _AGAIN)
     listed = values.get("parts")
     if not isinstance(listed, list) or not 0 < len(listed) <= limits.MAX_PARTS:
-        wanted = f"not a list of 1 to {limits.MAX_PARTS:,} parts."
-        raise ParseError(path, "parts", wanted, _AGAIN)
+        raise ParseError(path, "parts", f"not a list of 1 to {limits.MAX_PARTS:,} parts.", _AGAIN)
     texts = {}
     for key in ("code", "plan", "source"):
         found = values.get(key)
@@ -358,9 +291,8 @@ def _part_of(entry: Any) -> Part:
         raise _WrongEntryError("", "not the entries of a part")
     for key in ("name", "region"):
         text = entry[key]
-        if not isinstance(text, str) or not (
-            NAME.fullmatch(text) or (key == "region" and not text)
-        ):
+        is_none = key == "region" and text == ""
+        if not is_none and not (isinstance(text, str) and NAME.fullmatch(text)):
             raise _WrongEntryError(key, "not a name of letters, digits, _ and -")
     if entry["kind"] not in KINDS:
         raise _WrongEntryError("kind", "no kind of parts")
@@ -416,7 +348,6 @@ def _check_order(path: Path, parts: Sequence[Part]) -> None:
 
 # -- Plan the parts of a job: those of its stages, and those of tiles once they are known ---------
 
-
 # Shares of a job's time: measured on the demo scene, 2 cores.
 STAGE_SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
 MASKS_SHARE = 0.1
@@ -450,12 +381,7 @@ def plan_hash(job: JobFile) -> str:
 def plan_parts(folder: Path, job: JobFile, tiles: Mapping[str, PlannedTiles]) -> PartsGraph:
     """Return the parts of a job, in an order in which they can be run one after another.
 
-    Parameters
-    ----------
-    folder : Path
-        The job folder.
-    tiles : mapping
-        By region, those that are known to be meshed in tiles.
+    ``folder``: the job folder; ``tiles``: by region, those that are known to be meshed in tiles.
     """
     parts = _begin(job)
     last = parts[-1].name
@@ -487,10 +413,7 @@ def fixed_tiles(job: JobFile) -> dict[str, PlannedTiles]:
 def plan_if_missing(folder: JobFolder) -> PartsGraph:
     """Return the parts of a job folder; plan them if that was never done, or for another job.
 
-    Raises
-    ------
-    UsageError, ParseError
-        There is no job, or a file is damaged.
+    Raises UsageError, ParseError: there is no job, or a file is damaged.
     """
     job = read_job(folder.job_path)
     if (folder.root / PARTS_NAME).exists():
@@ -504,8 +427,7 @@ def plan_if_missing(folder: JobFolder) -> PartsGraph:
 
 def _begin(job: JobFile) -> list[Part]:
     """Return the parts up to the training."""
-    train = STAGE_SHARES["train"]
-    cameras = STAGE_SHARES["cameras"]
+    train, cameras = STAGE_SHARES["train"], STAGE_SHARES["cameras"]
     if job.command == "bake":  # both are finished
         cameras = train = BAKE_BEGINS / 2
     parts = [Part("cameras", "cameras", (), ("stages/cameras-*/scene.json",), cameras)]

@@ -24,7 +24,7 @@ from ...files import seconds_since_written
 from ...progress import ProgressEvent
 from ...worker.helper_process import emit, own_peak_bytes
 from ...worker.spawn import is_here, owner_alive
-from .graph import PartState, new_state, overwrite_state, read_state, state_path, write_state
+from . import graph
 
 _logger = logging.getLogger(__name__)
 
@@ -39,18 +39,12 @@ class PartHeldError(WorkerError):
 class PartLease:
     """The lease of this process on one part.
 
-    Parameters
-    ----------
-    root : Path
-        The job folder.
-    name, plan : str
-        The part, and the plan that it is run for.
+    ``root``: the job folder; ``name``, ``plan``: the part, and the plan that it is run for.
     """
 
     def __init__(self, root: Path, name: str, plan: str, attempt: int) -> None:
-        self._root = root
-        self._name = name
-        self._state = new_state(plan, attempt)
+        self._root, self._name = root, name
+        self._state = graph.new_state(plan, attempt)
         self._begun_s = time.monotonic()
         self._ended = threading.Event()
         self._guard = threading.Lock()
@@ -62,17 +56,8 @@ class PartLease:
     def take(self, is_cancelled: Callable[[], bool] | None = None) -> bool:
         """Begin to hold the part; return false if another process has done it meanwhile.
 
-        Parameters
-        ----------
-        is_cancelled : callable, optional
-            With it, wait until a process that runs the part has ended, or has done it.
-
-        Raises
-        ------
-        PartHeldError
-            Another process runs it.
-        Cancelled
-            While waiting.
+        With ``is_cancelled``, wait until a process that runs the part has ended, or has done it.
+        Raises PartHeldError: another process runs it; Cancelled: while waiting.
         """
         while (held := self._held()) is not None:
             if is_cancelled is None:
@@ -83,17 +68,16 @@ class PartLease:
             if is_cancelled():
                 raise Cancelled()
             time.sleep(WAIT_S)
-        state = read_state(self._root, self._name)
-        if state is not None and state.done_in(self._root, self._state.plan):
+        if graph.done_state(self._root, self._name, self._state.plan) is not None:
             return False
         self._write()
         self._is_held = True
         self._thread.start()
         return True
 
-    def _held(self) -> PartState | None:
+    def _held(self) -> graph.PartState | None:
         """Return the state of a living process that runs the part; ``None`` if there is none."""
-        held = read_state(self._root, self._name)
+        held = graph.read_state(self._root, self._name)
         return held if held and held.state == "RUNNING" and self._lives(held) else None
 
     def event(self, event: ProgressEvent) -> None:
@@ -108,16 +92,12 @@ class PartLease:
     def tell(self) -> None:
         """Write a line about the progress, if anybody reads the output."""
         with self._guard, contextlib.suppress(OSError):
-            message = self._state.message or self._name
-            emit(message=message, fraction=round(self._state.fraction, 4))
+            emit(message=self._state.message or self._name, fraction=round(self._state.fraction, 4))
 
-    def finish(self, state: str, **changes: object) -> PartState:
+    def finish(self, state: str, **changes: object) -> graph.PartState:
         """Write how the part has ended, unless another process holds it.
 
-        Raises
-        ------
-        OSError
-            It cannot be written that the part is done; that it is not need not be known.
+        Raises OSError: it cannot be written that the part is done; a failure need not be known.
         """
         if not self._is_held:
             return self._state
@@ -132,7 +112,7 @@ class PartLease:
                 if state == "DONE":
                     raise
                 with contextlib.suppress(OSError):  # a full disk has the room of the earlier state
-                    overwrite_state(self._root, self._name, self._state)
+                    graph.overwrite_state(self._root, self._name, self._state)
         return self._state
 
     def _beat(self) -> None:
@@ -150,17 +130,17 @@ class PartLease:
                 self._state, seconds=round(time.monotonic() - self._begun_s, 3),
                 heartbeat_s=round(time.time(), 1), peak_memory_bytes=own_peak_bytes(),
             )  # fmt: skip
-            write_state(self._root, self._name, self._state)
+            graph.write_state(self._root, self._name, self._state)
 
     def _is_taken(self) -> bool:
-        now = read_state(self._root, self._name)
+        now = graph.read_state(self._root, self._name)
         return now is not None and now.token != self._state.token
 
-    def _lives(self, state: PartState) -> bool:
+    def _lives(self, state: graph.PartState) -> bool:
         if is_here(state.place):
             return owner_alive(state.pid, state.pid_started)
         try:
-            age_s = seconds_since_written(state_path(self._root, self._name))
+            age_s = seconds_since_written(graph.state_path(self._root, self._name))
         except OSError:
             return False
         return age_s < limits.SILENT_S

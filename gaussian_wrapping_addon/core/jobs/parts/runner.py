@@ -3,27 +3,33 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Any, Protocol
 
+from ... import limits
+from ...array_file import is_whole
 from ...devices import DeviceChoice
+from ...devices.checks import is_device_failure
 from ...errors import EXIT_CANCELLED, EXIT_DONE, Cancelled, WorkerError, WrapError
+from ...farm.dask import DaskTasks, request_of
 from ...machine import describe_machine
+from ...meshing.tiles.store import is_planned, load_plan
 from ...names import TILE_KINDS, region_names
+from ...parallel import default_threads
 from ...progress import Progress, ProgressEvent, ReportWarning
-from ...settings import to_json
-from ...worker.helper_process import peak_memory_bytes
-from ..stages.bake import require_training, run_bake
+from ...settings import JobSettings, to_json
+from ...settings.job import LOCAL
+from ...worker.helper_process import child_command, peak_memory_bytes
 from ..stages.cameras import run_cameras
 from ..stages.masks import run_masks
 from ..stages.meshing import (
     ON_PROCESSOR,
     TILES_FOLDER,
+    RegionInputs,
     TileMaker,
     TilesPlanned,
     device_warning,
@@ -33,11 +39,11 @@ from ..stages.meshing import (
     run_mesh,
     tile_file,
 )
-from ..stages.texture import run_texture
-from ..stages.training import plan_files, run_block, run_coarse, run_training
+from ..stages.texture import export_results, require_training, run_bake, run_texture
+from ..stages.training import TrainingStages, plan_files
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
-from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done
+from ..store.stage_folder import Stage, read_done
 from .graph import (
     MAY_WORK_ELSEWHERE,
     OTHER_CODE,
@@ -45,6 +51,7 @@ from .graph import (
     PartsGraph,
     PartState,
     PlannedTiles,
+    done_state,
     fixed_tiles,
     keep_states,
     plan_parts,
@@ -54,12 +61,7 @@ from .graph import (
 )
 from .lease import PartLease
 
-if TYPE_CHECKING:
-    from ..stages.meshing import RegionInputs
-
-
 # -- How far a job is: the progress of its parts, run here or elsewhere, on one scale -------------
-
 
 STATES_EVERY_S = 1.0
 """How often the states of parts that run elsewhere are read."""
@@ -76,12 +78,9 @@ class JobProgress:
     def __init__(
         self, sink: Callable[[ProgressEvent], None], is_cancelled: Callable[[], bool]
     ) -> None:
-        self._sink = sink
-        self._is_cancelled = is_cancelled
+        self._sink, self._is_cancelled = sink, is_cancelled
         self._begun_s = time.monotonic()
-        self._offset = 0.0
-        self._done = 0.0
-        self._total = 1.0
+        self._offset, self._done, self._total = 0.0, 0.0, 1.0
         self._read_s = 0.0
 
     def part(self, part: Part) -> Progress:
@@ -144,12 +143,8 @@ def stage_of(part: Part) -> str:
 class BegunAgain(Exception):  # noqa: N818 - no error: the region's parts are planned anew
     """A GPU failed at a tile; the tiles of its region are removed and made on the processor."""
 
-    def __init__(self, region: str) -> None:
-        super().__init__(region)
-        self.region = region
 
-
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class PartResult:
     """What a part has made."""
 
@@ -160,37 +155,18 @@ class PartResult:
 class PartRunner:
     """Runs parts of one job, and keeps what several of them need.
 
-    Parameters
-    ----------
-    graph : callable
-        Returns the parts of the job as they are known now.
-    threads : int
-    device : DeviceChoice
-        Of this process, which need not be that of the job.
-    begun_s : float
-        Unix time at which the job began, for the report.
-    is_alone : bool
-        Whether no other process runs parts of the job: then this one may plan a region anew.
+    ``graph`` returns the parts of the job as they are known now; ``device`` is that of this
+    process, which need not be the job's; ``begun_s`` the Unix time at which the job began, for the
+    report. Where ``is_alone``, no other process runs parts: this one may plan a region anew.
     """
 
     def __init__(
-        self,
-        folder: JobFolder,
-        job: JobFile,
-        graph: Callable[[], PartsGraph],
-        *,
-        threads: int,
-        device: DeviceChoice,
-        begun_s: float,
-        is_alone: bool = True,
-    ) -> None:
-        self._folder = folder
-        self._is_alone = is_alone
-        self._job = job
-        self._graph = graph
-        self._threads = threads
-        self._device = device
-        self._begun_s = begun_s
+        self, folder: JobFolder, job: JobFile, graph: Callable[[], PartsGraph], *, threads: int,
+        device: DeviceChoice, begun_s: float, is_alone: bool = True,
+    ) -> None:  # fmt: skip
+        self._folder, self._job, self._graph = folder, job, graph
+        self._threads, self._device = threads, device
+        self._begun_s, self._is_alone = begun_s, is_alone
         names = region_names(job.settings.regions, job.region_bodies)
         self._requests = dict(zip(names, job.settings.regions, strict=True))
         self._stages: dict[str, Stage] = {}
@@ -201,65 +177,43 @@ class PartRunner:
     def run(self, part: Part, progress: Progress) -> PartResult:
         """Run a part whose needs are done.
 
-        Raises
-        ------
-        BegunAgain
-            The region of the part is to be planned anew.
-        WrapError
-            Any typed failure of a stage.
-        WorkerError
-            What it needs is not there.
+        Raises BegunAgain: its region is to be planned anew; WrapError: any typed failure of a
+        stage.
         """
         if part.kind in TILE_KINDS:
             return self._run_tile(part, progress)
-        work: dict[str, Callable[[Part, Progress], PartResult]] = {
-            "cameras": self._run_cameras, "masks": self._run_masks, "coarse": self._run_coarse,
-            "block": self._run_block, "train": self._run_training,
-            "plan": self._run_plan, "mesh": self._run_mesh, "texture": self._run_texture,
-            "bake": self._run_bake, "export": self._run_export,
-        }  # fmt: skip
-        return work[part.kind](part, progress)
+        if part.kind == "plan":
+            return self._run_plan(part, progress)
+        if part.kind == "mesh":
+            return self._run_mesh(part, progress)
+        if part.kind == "export":
+            return self._run_export(progress)
+        return self._finished(part, self._run_stage(part, progress))
 
-    def _run_cameras(self, part: Part, progress: Progress) -> PartResult:
-        stage = run_cameras(self._folder, self._job, progress, threads=self._threads)
-        return self._finished(part, stage)
-
-    def _run_masks(self, part: Part, progress: Progress) -> PartResult:
-        stage = run_masks(
-            self._folder, self._job, self._stage("cameras"), progress, threads=self._threads,
-            device=self._device,
-        )  # fmt: skip
-        return self._finished(part, stage)
-
-    def _run_coarse(self, part: Part, progress: Progress) -> PartResult:
+    def _run_stage(self, part: Part, progress: Progress) -> Stage:
+        """Run a part that is one stage."""
+        known, threads = (self._folder, self._job), self._threads
+        if part.kind == "cameras":
+            return run_cameras(*known, progress, threads=threads)
+        if part.kind == "masks":
+            cameras = self._stage("cameras")
+            return run_masks(*known, cameras, progress, threads=threads, device=self._device)
         cameras = self._cameras()
-        reject_short_edges(self._job, cameras.folder)
-        stage = run_coarse(
-            self._folder, self._job, cameras, progress, version=STAGE_VERSIONS["train"],
-            threads=self._threads, device=self._device,
-        )  # fmt: skip
-        result = self._finished(part, stage)
-        # What blocks read: a part whose outputs are gone is not done.
-        plan = tuple(self._relative(path) for path in plan_files(stage))
-        return dataclasses.replace(result, outputs=(*result.outputs, *plan))
-
-    def _run_block(self, part: Part, progress: Progress) -> PartResult:
-        stage = run_block(
-            self._folder, self._job, self._cameras(), part.block, progress,
-            version=STAGE_VERSIONS["train"], threads=self._threads, device=self._device,
-        )  # fmt: skip
-        return self._finished(part, stage)
-
-    def _run_training(self, part: Part, progress: Progress) -> PartResult:
-        cameras = self._cameras()
-        reject_short_edges(self._job, cameras.folder)
-        if self._job.command == "bake":
-            require_training(self._folder, self._job, cameras)
-        stage = run_training(
-            self._folder, self._job, cameras, progress, version=STAGE_VERSIONS["train"],
-            threads=self._threads, device=self._device,
-        )  # fmt: skip
-        return self._finished(part, stage)
+        training = TrainingStages(*known, cameras, threads, self._device)
+        if part.kind == "block":
+            return training.block(part.block, progress)
+        if part.kind in ("coarse", "train"):
+            reject_short_edges(self._job, cameras)
+            if part.kind == "coarse":
+                return training.coarse(progress)
+            if self._job.command == "bake":
+                require_training(*known, cameras)
+            return training.run(progress)
+        trained = self._stage("train")
+        if part.kind == "bake":
+            return run_bake(*known, cameras, trained, progress, threads=threads)
+        meshed = self._stage(f"mesh-{part.region}")
+        return run_texture(*known, part.region, cameras, trained, meshed, progress, threads=threads)
 
     def _run_plan(self, part: Part, progress: Progress) -> PartResult:
         try:
@@ -281,9 +235,8 @@ class PartRunner:
                     f"Tiles of region {part.region} are missing.", "Resume the job: it makes them."
                 ) from None
             # A list of parts that cannot grow was made before the plan.
-            inputs = self._inputs(part.region, self._device)
             TileMaker(planned.stage_folder / TILES_FOLDER).make_all(
-                inputs.field, progress.span(0.1, 0.9)
+                self._inputs(part.region, self._device).field, progress.span(0.1, 0.9)
             )
             return self._finished(part, self._meshed(part.region, progress.span(0.9, 1.0)))
         finally:
@@ -311,9 +264,6 @@ class PartRunner:
         return self._region[2]
 
     def _run_tile(self, part: Part, progress: Progress) -> PartResult:
-        from ...array_file import is_whole
-        from ...devices.checks import is_device_failure
-
         folder = self._stage_folder(f"plan-{part.region}") / TILES_FOLDER
         path = tile_file(folder, part.kind, part.tile)
         if path.is_file() and is_whole(path):
@@ -337,51 +287,33 @@ class PartRunner:
 
     def _tile_processes(self, region: str) -> int:
         """Return how many processes have made the tiles of a region."""
-        tiles = [part for part in self._graph().of_region(region) if part.kind in TILE_KINDS]
-        states = [read_state(self._folder.root, part.name) for part in tiles]
+        parts = self._graph().of_region(region)
+        states = [read_state(self._folder.root, p.name) for p in parts if p.kind in TILE_KINDS]
         return max(1, len({(s.place, s.pid) for s in states if s is not None}))
 
-    def _run_texture(self, part: Part, progress: Progress) -> PartResult:
-        stage = run_texture(
-            self._folder, self._job, part.region, self._cameras(), self._stage("train"),
-            self._stage(f"mesh-{part.region}"), progress, threads=self._threads,
-        )  # fmt: skip
-        return self._finished(part, stage)
-
-    def _run_bake(self, part: Part, progress: Progress) -> PartResult:
-        stage = run_bake(
-            self._folder, self._job, self._cameras(), self._stage("train"), progress,
-            threads=self._threads,
-        )  # fmt: skip
-        return self._finished(part, stage)
-
-    def _run_export(self, part: Part, progress: Progress) -> PartResult:
-        from ..stages.texture import export_results
-
+    def _run_export(self, progress: Progress) -> PartResult:
         regions = [
             (name, self._stage(f"mesh-{name}"), self._stage(f"texture-{name}"))
             for name in self._requests
         ]
         job = self._job
         summary = {
-            "command": job.command,
-            "source": Path(job.source).name,
-            "settings": to_json(job.settings),
-            "machine": describe_machine(self._threads),
-            "device": self._device.device,
-            "device_reason": self._device.reason,
+            "command": job.command, "source": Path(job.source).name,
+            "settings": to_json(job.settings), "machine": describe_machine(self._threads),
+            "device": self._device.device, "device_reason": self._device.reason,
             "started_unix_s": round(self._begun_s, 1),
             "wall_seconds": round(time.time() - self._begun_s, 1),
             "peak_memory_bytes": peak_memory_bytes(),
-        }
+        }  # fmt: skip
         cameras, trained = self._cameras(), self._stage("train")
         export_results(self._folder, job, cameras, trained, regions, summary, progress)
         return PartResult((self._relative(self._folder.result / "report.json"),))
 
     def _finished(self, part: Part, stage: Stage) -> PartResult:
         self._stages[part.name] = stage
-        folders = (stage.folder, *(earlier.folder for earlier in stage.before))
-        return PartResult(tuple(self._relative(path) for path in folders), stage.reused)
+        # With what blocks read: a part whose outputs are gone is not done.
+        paths = (stage.folder, *(s.folder for s in stage.before), *plan_files(stage))
+        return PartResult(tuple(self._relative(path) for path in paths), stage.reused)
 
     def _relative(self, path: Path) -> str:
         return path.relative_to(self._folder.root).as_posix()
@@ -395,17 +327,15 @@ class PartRunner:
         if name not in self._stages:
             state = self._done_state(name)
             stages = [_stage_in(self._folder.root / output) for output in state.outputs]
-            first, *before = stages
-            self._stages[name] = dataclasses.replace(first, before=tuple(before))
+            self._stages[name] = replace(stages[0], before=tuple(stages[1:]))
         return self._stages[name]
 
     def _stage_folder(self, name: str) -> Path:
         return self._folder.root / self._done_state(name).outputs[0]
 
     def _done_state(self, name: str) -> PartState:
-        state = read_state(self._folder.root, name)
-        plan = self._graph().plan
-        if state is None or not state.outputs or not state.done_in(self._folder.root, plan):
+        state = done_state(self._folder.root, name, self._graph().plan)
+        if state is None or not state.outputs:
             raise WorkerError(f"Part {name} is not done yet.", "Run it first, or resume the job.")
         return state
 
@@ -418,11 +348,9 @@ def _stage_in(folder: Path) -> Stage:
     return Stage(name, key, folder, done, True)
 
 
-def planned_tiles(folder: JobFolder, plan: PartState | None) -> PlannedTiles | None:
+def planned_tiles(folder: JobFolder, plan: PartState) -> PlannedTiles | None:
     """Return what is known of the tiles of a region whose plan is done; ``None`` if it is whole."""
-    from ...meshing.tiles.store import is_planned, load_plan
-
-    if plan is None or plan.state != "DONE" or not plan.outputs:
+    if not plan.outputs:
         return None
     tiles = folder.root / plan.outputs[0] / TILES_FOLDER
     if not is_planned(tiles):
@@ -434,7 +362,9 @@ def planned_tiles(folder: JobFolder, plan: PartState | None) -> PlannedTiles | N
     )
 
 
-# -- What runs parts: the interface, and the engine that runs them in this process ----------------
+# -- What runs parts: the interface, the engine of this process, and that of a Dask cluster -------
+
+PART_MODULE = "jobs.part_process"
 
 
 @dataclass(frozen=True)
@@ -478,13 +408,6 @@ class InProcess:
     """The engine of this process: one part after the other.
 
     Its errors are raised as they are: they end the job.
-
-    Parameters
-    ----------
-    root : Path
-        The job folder.
-    progress_of : callable
-        Makes the progress of a part.
     """
 
     root: Path
@@ -522,11 +445,60 @@ class InProcess:
         self._queue.clear()
 
 
+class FarmEngine:
+    """Runs each part by ``run-part`` on a Dask cluster; all its computers see the folder ``root``.
+
+    Raises MissingExtraError, UsageError, WorkerError: as :class:`~.dask.DaskTasks`.
+    """
+
+    trusts_states = True
+
+    def __init__(self, root: Path, settings: JobSettings) -> None:
+        self._root, self._settings = root, settings
+        self._is_local = settings.computers == LOCAL
+        self._tasks = DaskTasks(settings.computers, settings.processes, settings.certificates)
+        self._parts: dict[str, Part] = {}
+        self._begun_s = time.time()
+
+    @property
+    def slots(self) -> int:
+        """Parts that run at a time."""
+        return self._tasks.slots
+
+    def start(self, part: Part, plan: str, attempt: int) -> None:
+        """Submit a part."""
+        arguments: dict[str, Any] = {
+            "part": part.name, "threads": self._threads(part), "device": self._settings.device,
+            "attempt": attempt, "driven": True,
+        }  # fmt: skip
+        command = child_command(PART_MODULE)[:-1] if self._is_local else None
+        self._parts[part.name] = part
+        # The same part of another walk is another task: what it left is not known to Dask.
+        key = f"{part.name}-{plan}-{attempt}-{int(self._begun_s * 1000):x}"
+        self._tasks.submit(part.name, key, request_of(self._root, PART_MODULE, arguments, command))
+
+    def _threads(self, part: Part) -> int:
+        """Return the threads of a part: all there are, or a share where others run beside it."""
+        if self._settings.threads or not self._is_local or not part.is_one_of_many:
+            return self._settings.threads
+        return max(1, default_threads() // self._settings.processes)
+
+    def wait(self, seconds: float) -> list[Outcome]:
+        """Return what has ended."""
+        return [
+            Outcome(self._parts.pop(e.name), e.code, error=e.error, hint=e.hint, place=e.host)
+            for e in self._tasks.ended(seconds)
+        ]
+
+    def close(self, *, cancelled: bool) -> None:
+        """End all parts: they see the cancel file, or that nobody holds the folder."""
+        self._tasks.close(limits.CANCEL_ALONE_S if cancelled else 0.0)
+
+
 # -- Walk the parts of a job: start what is ready, take what has ended, plan what came to light
 #
 # A part that may work elsewhere is begun again, at most :data:`MOST_ATTEMPTS` times in all. One
 # that never will holds up what needs it; everything else is done first.
-
 
 _logger = logging.getLogger(__name__)
 
@@ -540,19 +512,12 @@ they are finished at once."""
 
 
 class PartError(WrapError):
-    """Parts of a job have failed for good.
-
-    Parameters
-    ----------
-    outcome : Outcome
-        Of the first of them.
-    count : int
-        How many there are.
-    """
+    """Parts of a job have failed for good."""
 
     can_resume = True
 
     def __init__(self, outcome: Outcome, count: int) -> None:
+        """Take how the first of them ended, and how many there are."""
         where = f" on {outcome.place}" if outcome.place else ""
         more = f" {count - 1} more failed." if count > 1 else ""
         super().__init__(
@@ -563,22 +528,15 @@ class PartError(WrapError):
 
 @dataclass
 class Walk:
-    """One walk through the parts of a job.
-
-    Parameters
-    ----------
-    engine, here : Engine
-        What runs most parts, and what runs those of :data:`HERE`; may be the same.
-    report : callable
-        Takes the share of the job that is done, the parts that run, and how many are done.
-    is_cancelled : callable
-    """
+    """One walk through the parts of a job."""
 
     folder: JobFolder
     job: JobFile
     engine: Engine
     here: Engine
+    """What runs the parts of :data:`HERE`; may be the same."""
     report: Callable[[float, Mapping[str, Part], int], None]
+    """Takes the share of the job that is done, the parts that run, and how many are done."""
     is_cancelled: Callable[[], bool]
     graph: PartsGraph = field(init=False)
     _tiles: dict[str, PlannedTiles] = field(default_factory=dict)
@@ -600,14 +558,7 @@ class Walk:
     def run(self) -> None:
         """Run all parts.
 
-        Raises
-        ------
-        Cancelled
-            The job was cancelled.
-        PartError
-            Parts failed for good; all that do not need them are done.
-        WrapError
-            What an engine raises.
+        Raises Cancelled; PartError: parts failed for good; all that do not need them are done.
         """
         while True:
             if self.is_cancelled():
@@ -638,23 +589,17 @@ class Walk:
             if part.kind == "plan":
                 self._note_tiles(part)
         self._plan()
-        root = self.folder.root
-        states = {part.name: read_state(root, part.name) for part in self.graph.parts}
-        return {
-            name: state
-            for name, state in states.items()
-            if state is not None and state.done_in(root, self.graph.plan)
-        }
+        root, plan = self.folder.root, self.graph.plan
+        states = {part.name: done_state(root, part.name, plan) for part in self.graph.parts}
+        return {name: state for name, state in states.items() if state is not None}
 
     def _note_tiles(self, part: Part) -> None:
-        state = read_state(self.folder.root, part.name)
-        if state is None or not state.done_in(self.folder.root, self.graph.plan):
+        state = done_state(self.folder.root, part.name, self.graph.plan)
+        if state is None:
             return
         known = planned_tiles(self.folder, state)
-        if known is None:
-            self._tiles.pop(part.region, None)
-        else:
-            self._tiles[part.region] = known
+        self._tiles.pop(part.region, None)
+        self._tiles |= {} if known is None else {part.region: known}
 
     def _start_ready(self) -> None:
         """Start what is ready, as far as engines have room; what was finished earlier is done."""
@@ -724,6 +669,5 @@ class Walk:
         self._plan()
 
     def _fraction(self) -> float:
-        total = sum(part.share for part in self.graph.parts)
         done = sum(part.share for part in self.graph.parts if part.name in self._done)
-        return done / total
+        return done / sum(part.share for part in self.graph.parts)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import json
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,6 +41,7 @@ from ..store.stage_folder import (
 
 if TYPE_CHECKING:
     from ...loading.real_world import UnitsRequest
+    from ...regions.shapes import Region
 
 
 # -- Frames stage: photos out of a video, kept in a stage folder of their own ---------------------
@@ -91,10 +93,7 @@ def run_frames(
 ) -> tuple[Path, dict[str, Any]]:
     """Take the frames of a job's video; return their folder and the stage's ``done.json``.
 
-    Raises
-    ------
-    DatasetError, ParseError
-        The video cannot be used.
+    Raises DatasetError, ParseError: the video cannot be used.
     """
     from ...photos.video_frames import FRAMES_FOLDER, extract_frames
 
@@ -110,8 +109,7 @@ def run_frames(
         }
 
     def whole(stage_folder: Path) -> bool:
-        done = read_done(stage_folder) or {}
-        names = done.get("names")
+        names = (read_done(stage_folder) or {}).get("names")
         return isinstance(names, list) and all(
             isinstance(name, str) and (stage_folder / FRAMES_FOLDER / name).is_file()
             for name in names
@@ -121,17 +119,7 @@ def run_frames(
     return stage.folder / FRAMES_FOLDER, stage.done
 
 
-def with_frame_facts(scene: Scene, done: dict[str, Any]) -> Scene:
-    """Return a scene of frames with what is known of their video."""
-    return replace(
-        scene,
-        warnings=(*read_warnings(done["warnings"]), *scene.warnings),
-        facts={**scene.facts, **done["facts"]},
-    )
-
-
 # -- Make a scene of a splat without photos: place virtual cameras around it and render them ------
-
 
 MAX_START_POINTS = 30_000
 """Centres of at most this many opaque Gaussians serve as sparse points."""
@@ -156,12 +144,8 @@ def is_splat(source: Path) -> bool:
 def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads: int = 0) -> Scene:
     """Render a splat from virtual cameras into ``folder/images`` and return the scene.
 
-    The scene frame keeps the axes of the file. The background is black, as in training.
-
-    Raises
-    ------
-    ParseError, DatasetError
-        The file is not a splat, or has no visible Gaussian.
+    The scene frame keeps the axes of the file. The background is black, as in training. Raises
+    ParseError, DatasetError: the file is not a splat, or has no visible Gaussian.
     """
     import torch
 
@@ -204,13 +188,10 @@ def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads:
     facts = {"kind": SPLAT, "views": len(views), "points": len(chosen), **splat.facts}
     progress.update(1.0, f"{len(views)} views are rendered")
     return Scene(
-        tuple(views),
-        scene_from_world.points(means[chosen]),
-        np.round(255.0 * colors).astype(np.uint8),
-        scene_from_world.inverse(),
-        tuple(warnings),
+        tuple(views), scene_from_world.points(means[chosen]),
+        np.round(255.0 * colors).astype(np.uint8), scene_from_world.inverse(), tuple(warnings),
         facts,
-    )
+    )  # fmt: skip
 
 
 def _png(color: np.ndarray) -> bytes:
@@ -230,22 +211,16 @@ def write_scene_summary(path: Path, scene: Scene) -> None:
     from ...limits import SCENE_RADIUS
 
     units = scene.facts.get("georeference")
-    write_json(
-        path,
-        {
-            **({} if units is None else {"georeference": units}),
-            "version": 1,
-            "world_from_scene": scene.world_from_scene.to_json(),
-            "radius": SCENE_RADIUS,
-            "cameras": [
-                {**view.camera.to_json(), "photo": str(view.photo_path)} for view in scene.views
-            ],
-        },
-    )
+    cameras = [{**view.camera.to_json(), "photo": str(view.photo_path)} for view in scene.views]
+    values = {
+        **({} if units is None else {"georeference": units}), "version": 1,
+        "world_from_scene": scene.world_from_scene.to_json(), "radius": SCENE_RADIUS,
+        "cameras": cameras,
+    }  # fmt: skip
+    write_json(path, values)
 
 
 # -- Cameras stage: load the input as a scene, or re-use the cameras of a finished training -------
-
 
 FRAMES_SHARE = 0.4
 """Rough share of the stage's time, where the photos are frames of a video."""
@@ -259,41 +234,29 @@ MASKED = "masked"
 def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads: int) -> Stage:
     """Load the scene, or re-use a finished cameras stage.
 
-    ``mesh``, ``bake`` and ``more`` use the cameras of the finished training even if the photos
-    have changed since, or an earlier version has loaded them.
-
-    Raises
-    ------
-    DatasetError, ParseError
-        The input cannot be used.
-    UsageError
-        A splat is to get metres by photos, or a video by GPS, which they have none of.
+    ``mesh``, ``bake`` and ``more`` use the cameras of the finished training even if the photos have
+    changed since, or an earlier version has loaded them. Raises DatasetError, ParseError,
+    UsageError: the input cannot be used, or has nothing by which it could get metres as asked.
     """
-    from ...array_file import is_whole
     from ...loading.load import load_scene
     from ...loading.real_world import UnitsRequest
     from ...photos.photo_file import AS_WRITTEN, MaskReading
-    from ...scene.scene import MOST_POINTS_BYTES, POINTS_NAME, SCENE_NAME, save_scene
 
-    source = Path(job.source)
-    turntable = job.settings.turntable
-    equirectangular = job.settings.equirectangular
-    reading = MaskReading(job.settings.mask_invert == "on", job.settings.mask_grow_px)
-    settings = job.settings
+    source, settings = Path(job.source), job.settings
+    turntable, equirectangular = settings.turntable, settings.equirectangular
+    reading = MaskReading(settings.mask_invert == "on", settings.mask_grow_px)
     units = UnitsRequest(settings.georeference, settings.markers, settings.control_points)
     wanted = frames_request(job)
     photos = source_fingerprint(source) if wanted is None else wanted.key
     key = stage_key(
-        STAGE_VERSIONS["cameras"], job.source, photos, job.settings.seed,
+        STAGE_VERSIONS["cameras"], job.source, photos, settings.seed,
         *([] if turntable == "auto" else [turntable]),
         *([] if equirectangular == "auto" else ["equirectangular", equirectangular]),
         *([] if reading == AS_WRITTEN else [reading.invert, reading.grow_px]),
         *_units_key(units),
     )  # fmt: skip
-    if (
-        job.command in ("mesh", "more", "bake")
-        and read_done(folder.stages / f"cameras-{key}") is None
-    ):
+    is_there = read_done(folder.stages / f"cameras-{key}") is not None
+    if job.command in ("mesh", "more", "bake") and not is_there:
         earlier = scene_of_finished_training(folder, job)
         if earlier is not None:
             _logger.warning(
@@ -326,27 +289,18 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
                 progress = progress.span(FRAMES_SHARE, 1.0)
             scene = load_scene(
                 root, stage_folder, progress,
-                seed=job.settings.seed, threads=threads, turntable=turntable, reading=reading,
+                seed=settings.seed, threads=threads, turntable=turntable, reading=reading,
                 equirectangular=equirectangular, units=units, in_order=taken is not None,
             )  # fmt: skip
             if taken is not None:
-                scene = with_frame_facts(scene, taken)
-        save_scene(scene, stage_folder)
-        return {
-            "views": len(scene.views),
-            "points": len(scene.points),
-            "warnings": [warning.to_json() for warning in scene.warnings],
-            "facts": scene.facts,
-        }
+                warnings = (*read_warnings(taken["warnings"]), *scene.warnings)
+                scene = replace(scene, warnings=warnings, facts={**scene.facts, **taken["facts"]})
+        return saved_scene(scene, stage_folder)
 
     def whole(stage_folder: Path) -> bool:
         if wanted is not None and read_done(wanted.folder(folder.stages)) is None:
             return False  # its photos may lie there
-        try:
-            read_json(stage_folder / SCENE_NAME)
-        except (FileNotFoundError, ParseError):
-            return False
-        return is_whole(stage_folder / POINTS_NAME, MOST_POINTS_BYTES)
+        return is_whole_scene(stage_folder)
 
     return run_stage(folder.stages, "cameras", key, progress, work, whole=whole)
 
@@ -366,6 +320,39 @@ def _units_key(units: UnitsRequest) -> list[str]:
     return ["units", units.georeference, units.markers, content]
 
 
+def saved_scene(scene: Scene, stage_folder: Path) -> dict[str, Any]:
+    """Save the scene of a stage; return the content of ``done.json``."""
+    from ...scene.scene import save_scene
+
+    save_scene(scene, stage_folder)
+    return {
+        "views": len(scene.views), "points": len(scene.points),
+        "warnings": [warning.to_json() for warning in scene.warnings], "facts": scene.facts,
+    }  # fmt: skip
+
+
+def is_whole_scene(stage_folder: Path) -> bool:
+    """Return whether the files of a saved scene are there and whole."""
+    from ...array_file import is_whole
+    from ...scene.scene import MOST_POINTS_BYTES, POINTS_NAME, SCENE_NAME
+
+    try:
+        read_json(stage_folder / SCENE_NAME)
+    except (FileNotFoundError, ParseError):
+        return False
+    return is_whole(stage_folder / POINTS_NAME, MOST_POINTS_BYTES)
+
+
+def regions_listed(listed: str, scene: Scene) -> list[Region]:
+    """Return the regions of a setting that is a JSON list of region bodies, scene frame."""
+    from ...regions.scene_regions import parse_region, region_in_scene
+
+    return [
+        region_in_scene(parse_region(body, Path("job.json")), scene.world_from_scene)
+        for body in json.loads(listed)
+    ]
+
+
 def scene_stage_name(job: JobFile) -> str:
     """Return the name of the stages whose scene a job trains on."""
     return MASKED if job.settings.masks_are_made else "cameras"
@@ -382,7 +369,7 @@ def scene_of_finished_training(folder: JobFolder, job: JobFile) -> Stage | None:
     found: list[tuple[float, int, Stage]] = []
     for path in sorted(folder.stages.glob(f"{name}-*")):
         done, key = read_done(path), path.name.removeprefix(f"{name}-")
-        train_key, base_key = training_keys(STAGE_VERSIONS["train"], key, job)
+        train_key, base_key = training_keys(key, job)
         trained = read_done(folder.stages / f"train-{train_key}")
         if trained is None and job.command == "more":
             shorter = shorter_training(folder.stages, base_key, extra)

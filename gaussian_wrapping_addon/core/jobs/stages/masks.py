@@ -4,39 +4,33 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import os
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...array_file import is_whole
 from ...devices import DeviceChoice
-from ...errors import DatasetError, ParseError, UsageError, WrapError
-from ...files import read_bounded, read_json, write_bytes, write_json
+from ...errors import DatasetError, UsageError, WrapError
+from ...files import read_bounded, write_bytes, write_json
 from ...limits import MIN_IMAGES
 from ...machine import helper_memory_limit_bytes
-from ...masks.mask_folder import (
-    MOST_MASK_BYTES,
-    MadeMask,
-    MaskList,
-    check_model_file,
-    digest,
-    mask_names,
-    publish,
-    read_list,
-    used_masks,
-)
-from ...progress import COMPILING, Progress, ReportWarning
-from ...regions.scene_regions import parse_region, region_in_scene
+from ...masks import mask_folder
+from ...progress import Progress, ReportWarning
 from ...regions.shapes import Region
-from ...settings import TrainingSettings
 from ..store.job_file import JobFile, training_keys
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done, run_stage, stage_key
-from .cameras import MASKED, scene_of_finished_training
+from .cameras import (
+    MASKED,
+    is_whole_scene,
+    regions_listed,
+    saved_scene,
+    scene_of_finished_training,
+)
+from .training import compile_if_needed
 
 if TYPE_CHECKING:
     from ...gaussians.model import OrientedGaussians
@@ -46,7 +40,6 @@ if TYPE_CHECKING:
 
 
 # -- Masks of what stands in regions: a short training, and its silhouettes in the photos ---------
-
 
 _logger = logging.getLogger(__name__)
 
@@ -72,20 +65,12 @@ _HINT = (
 
 
 def make_region_masks(
-    scene: Scene,
-    job: JobFile,
-    folder: Path,
-    progress: Progress,
-    *,
-    threads: int,
+    scene: Scene, job: JobFile, folder: Path, progress: Progress, *, threads: int,
     device: DeviceChoice,
-) -> None:
+) -> None:  # fmt: skip
     """Write ``000000.png``, ... of the scene's views; the training in ``folder`` is resumed.
 
-    Raises
-    ------
-    DatasetError
-        The short training has nothing in the regions.
+    Raises DatasetError: the short training has nothing in the regions.
     """
     import torch
 
@@ -96,7 +81,7 @@ def make_region_masks(
     gaussians = _coarse_training(
         scene, job, folder / "coarse", progress.span(0.0, _TRAINED), threads, device
     )
-    regions = _regions(job, scene)
+    regions = regions_listed(job.settings.mask_regions, scene)
     side = _inside(regions, gaussians)
     gaussians = gaussians.select(torch.from_numpy(side >= 0))
     inside = side[side >= 0] == 1
@@ -113,8 +98,7 @@ def make_region_masks(
         shares = silhouettes(gaussians, inside, cameras, renderer, bounds=bounds, threads=threads)
         for index, view in enumerate(scene.views):
             rendering.update(index / len(cameras), f"masking photo {index + 1} of {len(cameras)}")
-            size = (view.camera.width, view.camera.height)
-            mask = cleaned(next(shares), size, GROWN_SHARE)
+            mask = cleaned(next(shares), (view.camera.width, view.camera.height), GROWN_SHARE)
             write_bytes(folder / f"{index:06d}.png", encoded(mask))
 
     with_renderer(device.device, "Silhouettes", write)
@@ -128,14 +112,6 @@ def _limited(camera: Camera) -> Camera:
     return camera.resized(max(1, width), max(1, height))
 
 
-def _regions(job: JobFile, scene: Scene) -> list[Region]:
-    """Return the job's mask regions, scene frame."""
-    return [
-        region_in_scene(parse_region(body, Path("job.json")), scene.world_from_scene)
-        for body in json.loads(job.settings.mask_regions)
-    ]
-
-
 def _inside(regions: list[Region], gaussians: OrientedGaussians) -> np.ndarray:
     """Tell which Gaussians are in regions, (n,) int8: 1, 0, or -1 for fog in there."""
     means = gaussians.means.detach().cpu().double().numpy()
@@ -147,35 +123,21 @@ def _inside(regions: list[Region], gaussians: OrientedGaussians) -> np.ndarray:
     return found
 
 
-def coarse_settings(settings: TrainingSettings) -> TrainingSettings:
-    """Return the settings of the short training of a job."""
-    return dataclasses.replace(settings, **COARSE)
-
-
 def _coarse_training(
-    scene: Scene,
-    job: JobFile,
-    folder: Path,
-    progress: Progress,
-    threads: int,
-    device: DeviceChoice,
+    scene: Scene, job: JobFile, folder: Path, progress: Progress, threads: int, device: DeviceChoice
 ) -> OrientedGaussians:
     from ...gaussians.files import load_gaussians, save_gaussians
     from ...masks.making import with_background
     from ...photos.store import PhotoStore
     from ...training.device_backend import chosen_backend
-    from ...training.estimate import renderer_is_compiled
     from ...training.trainer import train
-    from ...training.warm_up import compile_kernels
 
     done = folder / "gaussians.npz"
     if done.is_file():
         return load_gaussians(done)
-    settings = coarse_settings(job.settings.training)
+    settings = dataclasses.replace(job.settings.training, **COARSE)
     folder.mkdir(exist_ok=True)
-    if not device.is_cuda and not renderer_is_compiled():
-        progress.enter(COMPILING, "compiling the renderer, about a minute, only this once")
-        compile_kernels(settings, folder, progress, threads=threads)
+    compile_if_needed(settings, folder, progress, threads, device)
     photos = PhotoStore(scene, settings.max_image_px)
     result = train(
         with_background(scene, photos, seed=job.settings.seed), photos, settings, folder, progress,
@@ -187,7 +149,6 @@ def _coarse_training(
 
 
 # -- Masks stages: make masks once, put them where people can edit them, and use what is left -----
-
 
 SECONDS_A_PHOTO = 120.0
 """Of a mask model, at most: a large one needs some 20 s on one slow core."""
@@ -201,24 +162,16 @@ _OWN_HINT = (
 
 
 def run_masks(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    progress: Progress,
-    *,
-    threads: int,
+    folder: JobFolder, job: JobFile, cameras: Stage, progress: Progress, *, threads: int,
     device: DeviceChoice,
-) -> Stage:
+) -> Stage:  # fmt: skip
     """Return the stage whose scene has the job's made masks; ``cameras`` where none are made.
 
     Masks are made once and put into the job's folder ``masks``. What is there when a training
     begins counts: edited files, deleted ones, and those that ``masks.json`` rejects. ``mesh``,
     ``bake`` and ``more`` use the masks of the finished training even if they have changed since.
-
-    Raises
-    ------
-    DatasetError, UsageError, ResourceError
-        Masks cannot be made, or too few photos are left.
+    Raises DatasetError, UsageError, ResourceError: masks cannot be made, or too few photos are
+    left.
     """
     if not job.settings.masks_are_made or cameras.name == MASKED:
         return cameras
@@ -229,11 +182,11 @@ def run_masks(
             return earlier
     made = _run_making(folder, job, cameras, progress.span(0.0, 0.95), threads, device)
     masks = _list_of(folder, cameras, made)
-    where = publish(folder.root, made.folder, masks)
-    masks = read_list(where) or masks
-    key = stage_key(STAGE_VERSIONS[MASKED], cameras.key, digest(where, masks))
+    where = mask_folder.publish(folder.root, made.folder, masks)
+    masks = mask_folder.read_list(where) or masks
+    key = stage_key(STAGE_VERSIONS[MASKED], cameras.key, mask_folder.digest(where, masks))
     if of_finished:
-        train_key, _ = training_keys(STAGE_VERSIONS["train"], key, job)
+        train_key, _ = training_keys(key, job)
         if read_done(folder.stages / f"train-{train_key}") is None:
             earlier = scene_of_finished_training(folder, job)
             if earlier is not None:
@@ -247,22 +200,16 @@ def run_masks(
         return _write_masked_scene(stage_folder, cameras, where, masks)
 
     stage = run_stage(
-        folder.stages, MASKED, key, progress.span(0.95, 1.0), work, whole=_is_whole_scene
+        folder.stages, MASKED, key, progress.span(0.95, 1.0), work, whole=is_whole_scene
     )
     return dataclasses.replace(stage, before=(cameras, made))
 
 
 def _making_key(job: JobFile, cameras: Stage) -> str:
-    """Return the key of the masks. Constants of the method are left out: edited masks stay.
-
-    Raises
-    ------
-    DatasetError, ResourceError
-        The mask model is missing, or too large.
-    """
+    """Return the key of the masks. Constants of the method are left out: edited masks stay."""
     settings = job.settings
     if settings.mask_model:
-        check_model_file(Path(settings.mask_model))
+        mask_folder.check_model_file(Path(settings.mask_model))
         state = Path(settings.mask_model).stat()
         how = [settings.mask_model, state.st_size, state.st_mtime_ns, settings.mask_model_range]
     else:
@@ -279,13 +226,9 @@ def _are_made(folder: JobFolder, job: JobFile, cameras: Stage) -> bool:
 
 
 def _run_making(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    progress: Progress,
-    threads: int,
+    folder: JobFolder, job: JobFile, cameras: Stage, progress: Progress, threads: int,
     device: DeviceChoice,
-) -> Stage:
+) -> Stage:  # fmt: skip
     settings = job.settings
     key = _making_key(job, cameras)
 
@@ -293,9 +236,16 @@ def _run_making(
         from ...scene.scene import load_saved_scene
 
         scene = load_saved_scene(cameras.folder)
-        _refuse_own_masks(scene, settings.training.mask_mode)
+        own = sum(view.mask_path is not None for view in scene.views)
+        if own and scene.mask_mode(settings.training.mask_mode) != "background":
+            raise UsageError(
+                f"{own} of {len(scene.views)} photos have masks of their own, which may hide the "
+                "object: no masks are made for them.",
+                _OWN_HINT,
+            )
         if settings.mask_model:
-            _run_model(scene, job, stage_folder, progress, threads)
+            photos = [os.path.abspath(view.photo_path) for view in scene.views]
+            _run_model(job, photos, stage_folder, progress, threads)
         else:
             make_region_masks(scene, job, stage_folder, progress, threads=threads, device=device)
         return {"masks": len(scene.views)}
@@ -307,98 +257,70 @@ def _run_making(
     return run_stage(folder.stages, "masks", key, progress, work, whole=whole)
 
 
-def _refuse_own_masks(scene: Scene, mask_mode: str) -> None:
-    """Raise where photos have masks that may hide the object itself."""
-    own = sum(view.mask_path is not None for view in scene.views)
-    if own and scene.mask_mode(mask_mode) != "background":
-        raise UsageError(
-            f"{own} of {len(scene.views)} photos have masks of their own, which may hide the "
-            "object: no masks are made for them.",
-            _OWN_HINT,
-        )
-
-
-def _run_model(scene: Scene, job: JobFile, folder: Path, progress: Progress, threads: int) -> None:
+def _run_model(
+    job: JobFile, photos: list[str], folder: Path, progress: Progress, threads: int
+) -> None:
+    """Load the job's model, and mask photos with it."""
     from ...worker.helper_process import run_helper
 
-    photos = [os.path.abspath(view.photo_path) for view in scene.views]
-    write_json(folder / "task.json", _task(job, photos, threads))
+    settings = job.settings
+    task = {
+        "model": settings.mask_model, "range": settings.mask_model_range, "threads": threads,
+        "photos": photos,
+    }  # fmt: skip
+    write_json(folder / "task.json", task)
     run_helper(
-        "masks.model_helper", folder, progress, deadline_s=SECONDS_A_PHOTO * (5 + len(photos)),
-        memory_bytes=helper_memory_limit_bytes(),
+        "masks.model_helper", folder, progress, memory_bytes=helper_memory_limit_bytes(),
+        deadline_s=SECONDS_A_PHOTO * (5 + len(photos) if photos else 1),
     )  # fmt: skip
 
 
 def check_mask_model(job: JobFile, folder: JobFolder, progress: Progress) -> None:
     """Load the job's mask model and raise if it is none, before photos are read.
 
-    Raises
-    ------
-    UsageError, DatasetError, ResourceError
-        The model cannot be used.
+    Raises UsageError, DatasetError, ResourceError: the model cannot be used.
     """
-    import tempfile
-
-    from ...worker.helper_process import run_helper
-
     if not job.settings.mask_model or job.command != "wrap":
         return
     if any(read_done(path) is not None for path in folder.stages.glob("masks-*")):
         return  # it may be resumed where the model is no longer; else it is checked when it runs
     progress.update(0.0, "loading the mask model")
     with tempfile.TemporaryDirectory() as temporary:
-        write_json(Path(temporary) / "task.json", _task(job, [], 1))
-        run_helper(
-            "masks.model_helper", Path(temporary), progress, deadline_s=SECONDS_A_PHOTO,
-            memory_bytes=helper_memory_limit_bytes(),
-        )  # fmt: skip
+        _run_model(job, [], Path(temporary), progress, 1)
 
 
-def _task(job: JobFile, photos: list[str], threads: int) -> dict[str, Any]:
-    settings = job.settings
-    return {
-        "model": settings.mask_model,
-        "range": settings.mask_model_range,
-        "threads": threads,
-        "photos": photos,
-    }
-
-
-def _list_of(folder: JobFolder, cameras: Stage, made: Stage) -> MaskList:
+def _list_of(folder: JobFolder, cameras: Stage, made: Stage) -> mask_folder.MaskList:
     from ...scene.scene import load_saved_scene
 
     views = load_saved_scene(cameras.folder).views
     names = [view.camera.name for view in views]
     entries = []
-    for view, name, file in zip(views, names, mask_names(names), strict=True):
-        path = view.photo_path
-        image = (
-            path.relative_to(folder.root).as_posix()
-            if path.is_relative_to(folder.root)
-            else str(path)
-        )
-        entries.append(MadeMask(name, file, image))
-    return MaskList(made.key, tuple(entries))
+    for view, name, file in zip(views, names, mask_folder.mask_names(names), strict=True):
+        path, root = view.photo_path, folder.root
+        inside = path.is_relative_to(root)
+        image = path.relative_to(root).as_posix() if inside else str(path)
+        entries.append(mask_folder.MadeMask(name, file, image))
+    return mask_folder.MaskList(made.key, tuple(entries))
 
 
 def _write_masked_scene(
-    stage_folder: Path, cameras: Stage, where: Path, masks: MaskList
+    stage_folder: Path, cameras: Stage, where: Path, masks: mask_folder.MaskList
 ) -> dict[str, Any]:
     """Copy masks and scene, without the photos that are left out."""
 
     from ...masks.segmentation import encoded
     from ...photos.photo_file import MASK_THRESHOLD, read_mask
-    from ...scene.scene import MASKS_MADE, load_saved_scene, save_scene
+    from ...scene.scene import MASKS_MADE, load_saved_scene
 
     scene = load_saved_scene(cameras.folder)
-    files = {mask.photo: path for mask, path in used_masks(where, masks)}
+    files = {mask.photo: path for mask, path in mask_folder.used_masks(where, masks)}
     views, empty = [], []
     for index, view in enumerate(scene.views):
         path = files.get(view.camera.name)
         if path is None:
             continue
         copy = stage_folder / f"{index:06d}.png"
-        write_bytes(copy, read_bounded(path, MOST_MASK_BYTES))
+        write_bytes(copy, read_bounded(path, mask_folder.MOST_MASK_BYTES))
         kept = read_mask(copy, upright=False) >= MASK_THRESHOLD
         if kept.shape != (view.camera.height, view.camera.width):
             raise DatasetError(
@@ -432,20 +354,4 @@ def _write_masked_scene(
         text = f"{len(empty)} photos do not show the object and are not used: {listed}."
         warnings.append(ReportWarning("photos-without-object", text, _MAKE_HINT))
     masked = dataclasses.replace(scene, views=tuple(views), facts=facts, warnings=tuple(warnings))
-    save_scene(masked, stage_folder)
-    return {
-        "views": len(views),
-        "points": len(scene.points),
-        "warnings": [warning.to_json() for warning in warnings],
-        "facts": facts,
-    }
-
-
-def _is_whole_scene(stage_folder: Path) -> bool:
-    from ...scene.scene import MOST_POINTS_BYTES, POINTS_NAME, SCENE_NAME
-
-    try:
-        read_json(stage_folder / SCENE_NAME)
-    except (FileNotFoundError, ParseError):
-        return False
-    return is_whole(stage_folder / POINTS_NAME, MOST_POINTS_BYTES)
+    return saved_scene(masked, stage_folder)

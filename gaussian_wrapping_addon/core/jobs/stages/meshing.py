@@ -13,27 +13,39 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ...array_file import is_whole
 from ...devices import CPU, DeviceChoice, stage_device
-from ...devices.checks import is_device_failure
+from ...devices.checks import is_device_failure, with_renderer
 from ...errors import DatasetError, MeshingError, WrapError
-from ...meshing.surface_points import Field
+from ...field import cuda_vacancy, samples
+from ...field.samples import DepthSamples
+from ...field.vacancy import PackedMask, VacancyField
+from ...field.vector_field import VectorField
+from ...gaussians.files import load_gaussians
+from ...gaussians.model import GaussianArrays, OrientedGaussians
+from ...mesh.surface_mesh import SurfaceMesh, save_mesh
+from ...meshing import estimate, pivot_meshing
+from ...meshing.checks import mesh_statistics, validate_manifold
+from ...meshing.clean_up import clean_up, without_caps
+from ...meshing.primal_adaptive import mesh_region
+from ...meshing.spacing import checked_request, resolved_edges
+from ...meshing.surface_points import Field, halo_bounds
+from ...meshing.tiles import store as tile_store
 from ...meshing.tiles.plan import TilePlan
-from ...meshing.tiles.store import (
-    faces_path,
-    gathered_path,
-    load_gathered,
-    load_plan,
-    load_points,
-    points_path,
-    save_gathered,
-    save_points,
-    save_surface,
-)
 from ...meshing.tiles.tile import GatheredPoints, gather, tile_faces, tile_points, tile_surface
+from ...meshing.tiles.tiled_mesh import join_tiles, plan_tiles
 from ...names import AUTOMATIC_REGIONS, GATHER, POINTS, TILE_KINDS
+from ...photos.store import PhotoStore
 from ...progress import Progress, ReportWarning
-from ...settings import MeshingSettings, key_values
+from ...regions import scene_regions
+from ...regions.shapes import Region
+from ...render.types import Renderer
+from ...scene import scene as scene_files
+from ...scene.frames import snapped_length
+from ...scene.scene import PhotoSource, Scene
+from ...settings import MeshingSettings, TrainingSettings, key_values
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import (
@@ -45,15 +57,7 @@ from ..store.stage_folder import (
 )
 
 if TYPE_CHECKING:
-    from ...field.samples import DepthSamples
-    from ...field.vacancy import VacancyField
-    from ...gaussians.model import GaussianArrays, OrientedGaussians
-    from ...mesh.surface_mesh import SurfaceMesh
     from ...meshing.estimate import MeshEstimate, PivotEstimate
-    from ...regions.shapes import Region
-    from ...scene.camera import Camera
-    from ...scene.scene import PhotoSource, Scene
-    from ...settings import TrainingSettings
 
 
 # -- Keys of a job's mesh stages ------------------------------------------------------------------
@@ -69,7 +73,6 @@ def mesh_key(job: JobFile, request: str, name: str, trained_key: str) -> str:
 
 
 # -- Build the vacancy field of a region with the job's cameras, masks and unseen space -----------
-
 
 _logger = logging.getLogger(__name__)
 
@@ -92,33 +95,20 @@ def load_region(
 ) -> RegionInputs:
     """Load a finished training and build the field of a region from it.
 
-    Parameters
-    ----------
-    request : str
-        The region's entry in the job's settings.
-    device : DeviceChoice
-        Where vacancy is evaluated, if it fits there.
-
-    Raises
-    ------
-    ParseError, DatasetError
-        A file of the stages is damaged or missing.
-    DeviceError
-        As :func:`field_device`.
+    ``request`` is the region's entry in the job's settings; vacancy is evaluated on ``device``, if
+    it fits there. Raises ParseError, DatasetError: a file of the stages is damaged or missing;
+    DeviceError: as :func:`~.choice.stage_device`.
     """
-    from ...field.vector_field import VectorField
-    from ...gaussians.files import load_gaussians
-    from ...meshing.surface_points import Field
-    from ...scene.scene import load_refined_scene
-
-    scene = load_refined_scene(cameras.folder, trained.folder)
+    scene = scene_files.load_refined_scene(cameras.folder, trained.folder)
     gaussians = load_gaussians(trained.folder / "gaussians.npz")
     arrays = gaussians.arrays()
-    body = job.region_bodies.get(request)
-    region, world_region = requested_region(request, body, scene, arrays)
+    region, world_region = requested_region(request, job.region_bodies.get(request), scene, arrays)
+    if device.is_cuda:
+        needed = cuda_vacancy.needed_bytes(len(arrays))
+        device = stage_device(device, job.settings.device, needed, "Vacancy")
     vacancy = region_field(
         scene, arrays, region, job.settings.training, job.meshing_of(request), threads=threads,
-        device=field_device(device, job.settings.device, arrays).device,
+        device=device.device,
     )  # fmt: skip
     field = Field(vacancy, VectorField(arrays, threads=threads), threads)
     return RegionInputs(scene, gaussians, arrays, region, world_region, field)
@@ -132,53 +122,26 @@ def requested_region(
     The world-frame region of a file is returned as read: transforming it to the scene frame and
     back would change its last digits each time.
 
-    Parameters
-    ----------
-    request : str
-        ``"auto"``, ``"all"`` or the path of a region file.
-    body : object
-        Content of that file.
-    arrays : GaussianArrays, optional
-        Of the training; only the region ``"all"`` needs them.
+    ``request``: ``"auto"``, ``"all"`` or the path of a region file with the content ``body``.
+    ``arrays``: of the training; only the region ``"all"`` needs them.
     """
-    from ...regions.scene_regions import (
-        automatic_region,
-        on_scene_grid,
-        parse_region,
-        region_in_scene,
-        whole_region,
-    )
-
-    if request in AUTOMATIC_REGIONS:
-        if request == "auto":
-            region = automatic_region(scene)
-        else:
-            assert arrays is not None
-            region = whole_region(scene, arrays)
-        region = on_scene_grid(region)
-        return region, region.transformed(scene.world_from_scene)
-    world_region = parse_region(body, Path(request))
-    return region_in_scene(world_region, scene.world_from_scene), world_region
+    if request not in AUTOMATIC_REGIONS:
+        world_region = scene_regions.parse_region(body, Path(request))
+        return scene_regions.region_in_scene(world_region, scene.world_from_scene), world_region
+    if request == "auto":
+        region = scene_regions.automatic_region(scene)
+    else:
+        assert arrays is not None
+        region = scene_regions.whole_region(scene, arrays)
+    region = scene_regions.on_scene_grid(region)
+    return region, region.transformed(scene.world_from_scene)
 
 
-def reject_short_edges(job: JobFile, cameras: Path) -> None:
+def reject_short_edges(job: JobFile, cameras: Stage) -> None:
     """Refuse edges far too short for their region, which would else fail after the training.
 
-    The region of all Gaussians is known only then, and is left out.
-
-    Parameters
-    ----------
-    cameras : Path
-        Folder of the finished cameras stage.
-
-    Raises
-    ------
-    ResourceError
-        Names the region.
+    The region of all Gaussians is known only then, and is left out. Raises ResourceError.
     """
-    from ...meshing.spacing import checked_request
-    from ...scene.scene import load_saved_scene
-
     lengths = {
         request: meshing.edge_length
         for request in job.settings.regions
@@ -186,7 +149,7 @@ def reject_short_edges(job: JobFile, cameras: Path) -> None:
     }
     if not any(lengths.values()):
         return
-    scene = load_saved_scene(cameras)
+    scene = scene_files.load_saved_scene(cameras.folder)
     for request, length in lengths.items():
         region, _ = requested_region(request, job.region_bodies.get(request), scene, None)
         checked_request(length / scene.world_from_scene.scale, 0, region)
@@ -195,24 +158,13 @@ def reject_short_edges(job: JobFile, cameras: Path) -> None:
 def field_views(scene: Scene, photos: PhotoSource, holdout_every: int, cameras: str) -> list[int]:
     """Return the views whose cameras a mesh is made from (docs/method.md, section 5.3).
 
-    Parameters
-    ----------
-    holdout_every : int
-        Setting of the training.
-    cameras : str
-        Setting of the meshing: ``"training"`` leaves out held-out photos and photos that their
-        masks cover; ``"all"`` uses every camera.
-
-    Raises
-    ------
-    DatasetError
-        No camera is left.
+    ``cameras``: setting of the meshing: ``"training"`` leaves out held-out photos and photos that
+    their masks cover; ``"all"`` uses every camera.
+    Raises DatasetError: no camera is left.
     """
-    from ...scene.scene import training_views
-
     if cameras == "all":
         return list(range(len(scene.views)))
-    views = training_views(scene, photos, holdout_every)
+    views = scene_files.training_views(scene, photos, holdout_every)
     if not views:
         raise DatasetError(
             "The masks cover every photo that was trained on.",
@@ -221,54 +173,15 @@ def field_views(scene: Scene, photos: PhotoSource, holdout_every: int, cameras: 
     return views
 
 
-def field_device(chosen: DeviceChoice, setting: str, arrays: GaussianArrays) -> DeviceChoice:
-    """Return where the field of these Gaussians is evaluated: the job's device if it fits there.
-
-    Raises
-    ------
-    DeviceError
-        As :func:`~.choice.stage_device`.
-    """
-    if not chosen.is_cuda:
-        return chosen
-    from ...field.cuda_vacancy import needed_bytes
-
-    return stage_device(chosen, setting, needed_bytes(len(arrays)), "Vacancy")
-
-
 def region_field(
-    scene: Scene,
-    arrays: GaussianArrays,
-    region: Region,
-    training: TrainingSettings,
-    meshing: MeshingSettings,
-    *,
-    threads: int,
-    device: str = "cpu",
-) -> VacancyField:
-    """Return the field in and around a region, limited to the mesher's halo.
+    scene: Scene, arrays: GaussianArrays, region: Region, training: TrainingSettings,
+    meshing: MeshingSettings, *, threads: int, device: str = "cpu",
+) -> VacancyField:  # fmt: skip
+    """Return the field in and around a region (scene frame), limited to the mesher's halo.
 
-    Parameters
-    ----------
-    region : Region
-        Scene frame.
-    training : TrainingSettings
-        ``mask_mode``, ``holdout_every`` and the size of the photos that masks are read at.
-    meshing : MeshingSettings
-        ``unseen`` and ``cameras`` are read.
-    device : str
-        Torch device of the field, from :func:`field_device`. If the kernels of a GPU cannot run,
-        the field is evaluated on the processor and the log says why.
-
-    Raises
-    ------
-    DatasetError
-        A mask does not fit its photo, or masks cover every photo that was trained on.
+    If the kernels of a GPU cannot run, it is evaluated on the processor and the log says why.
+    Raises DatasetError: a mask does not fit its photo, or masks cover all photos of the training.
     """
-    from ...field.vacancy import PackedMask, VacancyField
-    from ...meshing.surface_points import halo_bounds
-    from ...photos.store import PhotoStore
-
     photos = PhotoStore(scene, training.max_image_px)
     views = field_views(scene, photos, training.holdout_every, meshing.cameras)
     cameras = [scene.views[index].camera for index in views]
@@ -280,10 +193,8 @@ def region_field(
         "mask_mode": scene.mask_mode(training.mask_mode),
     }
     if device.startswith("cuda"):
-        from ...field.cuda_vacancy import CudaVacancyField
-
         try:
-            return CudaVacancyField(arrays, cameras, device=device, **options)
+            return cuda_vacancy.CudaVacancyField(arrays, cameras, device=device, **options)
         except (WrapError, RuntimeError) as error:
             if not is_device_failure(error):
                 raise
@@ -295,19 +206,15 @@ def region_field(
 def field_figures(field: VacancyField) -> dict[str, Any]:
     """Return the report's figures of a field: device, cameras, evaluations, what is unseen."""
     return {
-        "field_device": field.device,
-        "field_cameras": len(field.cameras),
-        "unseen": field.unseen,
-        "field_evaluations": field.evaluations,
-        "unseen_evaluations": field.unseen_evaluations,
-    }
+        "field_device": field.device, "field_cameras": len(field.cameras), "unseen": field.unseen,
+        "field_evaluations": field.evaluations, "unseen_evaluations": field.unseen_evaluations,
+    }  # fmt: skip
 
 
 # -- Mesh a region in its stage folder, whole or in tiles, as requested or as memory allows -------
 #
 # Tiles are parts of a job, which other processes may make (:mod:`..parts`): a region in tiles is
 # planned here, and joined here once its tiles are there.
-
 
 TILES_FOLDER = "tiles"
 """Subfolder of the stage's folder while tiles are being meshed."""
@@ -324,57 +231,24 @@ class TilesPlanned(Exception):  # noqa: N818 - no error: the tiles are made next
         self.stage_folder = stage_folder
 
 
-def mesh_in_stage(
-    stage_folder: Path,
-    field: Field,
-    arrays: GaussianArrays,
-    region: Region,
-    meshing: MeshingSettings,
-    progress: Progress,
-    *,
-    seed: int,
-    edge_length_scene: float,
-    sampled: Callable[[], DepthSamples],
-    warnings: Sequence[ReportWarning] = (),
-) -> tuple[SurfaceMesh, dict[str, Any]]:
+def _mesh_in_stage(
+    stage_folder: Path, inputs: RegionInputs, meshing: MeshingSettings, progress: Progress, *,
+    seed: int, sampled: Callable[[], DepthSamples], warnings: Sequence[ReportWarning],
+) -> tuple[SurfaceMesh, dict[str, Any]]:  # fmt: skip
     """Estimate the mesh of a region, then make it; or plan its tiles; or join them.
 
-    Parameters
-    ----------
-    sampled : callable
-        Samples depth maps; not called where tiles are planned already.
-    warnings : sequence of ReportWarning
-        Of the plan, for the report.
-
-    Returns
-    -------
-    mesh : SurfaceMesh
-    expected : dict
-        The estimate, for the report.
-
-    Raises
-    ------
-    TilesPlanned
-        Tiles are to be made first.
-    ResourceError
-        The mesh does not fit into memory.
-    MeshingError
-        The region holds no surface.
+    Return the mesh and the estimate. Raise :class:`TilesPlanned` where tiles are to be made first.
     """
-    from ...meshing.primal_adaptive import mesh_region
-    from ...meshing.tiles.store import is_planned, save_plan
-    from ...meshing.tiles.tiled_mesh import plan_tiles
-
-    folder, cameras = stage_folder / TILES_FOLDER, field.vacancy.cameras
-    if is_planned(folder):
+    folder, field, region = stage_folder / TILES_FOLDER, inputs.field, inputs.region
+    cameras = field.vacancy.cameras
+    if tile_store.is_planned(folder):
         return _joined(stage_folder, field, meshing, progress)
+    edge_length_scene = snapped_length(meshing.edge_length / inputs.scene.world_from_scene.scale)
     depth_samples = sampled()
     expected = estimate_region_mesh(
-        field.vacancy, cameras, region, meshing, edge_length_scene, depth_samples
+        field.vacancy, region, meshing, edge_length_scene, depth_samples
     )
-    for line in expected.lines():
-        _logger.info("region %s, estimated %s", region.name, line)
-    memory_bytes = free_bytes(stage_folder)
+    memory_bytes = _log_estimate(expected, region, stage_folder)
     tiled = meshing.tiles != "off" and (
         meshing.tiles != "auto" or bool(expected.tiles_for(memory_bytes))
     )
@@ -383,25 +257,25 @@ def mesh_in_stage(
     if tiled:
         tiles = 0 if meshing.tiles == "auto" else int(meshing.tiles)
         plan = plan_tiles(
-            field, arrays, cameras, region, meshing, progress, tiles=tiles, seed=seed,
+            field, inputs.arrays, cameras, region, meshing, progress, tiles=tiles, seed=seed,
             edge_length_scene=edge_length_scene, depth_samples=depth_samples,
         )  # fmt: skip
         noted = {"estimate": told, "warnings": [warning.to_json() for warning in warnings]}
-        save_plan(folder, plan, noted)
+        tile_store.save_plan(folder, plan, noted)
         raise TilesPlanned(stage_folder)
     mesh = mesh_region(
-        field,
-        arrays,
-        cameras,
-        region,
-        meshing,
-        progress,
-        seed=seed,
-        edge_length_scene=edge_length_scene,
-        depth_samples=depth_samples,
-    )
+        field, inputs.arrays, cameras, region, meshing, progress, seed=seed,
+        edge_length_scene=edge_length_scene, depth_samples=depth_samples,
+    )  # fmt: skip
     _note(mesh, warnings)
     return mesh, told
+
+
+def _log_estimate(expected: MeshEstimate | PivotEstimate, region: Region, folder: Path) -> int:
+    """Log an estimate; return how much memory is free for the mesh."""
+    for line in expected.lines():
+        _logger.info("region %s, estimated %s", region.name, line)
+    return free_bytes(folder)
 
 
 def _note(mesh: SurfaceMesh, warnings: Sequence[ReportWarning]) -> None:
@@ -413,30 +287,16 @@ def _note(mesh: SurfaceMesh, warnings: Sequence[ReportWarning]) -> None:
 def _joined(
     stage_folder: Path, field: Field, meshing: MeshingSettings, progress: Progress
 ) -> tuple[SurfaceMesh, dict[str, Any]]:
-    """Join the tiles of a planned region.
-
-    Raises
-    ------
-    TilesPlanned
-        Some are missing.
-    """
-    from ...meshing.tiles.store import (
-        faces_path,
-        gathered_path,
-        load_plan,
-        load_point_figures,
-        load_surface,
-    )
-    from ...meshing.tiles.tiled_mesh import join_tiles
-
+    """Join the tiles of a planned region, or raise ``TilesPlanned`` where some are missing."""
     folder = stage_folder / TILES_FOLDER
-    plan, noted = load_plan(folder)
-    paths = [faces_path(folder, tile) for tile in range(len(plan.tiling))]
-    if not all(path.is_file() for path in [gathered_path(folder), *paths]):
+    plan, noted = tile_store.load_plan(folder)
+    paths = [tile_store.faces_path(folder, tile) for tile in range(len(plan.tiling))]
+    gathered = tile_store.gathered_path(folder)
+    if not all(path.is_file() for path in [gathered, *paths]):
         raise TilesPlanned(stage_folder)
     mesh = join_tiles(
-        field, plan, load_point_figures(gathered_path(folder)),
-        lambda tile: load_surface(paths[tile]), meshing, progress,
+        field, plan, tile_store.load_point_figures(gathered),
+        lambda tile: tile_store.load_surface(paths[tile]), meshing, progress,
     )  # fmt: skip
     if noted.get("warnings"):
         mesh.provenance["warnings"] = list(noted["warnings"])
@@ -444,25 +304,15 @@ def _joined(
 
 
 def mesh_by_pivots_in_stage(
-    stage_folder: Path,
-    vacancy: VacancyField,
-    arrays: GaussianArrays,
-    region: Region,
-    meshing: MeshingSettings,
-    progress: Progress,
-    *,
-    seed: int,
-    depth_samples: DepthSamples | None,
-) -> tuple[SurfaceMesh, dict[str, Any]]:
-    """Estimate the mesh of a region by pivots, then make it; see :func:`mesh_in_stage`."""
-    from ...meshing.pivot_meshing import mesh_by_pivots
-
+    stage_folder: Path, field: Field, arrays: GaussianArrays, region: Region,
+    meshing: MeshingSettings, progress: Progress, *, seed: int, depth_samples: DepthSamples | None,
+) -> tuple[SurfaceMesh, dict[str, Any]]:  # fmt: skip
+    """Estimate the mesh of a region by pivots, then make it; return both."""
+    vacancy = field.vacancy
     expected = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
-    for line in expected.lines():
-        _logger.info("region %s, estimated %s", region.name, line)
-    memory_bytes = free_bytes(stage_folder)
+    memory_bytes = _log_estimate(expected, region, stage_folder)
     expected.refuse(memory_bytes)
-    mesh = mesh_by_pivots(
+    mesh = pivot_meshing.mesh_by_pivots(
         vacancy, arrays, vacancy.cameras, region, meshing, progress, seed=seed,
         depth_samples=depth_samples,
     )  # fmt: skip
@@ -470,52 +320,35 @@ def mesh_by_pivots_in_stage(
 
 
 def estimate_region_pivots(
-    vacancy: VacancyField,
-    arrays: GaussianArrays,
-    region: Region,
-    meshing: MeshingSettings,
+    vacancy: VacancyField, arrays: GaussianArrays, region: Region, meshing: MeshingSettings,
     depth_samples: DepthSamples | None,
-) -> PivotEstimate:
+) -> PivotEstimate:  # fmt: skip
     """Estimate the mesh of a region by pivots from the Gaussians and depth samples in it."""
-    from ...meshing.estimate import estimate_pivot_mesh, evaluation_seconds
-
     if depth_samples is None:
-        samples, near = 0, arrays.means[region.contains(arrays.means, 0.0)]
+        count, near = 0, arrays.means[region.contains(arrays.means, 0.0)]
     else:
-        samples, near = len(depth_samples), depth_samples.points
-    return estimate_pivot_mesh(
-        arrays, region, meshing.pivots, samples,
+        count, near = len(depth_samples), depth_samples.points
+    return estimate.estimate_pivot_mesh(
+        arrays, region, meshing.pivots, count,
         box=meshing.pivot_box, alone=meshing.pivot_samples == "none",
-        evaluation_s=evaluation_seconds(vacancy, near),
+        evaluation_s=estimate.evaluation_seconds(vacancy, near),
     )  # fmt: skip
 
 
 def estimate_region_mesh(
-    vacancy: VacancyField,
-    cameras: Sequence[Camera],
-    region: Region,
-    meshing: MeshingSettings,
-    edge_length_scene: float,
+    vacancy: VacancyField, region: Region, meshing: MeshingSettings, edge_length_scene: float,
     depth_samples: DepthSamples,
-) -> MeshEstimate:
+) -> MeshEstimate:  # fmt: skip
     """Estimate the mesh of a region from the depth samples of its surface."""
-    from ...meshing.estimate import (
-        box_counting_area,
-        estimate_mesh,
-        evaluation_seconds,
-        occupied_boundary_area,
-    )
-    from ...meshing.spacing import checked_request, resolved_edges
-
     adaptive = meshing.spacing == "adaptive"
     subset = depth_samples.points[:: max(1, len(depth_samples) // MAX_SPACING_SAMPLES)]
-    return estimate_mesh(
-        box_counting_area(depth_samples.points),
-        occupied_boundary_area(region, vacancy.is_empty),
+    return estimate.estimate_mesh(
+        estimate.box_counting_area(depth_samples.points),
+        estimate.occupied_boundary_area(region, vacancy.is_empty),
         checked_request(edge_length_scene, meshing.points, region),
         adaptive=adaptive,
-        evaluation_s=evaluation_seconds(vacancy, depth_samples.points),
-        resolved=resolved_edges(subset, cameras) if adaptive else None,
+        evaluation_s=estimate.evaluation_seconds(vacancy, depth_samples.points),
+        resolved=resolved_edges(subset, vacancy.cameras) if adaptive else None,
     )
 
 
@@ -545,36 +378,28 @@ def remove_tiles(stage_folder: Path) -> None:
 def tile_file(folder: Path, kind: str, tile: int) -> Path:
     """Return the file that a part of a tiled mesh makes."""
     if kind == GATHER:
-        return gathered_path(folder)
-    return (points_path if kind == POINTS else faces_path)(folder, tile)
+        return tile_store.gathered_path(folder)
+    return (tile_store.points_path if kind == POINTS else tile_store.faces_path)(folder, tile)
 
 
 class TileMaker:
-    """Makes the parts of one planned region; each can be made again, with the same result.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the tiles, with their plan.
-    """
+    """Makes the parts of one planned region; each can be made again, with the same result."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     @cached_property
-    def plan(self) -> TilePlan:
-        """The plan of the region."""
-        return load_plan(self._folder)[0]
+    def _plan(self) -> TilePlan:
+        return tile_store.load_plan(self._folder)[0]
 
     @cached_property
     def _all_points(self) -> GatheredPoints:
-        return load_gathered(gathered_path(self._folder))
+        return tile_store.load_gathered(tile_store.gathered_path(self._folder))
 
     def make_all(self, field: Field, progress: Progress) -> None:
         """Make all parts that are missing, one after another."""
-        count = len(self.plan.tiling)
-        todo = [(kind, tile) for kind in TILE_KINDS for tile in range(count)]
-        todo = [(kind, tile) for kind, tile in todo if kind != GATHER or tile == 0]
+        tiles = range(len(self._plan.tiling))
+        todo = [(k, tile) for k in TILE_KINDS for tile in tiles if k != GATHER or tile == 0]
         for number, (kind, tile) in enumerate(todo):
             if not tile_file(self._folder, kind, tile).is_file():
                 span = progress.span(number / len(todo), (number + 1) / len(todo))
@@ -582,22 +407,20 @@ class TileMaker:
 
     def make(self, kind: str, tile: int, field: Field, progress: Progress) -> Path:
         """Make a part and return its file."""
-        path = tile_file(self._folder, kind, tile)
+        path, plan = tile_file(self._folder, kind, tile), self._plan
         if kind == POINTS:
-            save_points(path, tile_points(field, self.plan, tile, progress))
+            tile_store.save_points(path, tile_points(field, plan, tile, progress))
         elif kind == GATHER:
             progress.update(0.0, "bringing the tiles' points together")
-            count = len(self.plan.tiling)
-            parts = [load_points(points_path(self._folder, number)) for number in range(count)]
-            save_gathered(path, gather(self.plan, parts))
+            files = [tile_file(self._folder, POINTS, n) for n in range(len(plan.tiling))]
+            tile_store.save_gathered(path, gather(plan, [tile_store.load_points(f) for f in files]))
         else:
-            faces = tile_faces(field, self.plan, self._all_points, tile, progress.span(0.0, 0.9))
-            save_surface(path, tile_surface(self.plan, self._all_points, faces))
+            faces = tile_faces(field, plan, self._all_points, tile, progress.span(0.0, 0.9))
+            tile_store.save_surface(path, tile_surface(plan, self._all_points, faces))
         return path
 
 
 # -- Mesh stage: mesh a region of a finished training and clean the mesh up -----------------------
-
 
 ON_PROCESSOR = DeviceChoice(CPU, "", "The GPU failed.")
 
@@ -606,69 +429,32 @@ DENSE_MESH = "dense.npz"
 
 
 def run_mesh(
-    folder: JobFolder,
-    job: JobFile,
-    request: str,
-    name: str,
-    trained: Stage,
-    progress: Progress,
-    *,
-    device: DeviceChoice,
-    load: Callable[[DeviceChoice], RegionInputs],
-    tile_processes: int = 1,
+    folder: JobFolder, job: JobFile, request: str, name: str, trained: Stage, progress: Progress, *,
+    device: DeviceChoice, load: Callable[[DeviceChoice], RegionInputs], tile_processes: int = 1,
     warnings: Sequence[ReportWarning] = (),
-) -> Stage:
+) -> Stage:  # fmt: skip
     """Mesh a region, or plan or join its tiles, or re-use its finished mesh stage.
 
-    Parameters
-    ----------
-    request : str
-        The region's entry in the job's settings.
-    name : str
-        Name of the region's folder.
-    device : DeviceChoice
-        The job's; vacancy is evaluated and depth maps are rendered there. Everything else gets
-        arrays and CPU tensors.
-    load : callable
-        Returns what :func:`load_region` does for a device.
-    tile_processes : int
-        How many processes made the tiles, for the report.
-    warnings : sequence of ReportWarning
-        Of what was tried before.
-
-    Raises
-    ------
-    TilesPlanned
-        The region is planned in tiles, which are to be made before this is called again.
-    MeshingError, ResourceError
-        The region holds no surface, or its mesh does not fit into memory.
+    ``request``: the region's entry in the job's settings; ``name`` is that of its folder.
+    ``device``: the job's; vacancy is evaluated and depth maps are rendered there. Everything else
+    gets arrays and CPU tensors.
+    ``load``: returns what :func:`load_region` does for a device; ``warnings``: of what was tried
+    before. Raises TilesPlanned: the planned tiles are to be made before this is called again;
+    MeshingError, ResourceError: the region holds no surface, or its mesh does not fit into memory.
     """
     meshing = job.meshing_of(request)
     key = mesh_key(job, request, name, trained.key)
 
     def meshed(
-        chosen: DeviceChoice,
-        stage_folder: Path,
-        progress: Progress,
+        chosen: DeviceChoice, stage_folder: Path, progress: Progress,
         warnings: Sequence[ReportWarning],
-    ) -> dict[str, Any]:
-        import numpy as np
-
-        from ...devices.checks import with_renderer
-        from ...field.samples import sample_depth_maps
-        from ...mesh.surface_mesh import save_mesh
-        from ...meshing.checks import mesh_statistics, validate_manifold
-        from ...meshing.clean_up import clean_up, without_caps
-        from ...regions.scene_regions import write_region
-        from ...render.types import Renderer
-        from ...scene.frames import snapped_length
-
+    ) -> dict[str, Any]:  # fmt: skip
         inputs = load(chosen)
         region, vacancy = inputs.region, inputs.field.vacancy
 
         def sampled() -> DepthSamples:
             def on(renderer: Renderer) -> DepthSamples:
-                return sample_depth_maps(
+                return samples.sample_depth_maps(
                     inputs.gaussians, vacancy.cameras, lambda points: region.contains(points, 0.0),
                     progress.span(0.0, 0.15), threads=inputs.field.threads,
                     renderer=renderer,
@@ -676,22 +462,17 @@ def run_mesh(
 
             return with_renderer(vacancy.device, "Depth maps", on)
 
+        seed, span = job.settings.seed, progress.span(0.15, 0.9)
         if meshing.method == "pivots":
-            alone = meshing.pivot_samples == "none"
             mesh, expected = mesh_by_pivots_in_stage(
-                stage_folder, vacancy, inputs.arrays, region, meshing, progress.span(0.15, 0.9),
-                seed=job.settings.seed, depth_samples=None if alone else sampled(),
+                stage_folder, inputs.field, inputs.arrays, region, meshing, span, seed=seed,
+                depth_samples=None if meshing.pivot_samples == "none" else sampled(),
             )  # fmt: skip
             _note(mesh, warnings)
         else:
-            mesh, expected = mesh_in_stage(
-                stage_folder, inputs.field, inputs.arrays, region, meshing,
-                progress.span(0.15, 0.9), seed=job.settings.seed, sampled=sampled,
-                edge_length_scene=snapped_length(
-                    meshing.edge_length / inputs.scene.world_from_scene.scale
-                ),
-                warnings=warnings,
-            )  # fmt: skip
+            mesh, expected = _mesh_in_stage(
+                stage_folder, inputs, meshing, span, seed=seed, sampled=sampled, warnings=warnings
+            )
         if expected.get("tiled"):
             mesh.provenance["tile_processes"] = tile_processes
         mesh, dense = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))
@@ -710,7 +491,7 @@ def run_mesh(
         if dense is not None:
             save_mesh(stage_folder / DENSE_MESH, dense)
         remove_tiles(stage_folder)
-        write_region(stage_folder / "region.json", inputs.world_region)
+        scene_regions.write_region(stage_folder / "region.json", inputs.world_region)
         progress.update(0.97, "measuring the mesh")
         return {
             "statistics": mesh_statistics(mesh).to_json(),
@@ -721,8 +502,6 @@ def run_mesh(
         }
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
-        from ...devices.checks import is_device_failure
-
         begun_s = time.monotonic()
         try:
             try:
@@ -735,8 +514,7 @@ def run_mesh(
             remove_tiles(stage_folder)
             return meshed(ON_PROCESSOR, stage_folder, progress, [*warnings, failed])
         except TilesPlanned:
-            spent_s = time.monotonic() - begun_s
-            record_interrupted_time(folder.stages, f"mesh-{name}", key, spent_s)
+            record_interrupted_time(stage_folder, time.monotonic() - begun_s)
             raise
 
     def whole(stage_folder: Path) -> bool:

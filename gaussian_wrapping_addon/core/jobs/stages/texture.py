@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Stages of textures and exports."""
+"""Stages of textures, bakes and exports."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...array_file import is_whole
-from ...errors import ParseError
+from ...errors import ParseError, UsageError
 from ...evaluation.report.report import CURVE, write_report
 from ...files import finite_json, read_json, resolve_inside, write_json
 from ...names import REPORT_FOLDER, RESULT_FORMATS
@@ -18,43 +20,34 @@ from ...progress import Progress
 from ...scene.camera import Similarity
 from ...scene.placement import FILE_NAME as PLACEMENT
 from ...scene.placement import read_placement, write_placement
-from ...settings import to_json
+from ...settings import TextureSettings, key_values, to_json
 from ...units.georeference import blender_start
-from ..store.job_file import JobFile
+from ..store.job_file import BakeRequest, JobFile, training_keys
 from ..store.job_folder import JobFolder
-from ..store.rollback import new_result
-from ..store.stage_folder import STAGE_VERSIONS, Stage, run_stage, stage_key
+from ..store.rollback import new_result, no_finished_training
+from ..store.stage_folder import STAGE_VERSIONS, Stage, read_done, run_stage, stage_key
 from .cameras import write_scene_summary
-from .meshing import DENSE_MESH
+from .meshing import DENSE_MESH, free_bytes
 
 if TYPE_CHECKING:
-    from ...scene.scene import Scene
+    from ...mesh.exchange import FileMesh
+    from ...photos.store import PhotoStore
+    from ...scene.scene import PhotoSource, Scene
 
 
 # -- Texture stage: bake a region's textures, write its files, and compare it with the photos -----
-
 
 OCCLUSION_VERSION = 2
 """Raise it where ambient occlusion alone is computed otherwise: other textures stay valid."""
 
 
 def run_texture(
-    folder: JobFolder,
-    job: JobFile,
-    name: str,
-    cameras: Stage,
-    trained: Stage,
-    meshed: Stage,
-    progress: Progress,
-    *,
-    threads: int,
-) -> Stage:
+    folder: JobFolder, job: JobFile, name: str, cameras: Stage, trained: Stage, meshed: Stage,
+    progress: Progress, *, threads: int,
+) -> Stage:  # fmt: skip
     """Texture the mesh of a region and write its files, or re-use the finished stage.
 
-    Raises
-    ------
-    ResourceError
-        Memory or disk space is not sufficient.
+    Raises ResourceError: memory or disk space is not sufficient.
     """
     texture = job.settings.texture
     occlusion = [OCCLUSION_VERSION] if texture.ambient_occlusion == "on" else []
@@ -62,30 +55,22 @@ def run_texture(
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         from ...evaluation.photo_views import compare_with_photos, write_preview
-        from ...files import read_json
         from ...limits import MAX_IMAGE_SIDE_PX
         from ...mesh.surface_mesh import load_mesh
         from ...photos.store import PhotoStore
         from ...regions.scene_regions import parse_region, region_in_scene
         from ...scene.frames import file_offset
-        from ...scene.scene import PhotoSource, load_refined_scene
+        from ...scene.scene import load_refined_scene
         from ...texture.files import write_textured
         from ...texture.levels_of_detail import levels_of_detail
         from ...texture.texture_mesh import texture_mesh
-        from .meshing import free_bytes
 
         scene = load_refined_scene(cameras.folder, trained.folder)
         photos = PhotoStore(scene, MAX_IMAGE_SIDE_PX)
         mesh = load_mesh(meshed.folder / "mesh.npz")
         dense_path = meshed.folder / DENSE_MESH
         dense = load_mesh(dense_path) if dense_path.is_file() else None
-        source: PhotoSource = photos
-        if texture.source == "gaussians":
-            from ...gaussians.files import load_gaussians
-            from ...texture.atlas_colors import GaussianPhotos
-
-            trained_file = trained.folder / "gaussians.npz"
-            source = GaussianPhotos(load_gaussians(trained_file), photos, threads=threads)
+        source = photo_source(texture, trained, photos, threads)
         coarse_from = 0.7 if texture.lods else 0.9
         textured = texture_mesh(
             mesh, scene, source, texture, stage_folder, progress.span(0.0, coarse_from),
@@ -121,31 +106,145 @@ def run_texture(
     )  # fmt: skip
 
 
-# -- Export stage: gather the results of all regions in ``result/`` and write the report ----------
+def photo_source(
+    texture: TextureSettings, trained: Stage, photos: PhotoStore, threads: int
+) -> PhotoSource:
+    """Return what a texture is made of: the photos, or renderings of the Gaussians instead."""
+    from ...gaussians.files import load_gaussians
+    from ...texture.atlas_colors import GaussianPhotos
 
+    if texture.source != "gaussians":
+        return photos
+    return GaussianPhotos(load_gaussians(trained.folder / "gaussians.npz"), photos, threads=threads)
+
+
+# -- Bake stage: the photos onto a mesh from elsewhere; its files go to ``baked/NAME`` ------------
+
+BAKE_FILE = "bake.json"
+"""Figures of a bake, beside its files."""
+BAKE_VERSION = 1
+
+
+def require_training(folder: JobFolder, job: JobFile, cameras: Stage) -> None:
+    """Raise if a bake would have to train first."""
+    key, _ = training_keys(cameras.key, job)
+    if read_done(folder.stages / f"train-{key}") is None:
+        raise no_finished_training(folder.root)
+
+
+def run_bake(
+    folder: JobFolder, job: JobFile, cameras: Stage, trained: Stage, progress: Progress, *,
+    threads: int,
+) -> Stage:  # fmt: skip
+    """Bake onto the mesh of a job and replace ``baked/NAME``, or re-use the finished stage.
+
+    Raises UsageError: the job names no mesh; DatasetError, MeshingError: the mesh cannot be read or
+    textured, or no photo sees it; ResourceError: memory or disk space is not sufficient.
+    """
+    request = job.bake
+    if request is None:
+        raise UsageError("job.json names no mesh to bake onto.", "Start the bake again.")
+    request = request.validated()
+    files = [request.mesh, request.dense, request.sidecar]
+    key = stage_key(
+        STAGE_VERSIONS["bake"], cameras.key, trained.key, [_fingerprint(path) for path in files],
+        request.up, request.uvs, request.faces, key_values(request.texture), sorted(request.export),
+    )  # fmt: skip
+
+    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        from ...evaluation.photo_views import compare_with_photos
+        from ...limits import MAX_IMAGE_SIDE_PX
+        from ...mesh.textured_mesh import POLYGONS_FILE, write_polygons
+        from ...photos.store import PhotoStore
+        from ...scene.scene import load_refined_scene
+        from ...texture.bake_onto import BakeChoices, bake_onto, welded
+        from ...texture.files import write_textured
+
+        progress.update(0.0, "reading the mesh")
+        scene = load_refined_scene(cameras.folder, trained.folder)
+        given = _read_in_scene(request.mesh, request, scene.world_from_scene)
+        dense = None
+        if request.dense:
+            dense = welded(_read_in_scene(request.dense, request, scene.world_from_scene))
+        photos = PhotoStore(scene, MAX_IMAGE_SIDE_PX)
+        source = photo_source(request.texture, trained, photos, threads)
+        textured = bake_onto(
+            given, scene, source, request.texture, BakeChoices(request.uvs, request.faces),
+            stage_folder, progress.span(0.02, 0.9),
+            threads=threads, dense=dense, free_bytes=free_bytes(stage_folder),
+        )  # fmt: skip
+        files = stage_folder / "files"
+        progress.update(0.9, "writing the files")
+        write_textured(textured, files, request.export, scene.world_from_scene)
+        if given.is_new and given.polygons is not None:
+            write_polygons(files / POLYGONS_FILE, given.polygons)
+        progress.update(0.93, "comparing with photos")
+        rendering = compare_with_photos(
+            textured, scene, photos, (), files, progress.span(0.93, 1.0),
+            from_gaussians=request.texture.source == "gaussians", threads=threads,
+        )  # fmt: skip
+        figures = {
+            "version": BAKE_VERSION, "name": request.name, "vertices": len(textured.mesh.vertices),
+            "faces": len(textured.mesh.faces), "faces_given": len(given.faces),
+            "udims": list(textured.udims), "texture": textured.statistics,
+            "mesh_rendering": rendering,
+        }  # fmt: skip
+        write_json(files / BAKE_FILE, figures)
+        return figures
+
+    baked = run_stage(
+        folder.stages, f"bake-{request.name}", key, progress.span(0.0, 0.98), work,
+        whole=lambda stage_folder: is_whole(stage_folder / "files" / "mesh.npz"),
+    )  # fmt: skip
+    with new_result(folder.baked) as new:
+        shutil.copytree(baked.folder / "files", new / request.name)
+    progress.update(1.0, "finished")
+    return baked
+
+
+def _read_in_scene(path: str, request: BakeRequest, world_from_scene: Similarity) -> FileMesh:
+    """Read a mesh and bring it from its file's frame into the scene frame."""
+    from ...mesh.exchange import SUFFIX, read_handed_over, read_mesh_file, world_from_file
+
+    file = Path(path)
+    if file.suffix.lower() == SUFFIX:
+        mesh = read_handed_over(file)
+        world = mesh.vertices
+    else:
+        mesh = read_mesh_file(file)
+        sidecar = Path(request.sidecar) if request.sidecar else None
+        world = world_from_file(file, sidecar, request.up).points(mesh.vertices)
+    return replace(mesh, vertices=world_from_scene.inverse().points(world))
+
+
+def _fingerprint(path: str) -> str:
+    """Return a hash of a file's content, and of what lies beside it and tells its frame."""
+    if not path:
+        return ""
+    digest = hashlib.sha256()
+    file = Path(path)
+    for part in (file, file.with_name(file.name + ".json"), file.with_name("transform.json")):
+        if part.is_file():
+            with part.open("rb") as stream:
+                digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()
+
+
+# -- Export stage: gather the results of all regions in ``result/`` and write the report ----------
 
 REPORTS = ("report.json", "report.md")
 """Replaced last, since they describe all other files."""
 
 
 def export_results(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    trained: Stage,
-    regions: list[tuple[str, Stage, Stage]],
-    summary: dict[str, Any],
-    progress: Progress,
-) -> None:
+    folder: JobFolder, job: JobFile, cameras: Stage, trained: Stage,
+    regions: list[tuple[str, Stage, Stage]], summary: dict[str, Any], progress: Progress,
+) -> None:  # fmt: skip
     """Fill ``result/``; regions of earlier jobs in the same folder stay.
 
     Files are replaced together at the end: after a failure the result is unchanged.
 
-    Parameters
-    ----------
-    regions : list of (name, mesh stage, texture stage)
-    summary : dict
-        Measurements of the whole job, from the runner.
+    ``summary``: measurements of the whole job, from the runner.
     """
     from ...gaussians.files import load_gaussians, write_splat_ply
     from ...scene.scene import load_refined_scene
@@ -165,7 +264,10 @@ def export_results(
             for picture in sorted(textured.folder.glob("comparison-*.jpg")):
                 shutil.copy2(picture, target / picture.name)
             shutil.copy2(textured.folder / "preview.png", target / "preview.png")
-            figures = _region_figures(trained, meshed, textured)
+            seconds = {"mesh": meshed.done["seconds"], "texture": textured.done["seconds"]}
+            figures = _json_values(
+                {**meshed.done, **textured.done, "training": trained.key, "seconds": seconds}
+            )
             figures["world"] = _in_world_units(meshed, figures, scene.world_from_scene)
             write_json(target / "figures.json", _json_values(figures))
         shutil.copy2(regions[0][2].folder / "preview.png", new / "preview.png")
@@ -200,28 +302,17 @@ def _figures_in(result: Path) -> dict[str, dict[str, Any]]:
 def _job_report(
     cameras: Stage, trained: Stage, regions: list[tuple[str, Stage, Stage]]
 ) -> dict[str, Any]:
+    times = ("seconds", "processor_seconds")
     training = [*trained.before, trained]
     stages = [*cameras.before, cameras, *training, *(s for _, m, t in regions for s in (m, t))]
     return {
         "stages": [
-            {
-                "name": s.name,
-                "seconds": s.done.get("seconds"),
-                "processor_seconds": s.done.get("processor_seconds"),
-                "reused": s.reused,
-            }
+            {"name": s.name, **{t: s.done.get(t) for t in times}, "reused": s.reused}
             for s in stages
         ],
         "cameras": {k: v for k, v in cameras.done.items() if k != "finished_unix_s"},
         "training": {k: v for k, v in trained.done.items() if k != "finished_unix_s"},
     }
-
-
-def _region_figures(trained: Stage, meshed: Stage, textured: Stage) -> dict[str, Any]:
-    figures = {**meshed.done, **textured.done}
-    figures["training"] = trained.key
-    figures["seconds"] = {"mesh": meshed.done["seconds"], "texture": textured.done["seconds"]}
-    return _json_values(figures)
 
 
 def _in_world_units(

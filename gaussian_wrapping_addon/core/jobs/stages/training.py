@@ -4,22 +4,20 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import gc
-import json
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from ...array_file import is_whole
-from ...devices import DeviceChoice
+from ...devices import DeviceChoice, stage_device
 from ...errors import ParseError, ResourceError, UsageError, WorkerError
 from ...files import read_json, write_json
-from ...progress import Progress, ReportWarning, read_warnings
+from ...progress import COMPILING, Progress, ReportWarning, read_warnings
 from ...settings import MeshingSettings, TrainingSettings, to_json
 from ...worker.helper_process import own_peak_bytes
 from ..store.job_file import JobFile, blocks_key, training_keys
@@ -32,7 +30,6 @@ from ..store.rollback import (
     shorter_training,
 )
 from ..store.stage_folder import Stage, read_done, record_interrupted_time, run_stage
-from .training_cost import compile_if_needed, estimated_cost, fitting_device
 
 if TYPE_CHECKING:
     import numpy as np
@@ -48,7 +45,6 @@ if TYPE_CHECKING:
 
 
 # -- Retry a training with reduced settings after it runs out of memory ---------------------------
-
 
 _logger = logging.getLogger(__name__)
 
@@ -85,49 +81,29 @@ def is_out_of_memory(error: BaseException) -> bool:
     """
     if isinstance(error, (MemoryError, ResourceError)):
         return True
-    if not isinstance(error, RuntimeError):
-        return False
     text = str(error).lower()
-    return any(message in text for message in _TORCH_OOM_MESSAGES)
+    return isinstance(error, RuntimeError) and any(words in text for words in _TORCH_OOM_MESSAGES)
 
 
 def reduced_settings(settings: TrainingSettings) -> TrainingSettings | None:
     """Return settings with fewer Gaussians and smaller images; ``None`` at the lower bounds."""
-    gaussians = max(MIN_GAUSSIANS, round(GAUSSIANS_FACTOR * settings.max_gaussians))
-    side_px = max(MIN_IMAGE_PX, round(IMAGE_FACTOR * settings.max_image_px))
-    gaussians = min(gaussians, settings.max_gaussians)
-    side_px = min(side_px, settings.max_image_px)
-    if (gaussians, side_px) == (settings.max_gaussians, settings.max_image_px):
+    most, longest = settings.max_gaussians, settings.max_image_px
+    gaussians = min(most, max(MIN_GAUSSIANS, round(GAUSSIANS_FACTOR * most)))
+    side_px = min(longest, max(MIN_IMAGE_PX, round(IMAGE_FACTOR * longest)))
+    if (gaussians, side_px) == (most, longest):
         return None
     return replace(settings, max_gaussians=gaussians, max_image_px=side_px)
 
 
 def train_with_oom_retry(
-    train: Callable[[TrainingSettings], Result],
-    settings: TrainingSettings,
-    folder: Path,
+    train: Callable[[TrainingSettings], Result], settings: TrainingSettings, folder: Path,
     discard_checkpoints: Callable[[], None],
-) -> Trained[Result]:
+) -> Trained[Result]:  # fmt: skip
     """Train; after running out of memory, train again with reduced settings, at most twice.
 
-    The retries are recorded in the folder, so that an interrupted run resumes with the same
-    settings.
-
-    Parameters
-    ----------
-    train : callable
-        Takes the settings; trains from the start or the last checkpoint.
-    settings : TrainingSettings
-        The requested settings.
-    folder : Path
-        Of the training stage.
-    discard_checkpoints : callable
-        Removes the checkpoints of the failed attempt, which fit no other settings.
-
-    Raises
-    ------
-    ResourceError
-        The last retry also ran out of memory. Other exceptions of ``train`` propagate.
+    The retries are recorded in the folder of the stage: an interrupted run resumes with the same
+    settings. ``discard_checkpoints`` removes those of the failed attempt, which fit no other
+    settings. Raises ResourceError: the last retry also ran out of memory.
     """
     reasons = _read_retries(folder)
     for _ in reasons:
@@ -157,14 +133,8 @@ def train_with_oom_retry(
 
 
 @contextlib.contextmanager
-def within_memory(what: str) -> Iterator[None]:
-    """Turn running out of memory into an error with the next step, for a part of a training.
-
-    Raises
-    ------
-    ResourceError
-        Memory did not suffice: the part may work elsewhere.
-    """
+def _within_memory(what: str) -> Iterator[None]:
+    """Turn running out of memory into a ``ResourceError`` with the next step: for a part."""
     try:
         yield
     except (MemoryError, ResourceError, RuntimeError) as error:
@@ -200,8 +170,7 @@ def _read_retries(folder: Path) -> list[str]:
 
 def killed_hint(settings: TrainingSettings) -> str:
     """Return the hint for a training worker that the system killed, probably for its memory."""
-    reduced = reduced_settings(settings)
-    number = settings.max_gaussians if reduced is None else reduced.max_gaussians
+    number = (reduced_settings(settings) or settings).max_gaussians
     return (
         "Close other programs and resume, which continues from the last checkpoint; or resume with "
         f"--max-gaussians {number}, which trains anew with fewer."
@@ -211,10 +180,7 @@ def killed_hint(settings: TrainingSettings) -> str:
 def killed_mesh_hint(meshing: MeshingSettings, *, kept: bool) -> str:
     """Return the hint for a killed worker that was meshing or texturing.
 
-    Parameters
-    ----------
-    kept : bool
-        Whether the folder has the result of an earlier job.
+    ``kept`` tells whether the folder has the result of an earlier job.
     """
     alternatives = "fewer --points, a larger --edge-length, or --set tiles=N with more tiles"
     if meshing.method == "pivots":
@@ -225,82 +191,82 @@ def killed_mesh_hint(meshing: MeshingSettings, *, kept: bool) -> str:
     return f"Close other programs and resume; or use mesh with {alternatives}.{unchanged}"
 
 
-# -- Stages of a training in blocks: the coarse training with its plan, each block, joining -------
-#
-# They lie in a folder of their own, ``stages/blocks-KEY``: a longer training of the same job, or
-# one with another joint training, joins the same blocks.
-
+# -- Stages of a training: in one piece; or coarse with a plan, each block, and joining -----------
 
 COARSE, COARSE_KEY = "coarse", "all"
 BLOCK = "block"
 GAUSSIANS_NAME = "gaussians.npz"
-"""In the folder of a block: what it has trained."""
+"""In the folder of a training or a block: what it has trained."""
+REFINED = "poses_refined"
+"""Entry of ``done.json``: whether refined camera poses lie beside the Gaussians."""
 
 
 @dataclass
-class BlockStages:
-    """The stages of one training in blocks; scene and plan are loaded once.
+class TrainingStages:
+    """The stages of one training; each is run, or re-used. Scene and plan are loaded once.
 
-    Parameters
-    ----------
-    root : Path
-        Their folder.
-    cameras : Stage
-    threads : int
-    device : DeviceChoice
+    A training that was begun on another device continues on this one: no key depends on it. Each
+    stage raises ResourceError: the disk is too full, or memory does not suffice, not even with
+    reduced settings.
     """
 
-    root: Path
+    folder: JobFolder
     job: JobFile
     cameras: Stage
     threads: int
     device: DeviceChoice
 
-    @cached_property
-    def scene(self) -> Scene:
-        """The scene with the poses that it came with."""
-        from ...scene.scene import load_saved_scene
+    def run(self, progress: Progress) -> Stage:
+        """Train in one piece or join the blocks.
 
-        return load_saved_scene(self.cameras.folder)
-
-    def fit_device(self, gaussians: int | None = None) -> None:
-        """Train on the processor where the GPU's memory does not suffice for so many Gaussians."""
-        self.device = fitting_device(self.scene, self.job, self.device, gaussians)
-
-    def coarse(
-        self,
-        progress: Progress,
-        *,
-        inside: Inside | None,
-        estimated: Mapping[str, Any],
-        warnings: Sequence[ReportWarning],
-    ) -> Stage:
-        """Train the whole scene coarsely and divide it, or re-use that.
-
-        Parameters
-        ----------
-        estimated, warnings
-            Of the cost of the whole training, for the report.
-
-        Raises
-        ------
-        UsageError
-            The scene cannot be divided into so many blocks.
-        ResourceError
-            Memory does not suffice.
+        Raises UsageError: the job continues a training, and there is no training to continue;
+        WorkerError: a block is not finished.
         """
-        from ...training.block_plan import ARRAYS_NAME, PLAN_NAME
+        extra = self._settings.extra_iterations
+        _, base_key = self._keys
+
+        def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+            if extra and not checkpoints(stage_folder):
+                shorter = shorter_training(self.folder.stages, base_key, extra)
+                if shorter is not None:
+                    link_checkpoints(shorter, stage_folder, (RETRIES_FILE,))
+                elif self.job.command == "more":
+                    raise nothing_to_continue(self.folder)
+            with _time_noted(stage_folder):
+                train = self._in_one_piece if self._settings.blocks == 1 else self._joined
+                done = train(stage_folder, progress)
+            return {**done, "lineage": lineage(base_key, extra)}
+
+        key, stages = self._keys[0], self.folder.stages
+        trained = run_stage(stages, "train", key, progress, work, whole=_is_whole)
+        if self._settings.blocks == 1:
+            return trained
+        return replace(trained, before=tuple(self._finished(reused=trained.reused)))
+
+    def coarse(self, progress: Progress) -> Stage:
+        """Train the whole scene coarsely and divide it; or return the finished whole training.
+
+        Raises UsageError: the scene cannot be divided into so many blocks.
+        """
+        from ...training.block_plan import ARRAYS_NAME, PLAN_NAME, coarse_settings
+
+        if (trained := self._whole_training()) is not None:
+            return trained
+        self._fit_device(coarse_settings(self._settings).max_gaussians)
+        self._root.mkdir(parents=True, exist_ok=True)
+        estimated, warnings = self._estimated(self._root, progress)
+        inside = self._inside_regions()
 
         def whole(folder: Path) -> bool:
-            return (self.root / PLAN_NAME).is_file() and is_whole(self.root / ARRAYS_NAME)
+            return (self._root / PLAN_NAME).is_file() and is_whole(self._root / ARRAYS_NAME)
 
         def work(folder: Path, progress: Progress) -> dict[str, Any]:
-            with self._noted(COARSE, COARSE_KEY), within_memory("The coarse training"):
+            with _time_noted(folder), _within_memory("The coarse training"):
                 done = self._train_coarse(folder, progress, inside)
             listed = [warning.to_json() for warning in warnings]
             return {**done, "estimate": estimated, "warnings": [*listed, *done["warnings"]]}
 
-        return run_stage(self.root, COARSE, COARSE_KEY, progress, work, whole=whole)
+        return run_stage(self._root, COARSE, COARSE_KEY, progress, work, whole=whole)
 
     def _train_coarse(
         self, folder: Path, progress: Progress, inside: Inside | None
@@ -309,13 +275,12 @@ class BlockStages:
         from ...training.block_plan import coarse_settings, plan_blocks, save_plan, train_coarse
         from ...training.state import remove_checkpoints
 
-        settings, scene = self._settings, self.scene
+        settings, scene = self._settings, self._scene
         less = coarse_settings(settings)
-        backend = self._backend()
         coarse = train_coarse(
             scene, _photos(scene, less), less, folder,
             progress.span(0.0, 0.9), seed=self.job.settings.seed, threads=self.threads,
-            inside=inside, backend=backend,
+            inside=inside, backend=self._backend(),
         )  # fmt: skip
         if coarse.poses is not None:
             scene = with_poses(scene, coarse.poses)
@@ -323,7 +288,7 @@ class BlockStages:
             coarse, scene, _photos(scene, settings), settings, progress.span(0.9, 1.0),
             threads=self.threads,
         )  # fmt: skip
-        save_plan(self.root, plan)
+        save_plan(self._root, plan)
         remove_checkpoints(folder)
         return {
             "gaussians": len(coarse.gaussians),
@@ -334,39 +299,35 @@ class BlockStages:
             "peak_memory_bytes": own_peak_bytes(),
         }
 
-    def block(self, index: int, progress: Progress, *, inside: Inside | None) -> Stage:
-        """Train a block, or re-use it.
+    def block(self, index: int, progress: Progress) -> Stage:
+        """Train a block; or return the finished whole training.
 
-        Raises
-        ------
-        UsageError
-            There is no such block.
-        WorkerError
-            The coarse training is not finished.
-        ParseError
-            Its files are damaged.
-        ResourceError
-            Memory does not suffice.
+        Raises UsageError: there is no such block; WorkerError: the coarse training is not finished;
+        ParseError: its files are damaged.
         """
+        from ...training.estimate import gaussians_of_block
 
+        if (trained := self._whole_training()) is not None:
+            return trained
+        self._fit_device(gaussians_of_block(self._settings))
+        compile_if_needed(self._settings, self._root, progress, self.threads, self.device)
         if not 0 <= index < self._settings.blocks:
             raise UsageError(
                 f"The training has no block {index}, but {self._settings.blocks} blocks.",
                 "Plan the parts again: batch.py parts DIR.",
             )
+        inside = self._inside_regions()
 
         def whole(folder: Path) -> bool:
             done = read_done(folder) or {}
             # A coarse training that was done again, on another machine, may divide differently.
             return done.get("plan") == self._plan.digest and is_whole(folder / GAUSSIANS_NAME)
 
-        key = f"{index:04d}"
-
         def work(folder: Path, progress: Progress) -> dict[str, Any]:
-            with self._noted(BLOCK, key), within_memory(f"Block {index}"):
+            with _time_noted(folder), _within_memory(f"Block {index}"):
                 return self._train_block(index, folder, progress, inside)
 
-        return run_stage(self.root, BLOCK, key, progress, work, whole=whole)
+        return run_stage(self._root, BLOCK, f"{index:04d}", progress, work, whole=whole)
 
     def _train_block(
         self, index: int, folder: Path, progress: Progress, inside: Inside | None
@@ -389,71 +350,57 @@ class BlockStages:
         remove_checkpoints(folder)
         block = plan.blocks[index]
         return {
-            "plan": plan.digest,
-            "photos": len(block.views),
-            "still": len(block.still),
-            "gaussians": len(result.gaussians),
-            "iterations": result.iterations,
-            "device": result.device,
-            "warnings": [warning.to_json() for warning in result.warnings],
+            "plan": plan.digest, "photos": len(block.views), "still": len(block.still),
+            "gaussians": len(result.gaussians), "iterations": result.iterations,
+            "device": result.device, "warnings": [w.to_json() for w in result.warnings],
             "peak_memory_bytes": own_peak_bytes(),
-        }
+        }  # fmt: skip
 
-    def finished(self, *, reused: bool = False) -> list[Stage]:
-        """Return the stages that are finished and still there, the coarse one first.
+    def _whole_training(self) -> Stage | None:
+        """Return the finished training that the blocks are for: they may be gone then."""
+        path = self.folder.stages / f"train-{self._keys[0]}"
+        done = read_done(path)
+        if done is None or not _is_whole(path):
+            return None
+        return Stage("train", self._keys[0], path, done, True)
 
-        Parameters
-        ----------
-        reused : bool
-            Whether they are noted as of an earlier run.
-        """
+    def _finished(self, *, reused: bool = True) -> list[Stage]:
+        """Return the stages that are finished and still there, the coarse one first."""
         names = [(COARSE, COARSE_KEY)]
         names += [(BLOCK, f"{index:04d}") for index in range(self._settings.blocks)]
         found = []
         for name, key in names:
-            folder = self.root / f"{name}-{key}"
+            folder = self._root / f"{name}-{key}"
             done = read_done(folder)
             if done is not None:
                 found.append(Stage(name, key, folder, done, reused))
         return found
 
-    def figures(self, joined_s: float) -> dict[str, Any]:
-        """Return what the report tells of the blocks, and the estimate made before them.
-
-        Parameters
-        ----------
-        joined_s : float
-            Seconds of the joint training.
-        """
-        coarse, *blocks = self.finished()
+    def _joined(self, stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        """Join the blocks; return the content of ``done.json``."""
+        self._fit_device(self._settings.max_gaussians)
+        compile_if_needed(self._settings, stage_folder, progress, self.threads, self.device)
+        result = self._join(stage_folder, progress)
+        done = self._written(stage_folder, Trained(result, self._settings, ()))
+        coarse, *blocks = self._finished()
         names = ("photos", "still", "gaussians", "iterations", "seconds", "peak_memory_bytes")
         coarse_s = float(coarse.done["seconds"])
         blocks_s = sum(float(stage.done["seconds"]) for stage in blocks)
         return {
+            **done,
             "estimate": coarse.done["estimate"],
             "blocks": [{name: stage.done[name] for name in names} for stage in blocks],
             "seconds_coarse": coarse_s,
-            "seconds_training": round(coarse_s + blocks_s + joined_s, 3),
+            "seconds_training": round(coarse_s + blocks_s + result.seconds, 3),
         }
 
-    def join(self, folder: Path, progress: Progress) -> TrainingResult:
-        """Join all blocks and train them together.
-
-        Returns
-        -------
-        TrainingResult
-            With the poses that the coarse training refined.
-
-        Raises
-        ------
-        WorkerError
-            A block is not finished.
-        """
+    def _join(self, folder: Path, progress: Progress) -> TrainingResult:
+        """Train all blocks together; the poses are those that the coarse training refined."""
         from ...gaussians.files import load_gaussians
         from ...training.blocks import joint_training
         from ...training.trainer import train
 
-        stages = self.finished()
+        stages = self._finished()
         if len(stages) < self._settings.blocks + 1:
             raise WorkerError("Blocks of the training are missing.", "Resume the job.")
         plan, settings = self._plan, self._settings
@@ -467,7 +414,7 @@ class BlockStages:
                     )
                 yield load_gaussians(stage.folder / GAUSSIANS_NAME)
 
-        with within_memory("Joining the blocks"):
+        with _within_memory("Joining the blocks"):
             photos, backend = _photos(scene, settings), self._backend()
             last, handover = joint_training(
                 plan, parts(), photos, settings, progress.span(0.0, 0.05), backend.renderer,
@@ -479,37 +426,103 @@ class BlockStages:
                 start=handover,
             )  # fmt: skip
         earlier = [w for stage in stages for w in read_warnings(stage.done.get("warnings"))]
-        return dataclasses.replace(
-            result, poses=plan.coarse.poses, warnings=(*earlier, *result.warnings)
-        )
+        return replace(result, poses=plan.coarse.poses, warnings=(*earlier, *result.warnings))
 
-    @contextlib.contextmanager
-    def _noted(self, name: str, key: str) -> Iterator[None]:
-        """Note the time of a run that is interrupted, for the report."""
-        begun_s = time.monotonic()
-        try:
-            yield
-        except BaseException:
-            record_interrupted_time(self.root, name, key, time.monotonic() - begun_s)
-            raise
+    def _in_one_piece(self, stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        """Train the whole scene; return the content of ``done.json``."""
+        from ...training.state import remove_checkpoints
+        from ...training.trainer import train
+        from .cameras import start_splat_of
+
+        self._fit_device(self._settings.max_gaussians)
+        scene = self._scene
+        estimated, warnings = self._estimated(stage_folder, progress)
+        inside = self._inside_regions()
+        _logger.info("training on %s", self.device.device)
+
+        def attempt(settings: TrainingSettings) -> TrainingResult:
+            return train(
+                scene, _photos(scene, settings), settings, stage_folder, progress,
+                seed=self.job.settings.seed, threads=self.threads,
+                start=start_splat_of(self.job), inside=inside, backend=self._backend(),
+            )  # fmt: skip
+
+        trained = train_with_oom_retry(
+            attempt, self._settings, stage_folder, lambda: remove_checkpoints(stage_folder)
+        )
+        done = self._written(stage_folder, trained)
+        earlier = [warning.to_json() for warning in (*warnings, *trained.warnings)]
+        return {**done, "warnings": [*earlier, *done["warnings"]], "estimate": estimated}
+
+    def _written(self, stage_folder: Path, trained: Trained[TrainingResult]) -> dict[str, Any]:
+        """Write Gaussians, poses and pictures of held-out photos; return the figures."""
+        from ...devices.checks import with_renderer
+        from ...evaluation.report.pictures import write_held_out
+        from ...gaussians.files import save_gaussians
+        from ...scene.scene import held_out_views, load_refined_scene, save_poses
+
+        result = trained.result
+        save_gaussians(stage_folder / GAUSSIANS_NAME, result.gaussians)
+        save_poses(stage_folder, result.poses)
+        scene = load_refined_scene(self.cameras.folder, stage_folder)
+        measured = {figure.name: figure.psnr for figure in result.held_out}
+        shown = [
+            (index, scene.views[index].camera.name, measured[scene.views[index].camera.name])
+            for index in held_out_views(scene, trained.settings.holdout_every)
+            if scene.views[index].camera.name in measured
+        ]
+        photos = _photos(scene, trained.settings)
+        pictures = with_renderer(
+            result.device,
+            "Pictures of held-out photos",
+            lambda renderer: write_held_out(
+                result.gaussians, photos, shown, stage_folder, threads=self.threads,
+                renderer=renderer,
+            ),
+        )  # fmt: skip
+        return {
+            **result.to_json(), REFINED: result.poses is not None, "device": result.device,
+            "device_reason": self.device.reason, "pictures": pictures,
+            "settings": to_json(trained.settings),
+        }  # fmt: skip
 
     @property
     def _settings(self) -> TrainingSettings:
         return self.job.settings.training
 
     @cached_property
+    def _keys(self) -> tuple[str, str]:
+        return training_keys(self.cameras.key, self.job)
+
+    @cached_property
+    def _root(self) -> Path:
+        """The folder of the blocks.
+
+        A longer training of the same job, or one with another joint training, joins the same ones.
+        """
+        return self.folder.stages / f"blocks-{blocks_key(self.cameras.key, self.job)}"
+
+    @cached_property
+    def _scene(self) -> Scene:
+        """The scene with the poses that it came with."""
+        from ...scene.scene import load_saved_scene
+
+        return load_saved_scene(self.cameras.folder)
+
+    @cached_property
     def _plan(self) -> BlockPlan:
         from ...training.block_plan import PLAN_NAME, load_plan
 
-        if not (self.root / PLAN_NAME).is_file():
+        if not (self._root / PLAN_NAME).is_file():
             raise WorkerError("The training is not divided into blocks yet.", "Resume the job.")
-        return load_plan(self.root)
+        return load_plan(self._root)
 
     def _refined(self, plan: BlockPlan) -> Scene:
         from ...scene.scene import with_poses
 
-        scene, poses = self.scene, plan.coarse.poses
-        return scene if poses is None else with_poses(scene, poses)
+        return (
+            self._scene if plan.coarse.poses is None else with_poses(self._scene, plan.coarse.poses)
+        )
 
     def _priors(
         self, plan: BlockPlan, scene: Scene, views: tuple[int, ...]
@@ -517,9 +530,46 @@ class BlockStages:
         from ...training.block_plan import coarse_settings, confirmed_depths
 
         settings = coarse_settings(self._settings)
-        folder = self.root / f"{COARSE}-{COARSE_KEY}"
+        folder = self._root / f"{COARSE}-{COARSE_KEY}"
         photos = _photos(scene, settings)
         return confirmed_depths(plan.coarse, folder, photos, settings, plan.views, views)
+
+    def _fit_device(self, gaussians: int) -> None:
+        """Train on the processor where the GPU's memory does not suffice for so many Gaussians."""
+        from ...training.estimate import gpu_bytes, scene_facts
+
+        if self.device.is_cuda:
+            needed = gpu_bytes(scene_facts(self._scene), self._settings, gaussians)
+            setting = self.job.settings.device
+            self.device = stage_device(self.device, setting, needed, "Training")
+
+    def _estimated(
+        self, stage_folder: Path, progress: Progress
+    ) -> tuple[dict[str, Any], list[ReportWarning]]:
+        """Estimate the cost, for ``done.json``, or raise where the disk is too full.
+
+        The renderer is compiled for it.
+        """
+        from ...training import estimate
+        from ...training.splat_start import wrapping_settings
+        from .cameras import start_splat_of
+
+        training, threads = self._settings, self.threads
+        if start_splat_of(self.job) is not None:
+            training = wrapping_settings(training)
+        compile_if_needed(self._settings, stage_folder, progress, threads, self.device)
+        progress.update(0.0, "timing this machine")
+        speeds = estimate.speeds(threads, self.device.device)
+        machine = estimate.this_machine(stage_folder, *speeds)
+        done = [int(path.stem.rpartition("-")[2]) for path in checkpoints(stage_folder)]
+        facts, first = estimate.scene_facts(self._scene), max(done, default=0)
+        expected = estimate.estimate_training(facts, training, machine, first=first)
+        warnings = estimate.check_resources(expected, machine)
+        _logger.info("estimate: %s", expected.sentence())
+        for warning in warnings:
+            _logger.warning("%s", warning.text)
+        progress.update(0.0, f"training will take {expected.span()}")
+        return {**asdict(expected), "speed": machine.speed}, warnings
 
     def _backend(self) -> Backend:
         from ...training.device_backend import chosen_backend
@@ -528,13 +578,42 @@ class BlockStages:
             self.device.device, self.threads, or_processor=self.job.settings.device == "auto"
         )
 
+    def _inside_regions(self) -> Inside | None:
+        """Return the test whether points lie in the job's weighted regions, scene frame, if any."""
+        from .cameras import regions_listed
+
+        if not self._settings.focus:
+            return None
+        regions = regions_listed(self._settings.focus, self._scene)
+
+        def inside(points: np.ndarray) -> np.ndarray:
+            found = regions[0].contains(points, 0.0)
+            for region in regions[1:]:
+                found |= region.contains(points, 0.0)
+            return found
+
+        return inside
+
+
+def compile_if_needed(
+    settings: TrainingSettings, folder: Path, progress: Progress, threads: int, device: DeviceChoice
+) -> None:
+    """Compile the renderer if that was never done on this machine, and say so."""
+    from ...training.estimate import renderer_is_compiled
+    from ...training.warm_up import compile_kernels
+
+    if device.is_cuda or renderer_is_compiled():
+        return
+    progress.enter(COMPILING, "compiling the renderer, about a minute, only this once")
+    compile_kernels(settings, folder, progress, threads=threads)
+
 
 def plan_files(stage: Stage) -> list[Path]:
     """Return the files of the plan beside a coarse training; none beside another stage."""
-    from ...training.block_plan import ARRAYS_NAME, PLAN_NAME
-
     if stage.name != COARSE:
         return []
+    from ...training.block_plan import ARRAYS_NAME, PLAN_NAME
+
     return [stage.folder.parent / name for name in (PLAN_NAME, ARRAYS_NAME)]
 
 
@@ -544,276 +623,20 @@ def _photos(scene: Scene, settings: TrainingSettings) -> PhotoStore:
     return PhotoStore(scene, settings.max_image_px)
 
 
-# -- Training stage: continue a shorter training, retry when out of memory, join blocks -----------
-
-
-REFINED = "poses_refined"
-"""Entry of ``done.json``: whether refined camera poses lie beside the Gaussians."""
-
-
-def run_training(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    progress: Progress,
-    *,
-    version: int,
-    threads: int,
-    device: DeviceChoice,
-) -> Stage:
-    """Train, or re-use a finished training.
-
-    Parameters
-    ----------
-    device : DeviceChoice
-        The job's. A training that was begun elsewhere continues here: no key depends on it.
-
-    Raises
-    ------
-    UsageError
-        The job continues a training, and there is no training to continue.
-    ResourceError
-        The disk is too full, or memory does not suffice even with reduced settings.
-    """
-    key, base_key = training_keys(version, cameras.key, job)
-    extra = job.settings.training.extra_iterations
-
-    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
-        if extra and not checkpoints(stage_folder):
-            shorter = shorter_training(folder.stages, base_key, extra)
-            if shorter is not None:
-                link_checkpoints(shorter, stage_folder, (RETRIES_FILE,))
-            elif job.command == "more":
-                raise nothing_to_continue(folder)
-        begun_s = time.monotonic()
-        try:
-            if job.settings.training.blocks > 1:
-                blocks = _blocks(folder, job, cameras, version, threads, device)
-                done = _join(stage_folder, blocks, progress)
-            else:
-                done = _train(stage_folder, job, cameras, progress, threads, device)
-        except BaseException:
-            record_interrupted_time(folder.stages, "train", key, time.monotonic() - begun_s)
-            raise
-        return {**done, "lineage": lineage(base_key, extra)}
-
-    trained = run_stage(folder.stages, "train", key, progress, work, whole=_is_whole)
-    if job.settings.training.blocks == 1:
-        return trained
-    before = _blocks(folder, job, cameras, version, threads, device).finished(reused=trained.reused)
-    return replace(trained, before=tuple(before))
-
-
-def run_coarse(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    progress: Progress,
-    *,
-    version: int,
-    threads: int,
-    device: DeviceChoice,
-) -> Stage:
-    """Train coarsely and divide the scene into blocks, or re-use that or the finished training.
-
-    Raises
-    ------
-    UsageError
-        The scene cannot be divided into so many blocks.
-    ResourceError
-        The disk is too full, or memory does not suffice.
-    """
-    from ...training.block_plan import coarse_settings
-
-    most = coarse_settings(job.settings.training).max_gaussians
-    blocks = _opened(folder, job, cameras, most, version, threads, device)
-    if isinstance(blocks, Stage):
-        return blocks
-    blocks.root.mkdir(parents=True, exist_ok=True)
-    estimated, warnings = estimated_cost(
-        blocks.scene, job, blocks.root, progress, threads, blocks.device
-    )
-    inside = _inside_regions(job, blocks.scene)
-    return blocks.coarse(progress, inside=inside, estimated=estimated, warnings=warnings)
-
-
-def run_block(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    index: int,
-    progress: Progress,
-    *,
-    version: int,
-    threads: int,
-    device: DeviceChoice,
-) -> Stage:
-    """Train a block, or re-use it or the finished training.
-
-    Raises
-    ------
-    WorkerError
-        The coarse training is not finished.
-    ResourceError
-        Memory does not suffice.
-    """
-    from ...training.estimate import gaussians_of_block
-
-    most = gaussians_of_block(job.settings.training)
-    blocks = _opened(folder, job, cameras, most, version, threads, device)
-    if isinstance(blocks, Stage):
-        return blocks
-    compile_if_needed(job, blocks.root, progress, threads, blocks.device)
-    return blocks.block(index, progress, inside=_inside_regions(job, blocks.scene))
-
-
-def _opened(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    gaussians: int,
-    version: int,
-    threads: int,
-    device: DeviceChoice,
-) -> BlockStages | Stage:
-    """Return the blocks, or the finished training that they are for: they may be gone then."""
-    key, _ = training_keys(version, cameras.key, job)
-    path = folder.stages / f"train-{key}"
-    done = read_done(path)
-    if done is not None and _is_whole(path):
-        return Stage("train", key, path, done, True)
-    blocks = _blocks(folder, job, cameras, version, threads, device)
-    blocks.fit_device(gaussians)
-    return blocks
+@contextlib.contextmanager
+def _time_noted(stage_folder: Path) -> Iterator[None]:
+    """Note the time of a run that is interrupted, for the report."""
+    begun_s = time.monotonic()
+    try:
+        yield
+    except BaseException:
+        record_interrupted_time(stage_folder, time.monotonic() - begun_s)
+        raise
 
 
 def _is_whole(stage_folder: Path) -> bool:
     from ...scene.scene import POSES_NAME
 
-    done = read_done(stage_folder) or {}
-    names = [GAUSSIANS_NAME, *([POSES_NAME] if done.get(REFINED) else [])]
+    refined = (read_done(stage_folder) or {}).get(REFINED)
+    names = [GAUSSIANS_NAME, *([POSES_NAME] if refined else [])]
     return all(is_whole(stage_folder / name) for name in names)
-
-
-def _blocks(
-    folder: JobFolder,
-    job: JobFile,
-    cameras: Stage,
-    version: int,
-    threads: int,
-    device: DeviceChoice,
-) -> BlockStages:
-    root = folder.stages / f"blocks-{blocks_key(version, cameras.key, job)}"
-    return BlockStages(root, job, cameras, threads, device)
-
-
-def _train(
-    stage_folder: Path,
-    job: JobFile,
-    cameras: Stage,
-    progress: Progress,
-    threads: int,
-    device: DeviceChoice,
-) -> dict[str, Any]:
-    """Train in one piece; return the content of ``done.json``."""
-    from ...photos.store import PhotoStore
-    from ...scene.scene import load_saved_scene
-    from ...training.device_backend import chosen_backend
-    from ...training.state import remove_checkpoints
-    from ...training.trainer import train
-    from .cameras import start_splat_of
-
-    scene = load_saved_scene(cameras.folder)
-    device = fitting_device(scene, job, device)
-    estimated, warnings = estimated_cost(scene, job, stage_folder, progress, threads, device)
-    inside = _inside_regions(job, scene)
-    _logger.info("training on %s", device.device)
-
-    def attempt(settings: TrainingSettings) -> TrainingResult:
-        photos = PhotoStore(scene, settings.max_image_px)
-        return train(
-            scene, photos, settings, stage_folder, progress,
-            seed=job.settings.seed, threads=threads, start=start_splat_of(job), inside=inside,
-            backend=chosen_backend(
-                device.device, threads, or_processor=job.settings.device == "auto"
-            ),
-        )  # fmt: skip
-
-    trained = train_with_oom_retry(
-        attempt, job.settings.training, stage_folder, lambda: remove_checkpoints(stage_folder)
-    )
-    done = _written(stage_folder, cameras, trained, threads, device)
-    earlier = [warning.to_json() for warning in (*warnings, *trained.warnings)]
-    return {**done, "warnings": [*earlier, *done["warnings"]], "estimate": estimated}
-
-
-def _join(stage_folder: Path, blocks: BlockStages, progress: Progress) -> dict[str, Any]:
-    """Join the blocks of a training; return the content of ``done.json``."""
-    blocks.fit_device()
-    compile_if_needed(blocks.job, stage_folder, progress, blocks.threads, blocks.device)
-    trained = Trained(blocks.join(stage_folder, progress), blocks.job.settings.training, ())
-    done = _written(stage_folder, blocks.cameras, trained, blocks.threads, blocks.device)
-    return {**done, **blocks.figures(trained.result.seconds)}
-
-
-def _written(
-    stage_folder: Path,
-    cameras: Stage,
-    trained: Trained[TrainingResult],
-    threads: int,
-    device: DeviceChoice,
-) -> dict[str, Any]:
-    """Write Gaussians, poses and pictures of held-out photos; return the figures."""
-    from ...devices.checks import with_renderer
-    from ...evaluation.report.pictures import write_held_out
-    from ...gaussians.files import save_gaussians
-    from ...photos.store import PhotoStore
-    from ...scene.scene import held_out_views, load_refined_scene, save_poses
-
-    result = trained.result
-    save_gaussians(stage_folder / GAUSSIANS_NAME, result.gaussians)
-    save_poses(stage_folder, result.poses)
-    scene = load_refined_scene(cameras.folder, stage_folder)
-    measured = {figure.name: figure.psnr for figure in result.held_out}
-    shown = [
-        (index, scene.views[index].camera.name, measured[scene.views[index].camera.name])
-        for index in held_out_views(scene, trained.settings.holdout_every)
-        if scene.views[index].camera.name in measured
-    ]
-    photos = PhotoStore(scene, trained.settings.max_image_px)
-    pictures = with_renderer(
-        result.device,
-        "Pictures of held-out photos",
-        lambda renderer: write_held_out(
-            result.gaussians, photos, shown, stage_folder, threads=threads, renderer=renderer
-        ),
-    )
-    return {
-        **result.to_json(),
-        REFINED: result.poses is not None,
-        "device": result.device,
-        "device_reason": device.reason,
-        "pictures": pictures,
-        "settings": to_json(trained.settings),
-    }
-
-
-def _inside_regions(job: JobFile, scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Return the test whether points lie in the job's weighted regions, scene frame, if any."""
-    from ...regions.scene_regions import parse_region, region_in_scene
-
-    focus = job.settings.training.focus
-    if not focus:
-        return None
-    regions = [
-        region_in_scene(parse_region(body, Path("job.json")), scene.world_from_scene)
-        for body in json.loads(focus)
-    ]
-
-    def inside(points: np.ndarray) -> np.ndarray:
-        found = regions[0].contains(points, 0.0)
-        for region in regions[1:]:
-            found |= region.contains(points, 0.0)
-        return found
-
-    return inside

@@ -39,12 +39,11 @@ from ...settings import (
     to_json,
 )
 from ...units.georeference import metric_from_world
-from .stage_folder import stage_key
+from .stage_folder import STAGE_VERSIONS, stage_key
 
 # -- What a job bakes the photos onto: the entry ``bake`` of the job file -------------------------
 #
 # Standard library only.
-
 
 MAX_FACES = 100_000_000
 MIN_FACES = 4
@@ -75,12 +74,8 @@ class BakeRequest:
     def validated(self) -> BakeRequest:
         """Return self with a safe name, or raise.
 
-        Raises
-        ------
-        UsageError
-            A choice is unknown or out of range, or contradicts another one.
-        DatasetError
-            A file does not exist.
+        Raises UsageError: a choice is unknown or out of range, or contradicts another one;
+        DatasetError: a file does not exist.
         """
         files = ((self.mesh, "mesh"), (self.sidecar, "sidecar"), (self.dense, "dense mesh"))
         for path, what in files:
@@ -108,28 +103,8 @@ class BakeRequest:
         JobSettings(texture=self.texture).validated()
         return replace(self, name=file_stem(self.name, 0))
 
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
-        return to_json(self)
-
-    @classmethod
-    def from_json(cls, values: Any) -> BakeRequest:
-        """Build from :meth:`to_json`'s values.
-
-        Raises
-        ------
-        UsageError
-            An entry is missing, unknown, of the wrong type or out of range.
-        """
-        try:
-            request: BakeRequest = from_json(cls, values, "bake")
-        except TypeError:
-            raise UsageError("job.json: bake names no mesh.", "Start the bake again.") from None
-        return request
-
 
 # -- The job file: command, input, settings and regions, the same for button and command line -----
-
 
 SCHEMA_VERSION = 1
 COMMANDS = ("wrap", "mesh", "more", "bake")
@@ -162,25 +137,19 @@ class JobFile:
         """Return plain JSON values."""
         # Omitted if empty: job files stay as they were before this entry existed.
         own = {"edge_lengths": self.edge_lengths} if self.edge_lengths else {}
-        bake = {"bake": self.bake.to_json()} if self.bake is not None else {}
+        bake = {"bake": to_json(self.bake)} if self.bake is not None else {}
         return {
-            **own,
-            **bake,
-            "schema_version": SCHEMA_VERSION,
-            "command": self.command,
-            "source": self.source,
-            "settings": to_json(self.settings),
+            **own, **bake, "schema_version": SCHEMA_VERSION, "command": self.command,
+            "source": self.source, "settings": to_json(self.settings),
             "region_bodies": self.region_bodies,
-        }
+        }  # fmt: skip
 
     @classmethod
     def from_json(cls, values: Any) -> JobFile:
         """Build from :meth:`to_json`'s values.
 
-        Raises
-        ------
-        UsageError
-            An entry is missing, unknown, of the wrong type or out of range; a region is invalid.
+        Raises UsageError: an entry is missing, unknown, of the wrong type or out of range; a region
+        is invalid.
         """
         wanted = {"schema_version", "command", "source", "settings", "region_bodies"}
         if not isinstance(values, dict) or set(values) - {"edge_lengths", "bake"} != wanted:
@@ -200,30 +169,23 @@ class JobFile:
         lengths = _checked_lengths(values.get("edge_lengths", {}), settings.regions)
         if (values["command"] == "bake") != ("bake" in values):
             raise UsageError("job.json names no mesh to bake onto.", "Start the bake again.")
-        bake = BakeRequest.from_json(values["bake"]) if "bake" in values else None
+        try:
+            bake = from_json(BakeRequest, values["bake"], "bake") if "bake" in values else None
+        except TypeError:
+            raise UsageError("job.json: bake names no mesh.", "Start the bake again.") from None
         bodies = values["region_bodies"]
         return cls(values["command"], values["source"], settings, bodies, lengths, bake)
 
 
 def make_job(
-    command: str,
-    source: Path,
-    settings: JobSettings,
+    command: str, source: Path, settings: JobSettings,
     edge_lengths: Mapping[str, float] | None = None,
-) -> JobFile:
+) -> JobFile:  # fmt: skip
     """Check the settings, read the region files, and return the job.
 
-    Parameters
-    ----------
-    edge_lengths : mapping, optional
-        Edge lengths, world units, of regions that have their own, keyed by their entry in
-        ``settings.regions``.
-
-    Raises
-    ------
-    UsageError, DatasetError
-        A setting is out of range; the source or a region file is missing or unreadable; two
-        regions have the same name.
+    ``edge_lengths``: of regions that have their own, world units, by entry in ``settings.regions``.
+    Raises UsageError, DatasetError: a setting is out of range; the source or a region file is
+    missing or unreadable; two regions have the same name.
     """
     settings = settings.validated()
     _check_source(str(real_path(source)))
@@ -273,14 +235,11 @@ def make_job(
         training = replace(training, focus=listed if weighted else "")
         mask_regions = listed if _makes_masks_of_regions(settings, source, bodies) else ""
     settings = replace(
-        settings,
-        training=training,
-        mask_regions=mask_regions,
+        settings, training=training, mask_regions=mask_regions,
         mask_model=str(real_path(settings.mask_model)) if settings.mask_model else "",
-        regions=tuple(names),
-        start_splat=str(real_path(start)) if start else "",
+        regions=tuple(names), start_splat=str(real_path(start)) if start else "",
         control_points=str(real_path(control)) if control else "",
-    )
+    )  # fmt: skip
     return JobFile(command, str(real_path(source)), settings, bodies, lengths)
 
 
@@ -372,10 +331,7 @@ def _check_regions(bodies: dict[str, Any]) -> None:
 def make_bake_job(earlier: JobFile, request: BakeRequest) -> JobFile:
     """Return the job that bakes the photos of a finished job onto a mesh.
 
-    Raises
-    ------
-    UsageError, DatasetError
-        A setting is out of range, or a file does not exist.
+    Raises UsageError, DatasetError: a setting is out of range, or a file does not exist.
     """
     return replace(earlier, command="bake", bake=request.validated())
 
@@ -393,21 +349,10 @@ def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:
 
 
 def reject_region_conflicts(result: Path, job: JobFile) -> None:
-    """Raise if a region of a job would overwrite the result of a different region.
+    """Raise if a region of a job would overwrite the result of a different region in ``result``.
 
-    A region of the same name is the same region, meshed again.
-
-    Parameters
-    ----------
-    result : Path
-        The result folder of the job; need not exist.
-
-    Raises
-    ------
-    UsageError
-        Two regions of the job, or one of it and one meshed before, conflict; names both.
-    ParseError
-        A region in the job file is invalid.
+    A region of the same name is the same region, meshed again. Raises UsageError: names both
+    regions; ParseError: a region in the job file is invalid.
     """
     region_names(job.settings.regions, job.region_bodies)
     folders = {
@@ -418,19 +363,10 @@ def reject_region_conflicts(result: Path, job: JobFile) -> None:
 
 
 def reject_folder_conflicts(result: Path, folders: dict[str, str]) -> None:
-    """Raise if a region's result folder belongs to a region with another name.
+    """Raise UsageError if a region's result folder belongs to a region with another name.
 
-    A region of the same name is the same region, meshed again.
-
-    Parameters
-    ----------
-    folders : dict
-        Folder name by region name, as the region's file gives it.
-
-    Raises
-    ------
-    UsageError
-        Two regions conflict; names both.
+    ``folders``: folder name by region name, as the region's file gives it. A region of the same
+    name is the same region, meshed again.
     """
     there = {path.parent.name: path for path in sorted(result.glob("*/region.json"))}
     for wanted, name in folders.items():
@@ -467,10 +403,7 @@ def write_job(path: Path, job: JobFile) -> None:
 def start_fingerprint(path: str) -> list[Any]:
     """Return path, size and time of the start splat for the stage key; empty for none.
 
-    Raises
-    ------
-    DatasetError
-        The file does not exist, or is a pipe or a device.
+    Raises DatasetError: the file does not exist, or is a pipe or a device.
     """
     if not path:
         return []
@@ -486,27 +419,26 @@ def start_fingerprint(path: str) -> list[Any]:
     return [path, state.st_size, state.st_mtime_ns]
 
 
-def training_keys(version: int, cameras_key: str, job: JobFile) -> tuple[str, str]:
-    """Return the stage's key, and the key without the extra iterations."""
+def training_keys(cameras_key: str, job: JobFile) -> tuple[str, str]:
+    """Return the key of a training's stage, and the key without the extra iterations."""
     described = key_values(job.settings.training)
     start = start_fingerprint(job.settings.start_splat)
-    parts = (version, cameras_key, job.settings.seed, *([start] if start else []))
+    parts = (STAGE_VERSIONS["train"], cameras_key, job.settings.seed, *([start] if start else []))
     key = stage_key(*parts, described)
     described.pop("extra_iterations")
     return key, stage_key(*parts, described)
 
 
-def blocks_key(version: int, cameras_key: str, job: JobFile) -> str:
+def blocks_key(cameras_key: str, job: JobFile) -> str:
     """Return the key of the blocks of a training: without what follows when they are joined."""
     described = key_values(job.settings.training)
     described.pop("extra_iterations")
-    return stage_key("blocks", version, cameras_key, job.settings.seed, described)
+    return stage_key("blocks", STAGE_VERSIONS["train"], cameras_key, job.settings.seed, described)
 
 
 # -- Write the JSON sidecar of an exported file: its coordinate frame and how it was made ---------
 #
 # Exports are shared with others, so that it holds names and no paths of this machine.
-
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -521,45 +453,24 @@ def sidecar_path(path: Path) -> Path:
 
 
 def write_sidecar(
-    path: Path,
-    frame: FileFrame,
-    world_from_scene: Similarity,
-    blender_from_scene: Similarity,
-    *,
-    placed: bool,
-    result: Path,
-    contents: dict[str, Any],
-) -> None:
-    """Write the sidecar of ``path``.
+    path: Path, frame: FileFrame, world_from_scene: Similarity, blender_from_scene: Similarity, *,
+    placed: bool, result: Path, contents: dict[str, Any],
+) -> None:  # fmt: skip
+    """Write the sidecar of the exported file ``path``.
 
-    Parameters
-    ----------
-    path : Path
-        The exported file.
-    frame : FileFrame
-        Frame of its coordinates.
-    placed : bool
-        Whether the target of ``frame`` is the scene as placed, else the world of the input.
-    result : Path
-        The result folder of the job; entries missing there are left out.
-    contents : dict
-        Content of the file: region, level, shading, number of vertices and faces, textures.
+    ``placed``: whether the target of ``frame`` is the scene as placed, else the world of the input;
+    ``result``: the job's, may lack entries; ``contents``: region, level, shading, counts, textures.
     """
     units = _units(result, frame, world_from_scene)
     in_metres = units is not None and units["applied"]
     unit = "metre" if in_metres else "unit of the input"
     values = {
-        "version": VERSION,
-        "file": path.name,
-        "format": frame.format,
-        "placed": placed,
+        "version": VERSION, "file": path.name, "format": frame.format, "placed": placed,
         "unit": "metre, as placed in Blender" if placed else unit,
         **frame.to_json(world_from_scene, blender_from_scene),
-        **({} if units is None else {"georeference": units}),
-        **contents,
-        **_source(result, contents.get("region")),
-        "made_with": _versions(),
-    }
+        **({} if units is None else {"georeference": units}), **contents,
+        **_source(result, contents.get("region")), "made_with": _versions(),
+    }  # fmt: skip
     write_json(sidecar_path(path), finite_json(values))
 
 
@@ -572,8 +483,7 @@ def _units(result: Path, frame: FileFrame, world_from_scene: Similarity) -> dict
     metric = metric_from_world(record)
     if metric is None:
         return None
-    metric_from_scene = metric.after(world_from_scene)
-    metric_from_file = metric_from_scene.after(frame.file_from_scene().inverse())
+    metric_from_file = metric.after(world_from_scene).after(frame.file_from_scene().inverse())
     applied = bool(record.get("applied"))
     return {**record, "applied": applied, "metric_from_file": metric_from_file.to_json()}
 
@@ -612,12 +522,9 @@ def _name(text: str) -> str:
 def _versions() -> dict[str, str | None]:
     bpy = sys.modules.get("bpy")
     return {
-        "add_on": add_on_version(),
-        "code": code_fingerprint(),
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "blender": None if bpy is None else str(bpy.app.version_string),
-    }
+        "add_on": add_on_version(), "code": code_fingerprint(), "python": platform.python_version(),
+        "numpy": np.__version__, "blender": None if bpy is None else str(bpy.app.version_string),
+    }  # fmt: skip
 
 
 @functools.cache

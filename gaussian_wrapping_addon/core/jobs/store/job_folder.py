@@ -11,13 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ... import limits
-from ...errors import (
-    DISK_FULL_ERRNOS,
-    ParseError,
-    UsageError,
-    known_error,
-    unwritable_error,
-)
+from ...errors import DISK_FULL_ERRNOS, ParseError, UsageError, known_error, unwritable_error
 from ...files import (
     overwrite_json,
     read_bounded,
@@ -34,12 +28,10 @@ from ...worker.spawn import host_and_pid_namespace, is_here, owner_alive, proces
 #
 # It is written outside of the worker, which has no Blender, and only on request.
 
+_logger = logging.getLogger("gaussian_wrapping")
 
-_blend_file_logger = logging.getLogger("gaussian_wrapping")
-
-NAME = "scene.blend"
-EARLIER = "scene.blend1"
-"""Blender's name for the previous version, which may hold a user's additions."""
+NAME, EARLIER = "scene.blend", "scene.blend1"
+"""Its name, and Blender's name for the previous version, which may hold a user's additions."""
 
 
 def result_state(result: Path) -> dict[str, bytes]:
@@ -53,16 +45,13 @@ def result_state(result: Path) -> dict[str, bytes]:
 def back_up_stale_blend(result: Path, before: dict[str, bytes]) -> bool:
     """Rename ``scene.blend`` if the result has changed; tell whether it was renamed.
 
-    Parameters
-    ----------
-    before : dict
-        :func:`result_state` from when the file was up to date.
+    ``before``: :func:`result_state` from when the file was up to date.
     """
     blend = result / NAME
     if not blend.is_file() or result_state(result) == before:
         return False
     os.replace(blend, result / EARLIER)
-    _blend_file_logger.info("%s showed the previous result and was renamed to %s", NAME, EARLIER)
+    _logger.info("%s showed the previous result and was renamed to %s", NAME, EARLIER)
     return True
 
 
@@ -70,7 +59,6 @@ def back_up_stale_blend(result: Path, before: dict[str, bytes]) -> bool:
 #
 # Layout: ``job.json``, ``status.json``, ``log.txt``, ``lock.json``, ``cancel`` (a file asks to
 # stop), ``stages/<name>-<hash>/`` (``done.json`` last), ``result/``.
-
 
 FOREIGN_LOCK_HINT = "If it is no job of this add-on, delete lock.json there."
 STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
@@ -116,108 +104,59 @@ class JobStatus:
     def from_json(cls, values: Any) -> JobStatus:
         """Build from JSON values, ignoring unknown entries.
 
-        Raises
-        ------
-        TypeError, ValueError
-            An entry has the wrong type: the file is not ours, or is being written.
+        Raises TypeError, ValueError: an entry is wrong: the file is not ours, or is being written.
         """
         given = dict(values)
         known = {f.name: given[f.name] for f in fields(cls) if f.name in given}
-        for name, value in known.items():
-            if not _is_kind(name, value):
-                raise TypeError(f"{name} is {type(value).__name__}")
+        for f in fields(cls):
+            if f.name in known and not has_type(str(f.type), known[f.name]):
+                raise TypeError(f"{f.name} is {type(known[f.name]).__name__}")
+        if known.get("state", "NEW") not in STATES:
+            raise ValueError("state is none")
         # Version 0.1.0 marked a rolled-back job only by its error.
         old = known.get("state") == "DONE" and bool(known.get("error"))
         return cls(**{"put_back": old, **known})
 
 
-_WHOLE_NUMBERS = ("pid", "pid_started", "exit_code")
-_NUMBERS = ("fraction", "seconds_left", "heartbeat_s")
-_FLAGS = ("put_back",)
-_MAY_BE_NONE = ("seconds_left", "exit_code")
+_TYPES: dict[str, Any] = {"str": str, "int": int, "float": int | float, "bool": bool}
 
 
-def _is_kind(name: str, value: Any) -> bool:
-    """Tell whether a value has the type of a status field."""
-    if value is None:
-        return name in _MAY_BE_NONE
-    if isinstance(value, bool) or name in _FLAGS:
-        return name in _FLAGS and isinstance(value, bool)
-    if name in _WHOLE_NUMBERS:
-        return isinstance(value, int)
-    if name in _NUMBERS:
-        return isinstance(value, int | float)
-    if name == "figures":
-        return isinstance(value, dict) and all(_is_kind("fraction", v) for v in value.values())
-    return isinstance(value, str) and (name != "state" or value in STATES)
+def has_type(annotation: str, value: Any) -> bool:
+    """Tell whether a JSON value has the type of a dataclass's field, as that is written."""
+    if annotation.endswith(" | None"):
+        return value is None or has_type(annotation.removesuffix(" | None"), value)
+    if annotation == "dict[str, float]":
+        return isinstance(value, dict) and all(has_type("float", x) for x in value.values())
+    if annotation == "tuple[str, ...]":
+        return isinstance(value, list) and all(isinstance(x, str) for x in value)
+    is_flag = isinstance(value, bool)  # an int for Python
+    return isinstance(value, _TYPES[annotation]) and is_flag == (annotation == "bool")
 
 
 def _read_small(path: Path) -> Any:
     return read_json(path, most_bytes=limits.MAX_STATUS_BYTES)
 
 
-@dataclass(frozen=True)
 class JobFolder:
     """Paths of a job folder; access to its status and lock."""
 
-    root: Path
-
-    @property
-    def job_path(self) -> Path:
-        """``job.json``."""
-        return self.root / "job.json"
-
-    @property
-    def status_path(self) -> Path:
-        """``status.json``."""
-        return self.root / "status.json"
-
-    @property
-    def log_path(self) -> Path:
-        """``log.txt``."""
-        return self.root / "log.txt"
-
-    @property
-    def output_path(self) -> Path:
-        """``worker-output.txt``; what the worker wrote to stdout and stderr."""
-        return self.root / "worker-output.txt"
-
-    @property
-    def cancel_path(self) -> Path:
-        """``cancel``; the worker stops if it exists."""
-        return self.root / "cancel"
-
-    @property
-    def lock_path(self) -> Path:
-        """``lock.json``; names the process that holds the folder."""
-        return self.root / "lock.json"
-
-    @property
-    def stages(self) -> Path:
-        """Folder of the stages."""
-        return self.root / "stages"
-
-    @property
-    def baked(self) -> Path:
-        """Folder of the meshes from elsewhere that photos were baked onto."""
-        return self.root / "baked"
-
-    @property
-    def result(self) -> Path:
-        """Folder of the results."""
-        return self.root / "result"
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.job_path = root / "job.json"
+        self.status_path = root / "status.json"
+        self.log_path = root / "log.txt"
+        self.output_path = root / "worker-output.txt"  # what the worker wrote to stdout and stderr
+        self.cancel_path = root / "cancel"  # the worker stops if it exists
+        self.lock_path = root / "lock.json"  # names the process that holds the folder
+        self.stages = root / "stages"
+        self.baked = root / "baked"  # meshes from elsewhere that photos were baked onto
+        self.result = root / "result"
 
     def create(self) -> None:
         """Create the folder, or accept an existing job folder or an empty folder.
 
-        Raises
-        ------
-        UsageError
-            The path is a file, a folder with other content, or too long.
-        DatasetError
-            It holds links or other entries that no job makes, see :meth:`check_entries`.
-        ResourceError
-            It cannot be written.
+        Raises UsageError: it is a file, holds other content, or its path is too long; DatasetError:
+        see :meth:`check_entries`; ResourceError: it cannot be written.
         """
         try:
             if self.root.exists() and not self.root.is_dir():
@@ -238,17 +177,8 @@ class JobFolder:
 
         Before any command reads or writes more than the status: the folder may come from elsewhere,
         and a link in it would lead writes and deletions out of it. The folder itself may be reached
-        through links.
-
-        Parameters
-        ----------
-        but : frozenset of str
-            Names of folders that are not looked into; they must be folders all the same.
-
-        Raises
-        ------
-        DatasetError
-            Names the entry.
+        through links. ``but``: names of folders that are not looked into. Raises DatasetError:
+        names the entry.
         """
         reject_foreign_entries(self.root, but=but)
 
@@ -258,18 +188,14 @@ class JobFolder:
 
     def read_status(self) -> JobStatus:
         """Return the status; a running job whose process is gone is reported as LOST."""
-        status = self._read_file()
-        if self._gone(status):
-            # The worker may have written its final status and ended after the first read.
+        for _ in range(2):  # it may have written its final status and ended after the first read
             status = self._read_file()
-        if not self._gone(status):
-            return status
+            if not self._gone(status):
+                return status
         return replace(
-            status,
-            state="LOST",
-            error="The worker process ended without reporting an error.",
+            status, state="LOST", error="The worker process ended without reporting an error.",
             hint="Resume the job; it continues from the last checkpoint.",
-        )
+        )  # fmt: skip
 
     def _read_file(self) -> JobStatus:
         try:
@@ -278,9 +204,9 @@ class JobFolder:
             return JobStatus()
 
     def _gone(self, status: JobStatus) -> bool:
-        if status.state not in ("RUNNING", "CANCELLING"):
-            return False
-        return not _lives(status.pid, status.pid_started, status.place, self.status_path)
+        return status.state in ("RUNNING", "CANCELLING") and not _lives(
+            status.pid, status.pid_started, status.place, self.status_path
+        )
 
     def write_status(self, status: JobStatus) -> None:
         """Write the status atomically."""
@@ -296,23 +222,16 @@ class JobFolder:
         """Lock the folder for this process.
 
         The lock of a dead process, or an unreadable one, is taken over: a lock of a living process
-        is written atomically.
-
-        Raises
-        ------
-        UsageError
-            Another process holds the folder.
+        is written atomically. Raises UsageError: another process holds the folder.
         """
-        mine = {
-            "pid": os.getpid(),
-            "started": process_start_ticks(os.getpid()),
-            "place": host_and_pid_namespace(),
-        }
+        pid = os.getpid()
+        started, place = process_start_ticks(pid), host_and_pid_namespace()
+        mine = {"pid": pid, "started": started, "place": place}
         if self._lock_owner() == tuple(mine.values()):
             return
         self._drop_stale_lock()
         # A hard link to a complete file is atomic and succeeds for one process only.
-        ready = self.lock_path.with_name(f"lock.{os.getpid()}.json")
+        ready = self.lock_path.with_name(f"lock.{pid}.json")
         write_json(ready, mine)
         try:
             os.link(ready, self.lock_path)

@@ -25,7 +25,6 @@ from .stage_folder import read_done
 # A new result is written to a subfolder of the result folder until it is complete: on the same
 # disk, so that replacing takes renames only. Region names contain no dot.
 
-
 _logger = logging.getLogger(__name__)
 
 NEW = ".new"
@@ -38,20 +37,8 @@ EARLIER = ".earlier"
 def new_result(result: Path, last: tuple[str, ...] = ()) -> Iterator[Path]:
     """Yield an empty folder for the new result; move its content into place when the block ends.
 
-    Each entry of the folder replaces the one of its name in ``result``; others stay. If the block
-    or the swap raises, the result is unchanged.
-
-    Parameters
-    ----------
-    result : Path
-        The result folder; created if missing.
-    last : tuple of str
-        Entries that describe the others and are replaced after them.
-
-    Raises
-    ------
-    OSError
-        An entry cannot be replaced.
+    Each entry of the folder replaces the one of its name in ``result``, those in ``last`` after the
+    others, which they describe. If the block or the swap raises, the result is unchanged.
     """
     begun = not result.exists()
     result.mkdir(exist_ok=True)
@@ -123,7 +110,6 @@ def _remove(path: Path) -> None:
 # removed when that is done. If it fails, job and status of the finished job are restored and the
 # stages it began are removed. A cancelled one can be resumed, as any job.
 
-
 NAME = "job-finished.json"
 
 
@@ -146,17 +132,15 @@ def save_rollback(folder: JobFolder, job: JobFile) -> None:
     except (UsageError, ParseError):
         path.unlink(missing_ok=True)
         return  # nothing to restore
-    saved = {"job": finished.to_json(), "status": asdict(_without_error(status))}
-    write_json(path, {**saved, "stages": sorted(p.name for p in folder.stages.iterdir())})
+    without_error = replace(status, error="", hint="", exit_code=0, put_back=False)
+    stages = sorted(p.name for p in folder.stages.iterdir())
+    write_json(path, {"job": finished.to_json(), "status": asdict(without_error), "stages": stages})
 
 
 def finished_job(folder: JobFolder) -> JobFile:
     """Return the job that produced a folder's result, not one whose mesh is unfinished.
 
-    Raises
-    ------
-    UsageError, ParseError
-        There is no job.
+    Raises UsageError, ParseError: there is no job.
     """
     saved = _read(folder.root / NAME)
     if saved is None or folder.read_status().state == "DONE":
@@ -183,12 +167,10 @@ def roll_back(folder: JobFolder) -> JobStatus | None:
     except (UsageError, TypeError, ValueError):
         return None
     known = set(saved["stages"])
-    begun = [
-        stage for kind in ("mesh", "texture", "bake") for stage in folder.stages.glob(f"{kind}-*")
-    ]
-    for stage in begun if is_real_folder(folder.stages) else ():
-        if is_real_folder(stage) and stage.name not in known and read_done(stage) is None:
-            shutil.rmtree(stage, ignore_errors=True)
+    for kind in ("mesh", "texture", "bake") if is_real_folder(folder.stages) else ():
+        for stage in folder.stages.glob(f"{kind}-*"):
+            if is_real_folder(stage) and stage.name not in known and read_done(stage) is None:
+                shutil.rmtree(stage, ignore_errors=True)
     for files in (folder.result, folder.baked):
         if is_real_folder(files):
             recover(files)
@@ -197,10 +179,6 @@ def roll_back(folder: JobFolder) -> JobStatus | None:
     _logger.info("the job was restored to its state before this mesh")
     # The folder may be a copy whose status names the original's path.
     return replace(status, result=str(folder.result) if status.result else "")
-
-
-def _without_error(status: JobStatus) -> JobStatus:
-    return replace(status, error="", hint="", exit_code=0, put_back=False)
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -218,7 +196,6 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 # -- Continue the training of a finished job from its last checkpoint -----------------------------
 
-
 _CHECKPOINT = re.compile(r"checkpoint-(\d{1,9})\.json")
 _INSTEAD = "Train anew instead: run wrap with the total number of --iterations."
 
@@ -226,12 +203,7 @@ _INSTEAD = "Train anew instead: run wrap with the total number of --iterations."
 def continue_training_job(folder: JobFolder, job: JobFile, iterations: int) -> JobFile:
     """Return the job that trains ``job`` for more iterations, then meshes again.
 
-    Raises
-    ------
-    UsageError
-        The number is not positive.
-    DatasetError
-        The folder holds no finished training, or no checkpoint to continue from.
+    Raises UsageError: not a positive number; DatasetError: no finished training, or no checkpoint.
     """
     if iterations < 1:
         raise UsageError(f"--iterations {iterations} adds nothing.", "Give a positive number.")
@@ -257,10 +229,7 @@ def checkpoints(folder: Path) -> list[Path]:
 def lineage(base_key: str, extra_iterations: int) -> dict[str, Any]:
     """Return the entry of ``done.json`` by which longer trainings find a finished one.
 
-    Parameters
-    ----------
-    base_key : str
-        Hash of everything that the stage's key depends on except the extra iterations.
+    ``base_key``: hash of everything that the stage's key depends on except the extra iterations.
     """
     return {"base": base_key, "extra_iterations": extra_iterations}
 
@@ -280,14 +249,9 @@ def shorter_training(stages: Path, base_key: str, extra_iterations: int) -> Path
 
 
 def link_checkpoints(source: Path, target: Path, others: tuple[str, ...] = ()) -> None:
-    """Link the checkpoints of a finished stage into a new one; copy them if links are unsupported.
+    """Link checkpoints of a finished stage into a new one, and ``others`` that exist; else copy.
 
     Files of a stage are replaced, never modified, so that a link cannot change its source.
-
-    Parameters
-    ----------
-    others : tuple of str
-        Further files to link, if they exist.
     """
     for path in reversed(checkpoints(source)):
         # The JSON file last: without it, the arrays are ignored.

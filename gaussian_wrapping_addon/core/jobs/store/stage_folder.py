@@ -14,22 +14,15 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ... import limits
-from ...errors import (
-    DatasetError,
-    ParseError,
-    WrapError,
-)
-from ...files import (
-    read_json,
-    write_json,
-)
+from ...errors import DatasetError, ParseError, WrapError
+from ...files import read_json, write_json
 from ...names import JOB_MARKER
 from ...photos.finder import second_copies
 from ...photos.formats import PHOTO_SUFFIXES
 from ...progress import Progress
 from ...readers.program_files import find_program_cameras
 
-_stage_folder_logger = logging.getLogger(__name__)
+_logger = logging.getLogger(__name__)
 
 # Increase a number when a stage's code changes its result: old stage folders are not re-used then.
 # Keys of later stages hold those of earlier ones. Finished trainings can be meshed and trained on
@@ -42,9 +35,7 @@ STAGE_VERSIONS = {
 
 DONE_NAME = "done.json"
 HASH_CHARACTERS = 12
-INPUT_SUFFIXES = (
-    *PHOTO_SUFFIXES, ".bin", ".txt", ".json", ".ply",
-)  # fmt: skip
+INPUT_SUFFIXES = (*PHOTO_SUFFIXES, ".bin", ".txt", ".json", ".ply")
 CAMERA_SUFFIXES = (".sfm", ".xml", ".csv", ".geojson", ".xmp")
 """Of files with cameras that other programs write."""
 
@@ -74,14 +65,8 @@ def stage_key(*parts: Any) -> str:
 def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
     """List the files of an input with size and modification time, for :func:`stage_key`.
 
-    An input that is gone has none.
-
-    Photos are not read: size and time detect a change, as in build systems.
-
-    Raises
-    ------
-    DatasetError
-        The folder holds too many files to be a set of photos, such as a whole disk.
+    An input that is gone has none. Photos are not read: size and time detect a change, as in build
+    systems. Raises DatasetError: there are too many files for photos, as on a whole disk.
     """
     if source.is_file() and source.suffix.lower() == ".ply":
         state = source.stat()
@@ -91,8 +76,7 @@ def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
     root = source if source.is_dir() else source.parent
     # Other programs write such files beside photos, too, and change them: notes of photo managers.
     suffixes = (*INPUT_SUFFIXES, *(CAMERA_SUFFIXES if _has_camera_files(source) else ()))
-    found = []
-    seen = 0
+    found, seen = [], 0
     for folder, subfolders, names in os.walk(root):
         seen += len(names)
         if seen > limits.MAX_SOURCE_FILES:
@@ -135,54 +119,36 @@ def read_done(folder: Path) -> dict[str, Any] | None:
 
 
 def run_stage(
-    stages: Path,
-    name: str,
-    key: str,
-    progress: Progress,
-    work: Callable[[Path, Progress], dict[str, Any]],
-    *,
+    stages: Path, name: str, key: str, progress: Progress,
+    work: Callable[[Path, Progress], dict[str, Any]], *,
     whole: Callable[[Path], bool] = Path.is_dir,
-) -> Stage:
-    """Run a stage, or re-use its finished folder.
+) -> Stage:  # fmt: skip
+    """Run the stage ``stages/NAME-KEY``, or re-use its finished folder.
 
-    Parameters
-    ----------
-    stages : Path
-        Folder of all stages.
-    name, key : str
-        Together they form the folder's name.
-    progress : Progress
-        Progress of the stage.
-    work : callable
-        Works in the folder; returns the content of ``done.json``. The folder of an interrupted
-        run is passed as it is, so that training finds its checkpoints.
-    whole : callable
-        Tells whether a finished folder still holds what later stages read; without, or damaged,
-        the stage is done again.
+    ``work``: works in the folder; returns the content of ``done.json``. The folder of an
+    interrupted run is passed as it is, so that training finds its checkpoints.
+    ``whole``: tells whether a finished folder still holds what later stages read; without, or
+    damaged, the stage is done again.
     """
     folder = stages / f"{name}-{key}"
     done = read_done(folder)
     if done is not None and not whole(folder):
-        _stage_folder_logger.warning(
-            "%s is damaged or incomplete: the stage is done again", folder.name
-        )
+        _logger.warning("%s is damaged or incomplete: the stage is done again", folder.name)
         (folder / DONE_NAME).unlink()
         done = None
     if done is not None:
-        _stage_folder_logger.info("stage %s is finished already (%s)", name, folder.name)
+        _logger.info("stage %s is finished already (%s)", name, folder.name)
         progress.update(1.0, f"{name}: finished before")
         return Stage(name, key, folder, done, True)
     folder.mkdir(parents=True, exist_ok=True)
     begun_s, begun_processor_s = time.monotonic(), time.process_time()
     progress.update(0.0, f"{name}: starting")
     done = work(folder, progress)
-    seconds = _seconds_so_far(folder) + time.monotonic() - begun_s
-    # Of this process in this run only, without helpers.
-    processor_s = time.process_time() - begun_processor_s
     done = {
         **done,
-        "seconds": round(seconds, 3),
-        "processor_seconds": round(processor_s, 3),
+        "seconds": round(_seconds_so_far(folder) + time.monotonic() - begun_s, 3),
+        # Of this process in this run only, without helpers.
+        "processor_seconds": round(time.process_time() - begun_processor_s, 3),
         "finished_unix_s": round(time.time(), 1),
     }
     write_json(folder / DONE_NAME, done)
@@ -190,9 +156,8 @@ def run_stage(
     return Stage(name, key, folder, done, False)
 
 
-def record_interrupted_time(stages: Path, name: str, key: str, seconds: float) -> None:
-    """Record the time of an interrupted run, so that reports include it."""
-    folder = stages / f"{name}-{key}"
+def record_interrupted_time(folder: Path, seconds: float) -> None:
+    """Record the time of an interrupted run of a stage, so that reports include it."""
     if folder.is_dir() and read_done(folder) is None:
         write_json(folder / "spent.json", {"seconds": _seconds_so_far(folder) + seconds})
 

@@ -19,15 +19,9 @@ from gaussian_wrapping_addon.core.jobs.stages import training
 from gaussian_wrapping_addon.core.jobs.stages.cameras import run_cameras
 from gaussian_wrapping_addon.core.jobs.stages.meshing import DENSE_MESH, load_region, run_mesh
 from gaussian_wrapping_addon.core.jobs.stages.texture import run_texture
-from gaussian_wrapping_addon.core.jobs.stages.training import run_training
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
-    DONE_NAME,
-    STAGE_VERSIONS,
-    Stage,
-    read_done,
-)
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import DONE_NAME, Stage, read_done
 from gaussian_wrapping_addon.core.loading import load
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh, load_mesh, save_mesh
 from gaussian_wrapping_addon.core.progress import Progress
@@ -61,15 +55,7 @@ def run(folder: JobFolder) -> tuple[JobFile, Stage, Stage]:
     """Run the first two stages."""
     job = read_job(folder.job_path)
     cameras = run_cameras(folder, job, Progress(), threads=1)
-    trained = run_training(
-        folder,
-        job,
-        cameras,
-        Progress(),
-        version=STAGE_VERSIONS["train"],
-        threads=1,
-        device=PROCESSOR,
-    )
+    trained = training.TrainingStages(folder, job, cameras, 1, PROCESSOR).run(Progress())
     return job, cameras, trained
 
 
@@ -97,11 +83,11 @@ def test_a_damaged_training_is_trained_again(
     path = trained.folder / training.GAUSSIANS_NAME
     gaussians = load_gaussians(path)
 
-    def train(stage_folder: Path, *_: object) -> dict[str, Any]:
+    def train(_: object, stage_folder: Path, *_more: object) -> dict[str, Any]:
         save_gaussians(stage_folder / training.GAUSSIANS_NAME, gaussians)
         return {}
 
-    monkeypatch.setattr(training, "_train", train)
+    monkeypatch.setattr(training.TrainingStages, "_in_one_piece", train)
     damage(path)
     _, cameras, again = run(folder)
     assert (trained.reused, cameras.reused, again.reused) == (True, True, False)
@@ -123,12 +109,12 @@ def test_a_training_whose_refined_poses_are_damaged_is_trained_again(
 
     gaussians = load_gaussians(trained.folder / training.GAUSSIANS_NAME)
 
-    def train(stage_folder: Path, *_: object) -> dict[str, Any]:
+    def train(_: object, stage_folder: Path, *_more: object) -> dict[str, Any]:
         save_gaussians(stage_folder / training.GAUSSIANS_NAME, gaussians)
         save_poses(stage_folder, poses)
         return {training.REFINED: True}
 
-    monkeypatch.setattr(training, "_train", train)
+    monkeypatch.setattr(training.TrainingStages, "_in_one_piece", train)
     damage(trained.folder / POSES_NAME)
     again = run(folder)[2]
     assert not again.reused

@@ -18,7 +18,6 @@ from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.stages.cameras import frames_request, run_cameras
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, training_keys
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS
 from gaussian_wrapping_addon.core.loading import load
 from gaussian_wrapping_addon.core.photos import video_frames
 from gaussian_wrapping_addon.core.photos.finder import list_photos
@@ -174,7 +173,7 @@ def test_a_video_that_is_gone_stops_no_mesh_of_its_training(
     source = video if gone == "the video" else video.parent
     folder, job = folder_in(tmp_path), job_of(source)
     stage = run_cameras(folder, job, Progress(), threads=1)
-    key, _ = training_keys(STAGE_VERSIONS["train"], stage.key, job)
+    key, _ = training_keys(stage.key, job)
     (folder.stages / f"train-{key}").mkdir()
     write_json(folder.stages / f"train-{key}" / "done.json", {"finished_unix_s": 1.0})
     shutil.rmtree(video.parent)

@@ -25,7 +25,7 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import (
     training_keys,
 )
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage
 from gaussian_wrapping_addon.core.masks.mask_folder import read_list, write_list
 from gaussian_wrapping_addon.core.masks.segmentation import encoded
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
@@ -93,7 +93,7 @@ def names_of(stage: Stage) -> list[str]:
 
 
 def finish_training(folder: JobFolder, job: JobFile, scene: Stage) -> None:
-    key, _ = training_keys(STAGE_VERSIONS["train"], scene.key, job)
+    key, _ = training_keys(scene.key, job)
     (folder.stages / f"train-{key}").mkdir()
     write_json(folder.stages / f"train-{key}" / "done.json", {"finished_unix_s": 9.0})
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -471,8 +472,8 @@ def mesh_here(folder: Path):
     points = np.random.default_rng(0).normal(size=(500, 3))
     points /= np.linalg.norm(points, axis=1)[:, None]
     return meshing.mesh_by_pivots_in_stage(
-        folder, ShapeField(sphere(), 0.05), gaussians_on(sphere(), cube(1.5), 800, 0.05),
-        cube(1.5), MeshingSettings(method="pivots"), Progress(), seed=0,
+        folder, Field(ShapeField(sphere(), 0.05), cast(Any, None), 1),
+        gaussians_on(sphere(), cube(1.5), 800, 0.05), cube(1.5), MeshingSettings(method="pivots"), Progress(), seed=0,
         depth_samples=DepthSamples(points, -points, np.full(500, 0.02)),
     )  # fmt: skip
 

@@ -12,11 +12,11 @@ import pytest
 from gaussian_wrapping_addon.core.devices import DeviceChoice, checks, choose_device
 from gaussian_wrapping_addon.core.evaluation.report import pictures
 from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
-from gaussian_wrapping_addon.core.jobs.stages import training, training_cost
-from gaussian_wrapping_addon.core.jobs.stages.training import GAUSSIANS_NAME, run_training
+from gaussian_wrapping_addon.core.jobs.stages import training
+from gaussian_wrapping_addon.core.jobs.stages.training import GAUSSIANS_NAME, TrainingStages
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage, read_done
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage, read_done
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.training import device_backend, trainer
 from gaussian_wrapping_addon.core.training.state import TrainingResult
@@ -31,10 +31,8 @@ def stage_of(folder: JobFolder, name: str) -> Stage:
 
 
 def trained(folder: JobFolder, device: DeviceChoice) -> Stage:
-    return run_training(
-        folder, read_job(folder.job_path), stage_of(folder, "cameras"), Progress(),
-        version=STAGE_VERSIONS["train"], threads=1, device=device,
-    )  # fmt: skip
+    job, cameras = read_job(folder.job_path), stage_of(folder, "cameras")
+    return TrainingStages(folder, job, cameras, 1, device).run(Progress())
 
 
 def test_the_training_gets_the_device_and_notes_it(
@@ -65,8 +63,8 @@ def test_the_training_gets_the_device_and_notes_it(
     )
     monkeypatch.setattr(checks, "with_renderer", with_renderer)
     monkeypatch.setattr(pictures, "write_held_out", write_held_out)
-    monkeypatch.setattr(training_cost, "stage_device", lambda chosen, *_: chosen)
-    monkeypatch.setattr(training, "estimated_cost", lambda *_: ({}, []))
+    monkeypatch.setattr(training, "stage_device", lambda chosen, *_: chosen)
+    monkeypatch.setattr(TrainingStages, "_estimated", lambda *_: ({}, []))
     done = trained(folder, GPU)
     expected = [
         "backend of cuda:1", ("cuda:1", "Pictures of held-out photos"), "its renderer",

@@ -29,15 +29,12 @@ from gaussian_wrapping_addon.core.jobs.stages.training import (
     MIN_IMAGE_PX,
     killed_hint,
     reduced_settings,
-    run_block,
-    run_coarse,
-    run_training,
     train_with_oom_retry,
 )
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.jobs.store.rollback import continue_training_job
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import STAGE_VERSIONS, Stage
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage
 from gaussian_wrapping_addon.core.photos.store import PhotoStore
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.scene.scene import load_saved_scene
@@ -52,16 +49,18 @@ from tests.core.jobs.block_jobs import TRAINING, cameras_of, row_job
 from tests.core.training.row_scene import join_blocks, train_block
 from tests.core.training.test_trainer import StopAt, assert_same
 
-KNOWN = {"version": STAGE_VERSIONS["train"], "threads": 1, "device": choose_device("cpu")}
+
+def stages(folder: JobFolder, job: JobFile) -> TrainingStages:
+    return TrainingStages(folder, job, cameras_of(folder), 1, choose_device("cpu"))
 
 
 def trained(folder: JobFolder, job: JobFile, progress: Progress | None = None) -> Stage:
     """Run all parts of the training."""
-    cameras, progress = cameras_of(folder), progress or Progress()
-    run_coarse(folder, job, cameras, progress, **KNOWN)
+    progress = progress or Progress()
+    stages(folder, job).coarse(progress)
     for index in range(job.settings.training.blocks):
-        run_block(folder, job, cameras, index, progress, **KNOWN)
-    return run_training(folder, job, cameras, progress, **KNOWN)
+        stages(folder, job).block(index, progress)
+    return stages(folder, job).run(progress)
 
 
 def of_library(folder: JobFolder, root: Path, settings: TrainingSettings) -> OrientedGaussians:
@@ -172,7 +171,7 @@ def test_an_interrupted_block_goes_on_to_the_same_gaussians(
         trained(folder, job, StopAt(30).progress())
     assert list(block.glob("checkpoint-*.json"))
     with pytest.raises(WorkerError, match="missing"):
-        run_training(folder, job, cameras_of(folder), Progress(), **KNOWN)
+        stages(folder, job).run(Progress())
     again = trained(folder, job)
     assert_same(
         load_gaussians(again.folder / GAUSSIANS_NAME), load_gaussians(stage.folder / GAUSSIANS_NAME)
@@ -182,14 +181,14 @@ def test_an_interrupted_block_goes_on_to_the_same_gaussians(
 def test_a_block_before_the_coarse_training_is_refused(tmp_path: Path) -> None:
     folder, job = row_job(tmp_path)
     with pytest.raises(WorkerError, match="not divided into blocks yet"):
-        run_block(folder, job, cameras_of(folder), 0, Progress(), **KNOWN)
+        stages(folder, job).block(0, Progress())
 
 
 @pytest.mark.parametrize("index", [-1, 2])
 def test_a_block_that_is_none_is_refused(tmp_path: Path, index: int) -> None:
     folder, job = row_job(tmp_path)
     with pytest.raises(UsageError, match=f"no block {index}, but 2 blocks"):
-        run_block(folder, job, cameras_of(folder), index, Progress(), **KNOWN)
+        stages(folder, job).block(index, Progress())
 
 
 def test_too_little_memory_names_the_block_and_may_work_elsewhere(
@@ -212,7 +211,7 @@ def test_too_little_memory_names_the_block_and_may_work_elsewhere(
 def test_more_blocks_than_the_scene_has_are_refused(tmp_path: Path) -> None:
     folder, job = row_job(tmp_path, blocks=500)
     with pytest.raises(UsageError, match="cannot be divided into 500 blocks"):
-        run_coarse(folder, job, cameras_of(folder), Progress(), **KNOWN)
+        stages(folder, job).coarse(Progress())
 
 
 def test_a_training_from_a_splat_is_not_divided(tmp_path: Path) -> None:

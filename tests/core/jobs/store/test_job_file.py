@@ -179,9 +179,9 @@ def test_regions_that_a_training_favours_stay_its_own(tmp_path: Path) -> None:
     other = replace(trained.settings, regions=(str(tmp_path / "foot.json"),))
     meshed = make_job("mesh", tmp_path, other)
     assert meshed.settings.training == trained.settings.training
-    assert training_keys(1, "cameras", meshed) == training_keys(1, "cameras", trained)
+    assert training_keys("cameras", meshed) == training_keys("cameras", trained)
     again = make_job("wrap", tmp_path, other)
-    assert training_keys(1, "cameras", again) != training_keys(1, "cameras", trained)
+    assert training_keys("cameras", again) != training_keys("cameras", trained)
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def test_an_interrupted_stage_is_run_again_in_the_same_folder(tmp_path: Path) ->
 
     with pytest.raises(Cancelled):
         run_stage(tmp_path, "train", "abc", Progress(), interrupted)
-    record_interrupted_time(tmp_path, "train", "abc", 100.0)
+    record_interrupted_time(tmp_path / "train-abc", 100.0)
     stage = run_stage(tmp_path, "train", "abc", Progress(), work)
     assert not stage.reused
     assert stage.done["seconds"] >= 100.0
@@ -191,17 +191,17 @@ def test_keys_tell_extra_iterations_from_everything_else(tmp_path: Path) -> None
         "other": job_of(tmp_path, iterations=77),
         "started": started,
     }
-    keys = {name: training_keys(1, "cameras", job) for name, job in jobs.items()}
+    keys = {name: training_keys("cameras", job) for name, job in jobs.items()}
     assert len({key for key, _ in keys.values()}) == 4
     assert keys["plain"][1] == keys["more"][1]
     assert len({base for _, base in keys.values()}) == 3
     again = job_of(tmp_path, preview_every_s=1.0)
-    assert training_keys(1, "cameras", again) == keys["plain"]
+    assert training_keys("cameras", again) == keys["plain"]
     splat.write_bytes(b"ply, changed")
-    assert training_keys(1, "cameras", started)[0] != keys["started"][0]
+    assert training_keys("cameras", started)[0] != keys["started"][0]
     splat.unlink()
     with pytest.raises(DatasetError, match=r"start\.ply"):
-        training_keys(1, "cameras", started)
+        training_keys("cameras", started)
 
 
 @pytest.fixture
