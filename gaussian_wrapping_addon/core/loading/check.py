@@ -272,8 +272,7 @@ def check_input(source: Path, *, worker: str = "", panoramas: str = "auto") -> l
         findings.append(Finding("error", error.message, error.hint))
     except OSError as error:
         told = known_error(error, source) or DatasetError(
-            f"{source} cannot be read: {error.strerror}.",
-            "Check the path and its permissions.",
+            f"{source} cannot be read: {error.strerror}.", "Check the path and its permissions."
         )
         findings.append(Finding("error", told.message, told.hint))
     return findings

@@ -176,10 +176,7 @@ def choose_pairs(
 
 
 def second_round(
-    count: int,
-    tried: Pairs,
-    verified: Mapping[tuple[int, int], int],
-    resemblance: np.ndarray,
+    count: int, tried: Pairs, verified: Mapping[tuple[int, int], int], resemblance: np.ndarray
 ) -> Pairs:
     """Return more pairs for photos with few neighbours.
 

@@ -255,11 +255,7 @@ Alike = Mapping[tuple[int, int], float]
 
 
 def mended(
-    database: Path,
-    folder: Path,
-    solve: Callable[[Path], Any],
-    model: Any,
-    verdict: Verdict,
+    database: Path, folder: Path, solve: Callable[[Path], Any], model: Any, verdict: Verdict
 ) -> tuple[Any, Verdict, bool]:
     """Solve again from the most alike pairs; keep the result if these contradict it far less.
 

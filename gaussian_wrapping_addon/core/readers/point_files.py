@@ -78,12 +78,7 @@ EXPECTED = (
 
 _UNPACK = "Open it in a splat editor, such as SuperSplat, and export it as an uncompressed PLY."
 
-OTHER_FORMATS = {
-    ".spz": "SPZ",
-    ".splat": "antimatter15 .splat",
-    ".ksplat": "KSPLAT",
-    ".sog": "SOG",
-}
+OTHER_FORMATS = {".spz": "SPZ", ".splat": "antimatter15 .splat", ".ksplat": "KSPLAT", ".sog": "SOG"}
 """Splats in formats that are not read, by suffix."""
 
 

@@ -20,10 +20,7 @@ LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "FULL_OPENCV": (
-        *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-        *("k3", "k4", "k5", "k6"),
-    ),
+    "FULL_OPENCV": (*("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"), *("k3", "k4", "k5", "k6")),
     "FOV": ("fx", "fy", "cx", "cy", "omega"),
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),

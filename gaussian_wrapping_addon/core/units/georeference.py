@@ -277,11 +277,7 @@ class RobustFit:
 
 
 def robust_similarity(
-    source: np.ndarray,
-    target: np.ndarray,
-    *,
-    largest_error: float,
-    noise: float,
+    source: np.ndarray, target: np.ndarray, *, largest_error: float, noise: float
 ) -> RobustFit:
     """Fit a similarity to pairs of which up to a third are wrong.
 
