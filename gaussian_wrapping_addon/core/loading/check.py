@@ -93,15 +93,8 @@ def points_in_scene(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Transform sparse points of an input to the scene frame's grid; leave out unusable ones.
 
-    Parameters
-    ----------
-    points, colors : (n, 3) ndarrays
-        World frame; colours go along.
-
-    Raises
-    ------
-    DatasetError
-        The cameras hardly moved, for the distances of the points.
+    ``points``, ``colors``: (n, 3) ndarrays, world frame; colours go along.
+    Raises DatasetError: the cameras hardly moved, for the distances of the points.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         points = snapped(scene_from_world.points(points.reshape(-1, 3)), POINT_STEP)
@@ -140,10 +133,7 @@ _MOST_NAMES = 5
 def coverage_warnings(model: SourceModel) -> list[ReportWarning]:
     """Return warnings about photos that contribute little; none where points are too few to tell.
 
-    Parameters
-    ----------
-    model : SourceModel
-        Poses and sparse points of an input, or solved ones.
+    ``model``: poses and sparse points of an input, or solved ones.
     """
     if len(model.points) < MIN_POINTS or len(model.photos) < 3:
         return []
@@ -234,18 +224,9 @@ _PANORAMAS = f"The photos are 360 degree panoramas; each is cut into {len(VIEWS)
 def check_input(source: Path, *, worker: str = "", panoramas: str = "auto") -> list[Finding]:
     """Check an input without decoding photos or solving cameras.
 
-    Parameters
-    ----------
-    source : Path
-    worker : str
-        The worker's Python, which opens videos; without, only their first bytes are looked at.
-    panoramas : {"auto", "on", "off"}
-        Whether photos without cameras are cut into views.
-
-    Returns
-    -------
-    list of Finding
-        An ``"error"`` means that loading would fail.
+    ``worker``: the worker's Python, which opens videos; without, only their first bytes are looked
+    at. ``panoramas``: {"auto", "on", "off"}, whether photos without cameras are cut into views.
+    A finding that is an ``"error"`` means that loading would fail.
     """
     findings: list[Finding] = []
     try:
@@ -416,10 +397,7 @@ def _check_files(
 ) -> None:
     """Check that headers are readable, and that photos are large enough and sufficiently many.
 
-    Parameters
-    ----------
-    posed : mapping of Path to PosedPhoto, optional
-        Cameras of the photos, whose sizes must be those of the photos.
+    ``posed``: cameras of the photos, whose sizes must be those of the photos.
     """
     bad: list[DatasetError] = []
     sizes: Counter[str] = Counter()

@@ -68,17 +68,8 @@ def with_views_of_panoramas(
 ) -> tuple[SourceModel, SourceKind]:
     """Cut the panoramas of a model with poses; other photos stay.
 
-    Returns
-    -------
-    model : SourceModel
-        Every panorama replaced by its views.
-    kind : SourceKind
-        That finds them.
-
-    Raises
-    ------
-    DatasetError
-        No panorama was found, or one is not twice as wide as high.
+    Returns the model with every panorama replaced by its views, and the kind that finds these.
+    Raises DatasetError: no panorama was found, or one is not twice as wide as high.
     """
     index = PhotoIndex(kind.photo_roots)
     posed = [photo for photo in model.photos if photo.is_panorama]
@@ -136,10 +127,7 @@ def solve_views_of_panoramas(
 ) -> tuple[SourceModel, SourceKind]:
     """Cut photos without cameras, and solve the poses of the panoramas.
 
-    Raises
-    ------
-    DatasetError
-        A photo is not twice as wide as high, or too few panoramas can be placed.
+    Raises DatasetError: a photo is not twice as wide as high, or too few panoramas can be placed.
     """
     root = photo_root(kind.folder)
     names = [path.relative_to(root).as_posix() for path in photos]
@@ -216,17 +204,9 @@ class SplatExtent:
 def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
     """Return the robust centre and radius of the opaque Gaussians.
 
-    Parameters
-    ----------
-    means : (n, 3)
-        Finite.
-    opacities : (n,)
-        Effective opacities in [0, 1], used as weights.
-
-    Raises
-    ------
-    DatasetError
-        All Gaussians are transparent or coincide, or they are scattered without bounds.
+    ``means``: (n, 3), finite. ``opacities``: (n,), effective opacities in [0, 1], used as weights.
+    Raises DatasetError: all Gaussians are transparent or coincide, or they are scattered without
+    bounds.
     """
     opaque = opacities >= MIN_OPACITY
     if not opaque.any():

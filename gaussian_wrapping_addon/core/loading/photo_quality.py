@@ -59,12 +59,8 @@ class PhotoMeasures:
 def measure_photo(path: Path, name: str) -> PhotoMeasures:
     """Measure a photo.
 
-    Raises
-    ------
-    DatasetError
-        It cannot be decoded.
-    MissingExtraError
-        The worker lacks the package for HEIF or RAW.
+    Raises DatasetError: it cannot be decoded; MissingExtraError: the worker lacks the package for
+    HEIF or RAW.
     """
     return measure_grey(reduced_grey(path), name)
 
@@ -81,10 +77,7 @@ def reduced_grey(path: Path) -> np.ndarray:
 
     JPEGs are decoded at a half, a quarter or an eighth of their size where that is enough.
 
-    Raises
-    ------
-    DatasetError, MissingExtraError
-        As :func:`~.photo_file.read_photo`.
+    Raises DatasetError, MissingExtraError: as :func:`~.photo_file.read_photo`.
     """
     header = photo_header(path)
     long_px = max(header.width, header.height)
@@ -281,25 +274,12 @@ _SPREAD_STOPS = 2.5
 def photo_findings(source: Path, progress: Progress, *, threads: int = 0) -> list[Finding]:
     """Look at every photo of an input at a reduced size, and at what its cameras cover.
 
-    Parameters
-    ----------
-    source : Path
-        As for :func:`~.check.check_input`, which has found no error.
-    progress : Progress
-    threads : int
-        0 uses every core.
-
-    Returns
-    -------
-    list of Finding
-        Blur, exposure, duplicates and coverage, with the photos' names; none of a video or splat.
-
-    Raises
-    ------
-    MissingExtraError
-        Photos need a package that the worker lacks.
-    DatasetError, ParseError
-        The input cannot be read.
+    ``source``: as for :func:`~.check.check_input`, which has found no error. ``threads``: 0 uses
+    every core.
+    Returns blur, exposure, duplicates and coverage, with the photos' names; none of a video or
+    splat.
+    Raises MissingExtraError: photos need a package that the worker lacks; DatasetError, ParseError:
+    the input cannot be read.
     """
     kind = source_kind(real_path(source))
     if kind.kind in WITHOUT_PHOTOS:

@@ -66,12 +66,8 @@ class UnitsRequest:
     def checked(self) -> ControlFile | None:
         """Return the control points, read; raises before any work where something is missing.
 
-        Raises
-        ------
-        UsageError, DatasetError, ParseError
-            The markers are none, the file of control points is wrong.
-        WorkerError
-            Markers are asked for, and OpenCV is not installed.
+        Raises UsageError, DatasetError, ParseError: the markers are none, the file of control
+        points is wrong; WorkerError: markers are asked for, and OpenCV is not installed.
         """
         if marker_spec(self.markers) is not None:
             load_extra(MARKERS_EXTRA, "--markers")
@@ -83,9 +79,7 @@ class UnitsRequest:
         Before cameras are solved, which takes minutes. Whether the positions determine the scene
         is known afterwards.
 
-        Raises
-        ------
-        DatasetError
+        Raises DatasetError.
         """
         if self.georeference != "on" or self.control_points:
             return
@@ -116,11 +110,8 @@ def find_real_units(
     markers decide the scale unless there are control points. What contradicts is added to
     ``warnings``.
 
-    Raises
-    ------
-    DatasetError, ParseError
-        What was asked for cannot be had: no usable marker, a wrong file, or GPS that does not
-        determine the frame with ``georeference`` ``"on"``.
+    Raises DatasetError, ParseError: what was asked for cannot be had: no usable marker, a wrong
+    file, or GPS that does not determine the frame with ``georeference`` ``"on"``.
     """
     spec = marker_spec(request.markers)
     if content is None and spec is None and request.georeference == "off":

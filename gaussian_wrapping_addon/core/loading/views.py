@@ -93,19 +93,9 @@ def prepare_views(
     Written files: ``work_folder/images/*.jpg`` (undistorted, or oriented and converted to 8 bits)
     and ``work_folder/masks/*.png``.
 
-    Returns
-    -------
-    views : list of PreparedView
-        In the order of the names.
-    warnings : list of ReportWarning
-    facts : dict
-
-    Raises
-    ------
-    DatasetError
-        No photo was found, more than a fifth cannot be decoded, or sizes do not match the cameras.
-    MissingExtraError
-        Photos need a package that the worker lacks.
+    Returns views in the order of the names, warnings and facts.
+    Raises DatasetError: no photo was found, more than a fifth cannot be decoded, or sizes do not
+    match the cameras; MissingExtraError: photos need a package that the worker lacks.
     """
     threads = threads or default_threads()
     notes = _Notes()

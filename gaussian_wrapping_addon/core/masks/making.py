@@ -36,10 +36,7 @@ def with_background(scene: Scene, photos: PhotoSource, *, seed: int) -> Scene:
     They are in the direction of pixels drawn by chance, where neither the cell nor its neighbours
     show a sparse point; where that gives too few, of all pixels.
 
-    Parameters
-    ----------
-    photos : PhotoStore
-        Small photos of the scene's views.
+    ``photos``: small photos of the scene's views.
     """
     random = np.random.default_rng([seed, 7])
     tried = -(-(MOST_POINTS + LEAST_POINTS) // len(scene.views))  # a photo
@@ -104,17 +101,11 @@ def silhouettes(
     The share is the sum of the blending weights of the Gaussians inside: what stands in front of
     them takes its part of the light, and so does what they let through.
 
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Scene frame.
-    inside : (n,) bool
-        Gaussians that belong to the object.
-    cameras : sequence of Camera
-        Scene frame; silhouettes have their size.
-    bounds : (n, 3), optional
-        Corners of the regions, scene frame. What is nearer to a camera than half of the way to
-        them hides nothing: a short training leaves fog right before single cameras.
+    ``gaussians``: scene frame.
+    ``inside``: (n,) bool, Gaussians that belong to the object.
+    ``cameras``: scene frame; silhouettes have their size.
+    ``bounds``: (n, 3), corners of the regions, scene frame. What is nearer to a camera than half of
+        the way to them hides nothing: a short training leaves fog right before single cameras.
     """
     arrays = marked(gaussians, inside)
     for camera in cameras:

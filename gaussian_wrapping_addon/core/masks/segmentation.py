@@ -35,14 +35,9 @@ pixel of it inexact, and what a mask cuts off is lost while what it leaves on is
 def cleaned(share: np.ndarray, size: tuple[int, int], grown_share: float = 0.0) -> np.ndarray:
     """Return the (h, w) bool mask of a photo, true where it shows the object.
 
-    Parameters
-    ----------
-    share : (h', w') float
-        In [0, 1]; of the whole photo, usually smaller than it.
-    size : (int, int)
-        Width and height of the photo.
-    grown_share : float
-        Border kept around the object, as a share of the photo's long side.
+    ``share``: (h', w') float, in [0, 1]; of the whole photo, usually smaller than it.
+    ``size``: (int, int), width and height of the photo.
+    ``grown_share``: border kept around the object, as a share of the photo's long side.
     """
     from PIL import Image
 
@@ -111,23 +106,10 @@ _FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 class SegmentationModel:
     """A model that is ready to run.
 
-    Parameters
-    ----------
-    path : Path
-        The ONNX file.
-    color_range : str
-        One of ``RANGES``.
-    threads : int
-        0 uses every core.
-
-    Raises
-    ------
-    WorkerError
-        onnxruntime is not installed; says how to install it.
-    DatasetError
-        It is not an ONNX file, or its inputs and outputs are not those of such a model.
-    ResourceError
-        It is too large.
+    ``path``: the ONNX file. ``color_range``: one of ``RANGES``. ``threads``: 0 uses every core.
+    Raises WorkerError: onnxruntime is not installed; says how to install it; DatasetError: it is
+    not an ONNX file, or its inputs and outputs are not those of such a model; ResourceError: it is
+    too large.
     """
 
     def __init__(self, path: Path, color_range: str, *, threads: int = 0) -> None:
@@ -169,15 +151,9 @@ class SegmentationModel:
     def share(self, color: np.ndarray) -> np.ndarray:
         """Return how much of each pixel is the object, (h', w') float32 in [0, 1].
 
-        Parameters
-        ----------
-        color : (h, w, 3) uint8
-            A photo of any size; it is stretched to the model's, and so is the result.
-
-        Raises
-        ------
-        DatasetError
-            The model fails, or its output has another shape or is not finite.
+        ``color``: (h, w, 3) uint8, a photo of any size; it is stretched to the model's, and so is
+            the result.
+        Raises DatasetError: the model fails, or its output has another shape or is not finite.
         """
         from PIL import Image
 

@@ -31,10 +31,7 @@ def list_photos(root: Path) -> list[Path]:
 
     Links to files are followed, links to folders are not (they could form a loop).
 
-    Raises
-    ------
-    DatasetError
-        More files than the limit.
+    Raises DatasetError: more files than the limit.
     """
     photos, _ = _walk(root)
     return photos
@@ -88,11 +85,8 @@ def _walk(root: Path) -> tuple[list[Path], list[Path]]:
 def second_copies(names: Iterable[str]) -> set[str]:
     """Return the names of files that hold the same photo as another one.
 
-    Parameters
-    ----------
-    names : iterable of str
-        Of the photos of one folder. Cameras write ``x.jpg`` and ``x.nef`` of the same photo: the
-        HEIC and RAW files are left out where an image of the same stem is there, the RAW files
+    ``names``: of the photos of one folder. Cameras write ``x.jpg`` and ``x.nef`` of the same photo:
+        the HEIC and RAW files are left out where an image of the same stem is there, the RAW files
         where a HEIC is. An image is what the camera made of it, needs no package and no time.
     """
     rank_of: dict[str, list[tuple[int, str]]] = {}
@@ -112,11 +106,8 @@ def second_copies(names: Iterable[str]) -> set[str]:
 def masks_among(names: Iterable[str]) -> dict[str, str]:
     """Return the masks that lie beside their photos: the mask's name of each photo's.
 
-    Parameters
-    ----------
-    names : iterable of str
-        Of the files of one folder. ``x_mask.png``, ``x.jpg.mask.png`` and the like
-        (``MASK_ENDINGS``), in upper or lower case, belong to ``x.jpg`` if that is there.
+    ``names``: of the files of one folder. ``x_mask.png``, ``x.jpg.mask.png`` and the like
+    (``MASK_ENDINGS``), in upper or lower case, belong to ``x.jpg`` if that is there.
     """
     photos: dict[str, list[str]] = {}
     marked: list[tuple[str, str]] = []
@@ -163,10 +154,7 @@ class Match:
 class PhotoIndex:
     """Photos looked up by the names that a model uses.
 
-    Parameters
-    ----------
-    roots : list of Path
-        Names are looked up exactly under each of them, then by looser rules under the first.
+    ``roots``: names are looked up exactly under each of them, then by looser rules under the first.
     """
 
     def __init__(self, roots: list[Path]) -> None:
@@ -225,13 +213,9 @@ def mask_candidates(name: str) -> list[str]:
 def find_mask(mask_roots: list[Path], name: str, beside: Sequence[Path] = ()) -> Path | None:
     """Return the mask of photo ``name``, or ``None``.
 
-    Parameters
-    ----------
-    mask_roots : list of Path
-        Folders of masks: ``x.jpg.png``, ``x.png``, the same name, or a name that says so
-        (``MASK_ENDINGS``).
-    beside : sequence of Path
-        Folders of photos: the mask lies beside the photo (:func:`masks_among`).
+    ``mask_roots``: folders of masks: ``x.jpg.png``, ``x.png``, the same name, or a name that says
+    so (``MASK_ENDINGS``). ``beside``: folders of photos: the mask lies beside the photo
+    (:func:`masks_among`).
     """
     for root in mask_roots:
         for candidate in mask_candidates(name):

@@ -60,10 +60,7 @@ def photo_kind(path: Path) -> str:
     HEIF is told by the content (phones' files are often renamed), RAW by the name unless the
     content is something else: many RAW formats are TIFF inside.
 
-    Raises
-    ------
-    OSError
-        The file cannot be read, or is a pipe or a device, which reading could wait for.
+    Raises OSError: the file cannot be read, or is a pipe or a device, which reading could wait for.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} is no file.")
@@ -81,10 +78,7 @@ def photo_kind(path: Path) -> str:
 def require_extras(photos: Sequence[Path]) -> None:
     """Raise where the worker lacks the packages that photos need; decodes nothing.
 
-    Raises
-    ------
-    MissingExtraError
-        Names the photos and the next step.
+    Raises MissingExtraError, which names the photos and the next step.
     """
     of_kind: dict[str, list[str]] = {}
     for path in photos:
@@ -104,14 +98,9 @@ def open_image(path: Path) -> Image.Image:
 
     HEIF photos come upright, their own rotation and mirroring applied.
 
-    Raises
-    ------
-    ImportError
-        Pillow is not installed.
-    MissingExtraError
-        A HEIF photo, and its extra is not installed.
-    PIL.UnidentifiedImageError, OSError, ValueError, SyntaxError, DecompressionBombError
-        Of Pillow: no image in one of :data:`IMAGE_FORMATS`.
+    Raises ImportError: Pillow is not installed; MissingExtraError: a HEIF photo, and its extra is
+    not installed; PIL.UnidentifiedImageError, OSError, ValueError, SyntaxError,
+    DecompressionBombError: of Pillow: no image in one of :data:`IMAGE_FORMATS`.
     """
     from PIL import Image
 
@@ -197,12 +186,8 @@ _one_at_a_time = threading.Lock()
 def raw_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of a RAW photo once it is developed, without reading its pixels.
 
-    Raises
-    ------
-    MissingExtraError
-        The worker has no package for RAW photos.
-    ValueError
-        Not a RAW photo that LibRaw knows.
+    Raises MissingExtraError: the worker has no package for RAW photos; ValueError: not a RAW photo
+    that LibRaw knows.
     """
     with _opened(path) as raw:
         sizes = raw.sizes
@@ -213,23 +198,11 @@ def raw_size(path: Path) -> tuple[int, int]:
 def develop(path: Path, *, half: bool = False) -> np.ndarray:
     """Develop a RAW photo.
 
-    Parameters
-    ----------
-    path : Path
-    half : bool
-        At half the size: each 2 x 2 block of the sensor gives one pixel, several times faster.
-
-    Returns
-    -------
-    (h, w, 3) uint8
-        Upright, sRGB.
-
-    Raises
-    ------
-    MissingExtraError
-        The worker has no package for RAW photos.
-    ValueError
-        Not a RAW photo that LibRaw knows, or damaged.
+    ``half``: at half the size: each 2 x 2 block of the sensor gives one pixel, several times
+        faster.
+    Returns (h, w, 3) uint8, upright, sRGB.
+    Raises MissingExtraError: the worker has no package for RAW photos; ValueError: not a RAW photo
+    that LibRaw knows, or damaged.
     """
     with _one_at_a_time, _opened(path) as raw:
         return np.ascontiguousarray(
@@ -247,10 +220,7 @@ def develop(path: Path, *, half: bool = False) -> np.ndarray:
 def raw_focal(path: Path) -> tuple[float, str]:
     """Return focal length in mm (0 where unknown) and name of the lens, as LibRaw reads them.
 
-    Raises
-    ------
-    MissingExtraError, ValueError
-        As :func:`raw_size`.
+    Raises MissingExtraError, ValueError: as :func:`raw_size`.
     """
     with _opened(path) as raw:
         return float(raw.other.focal_length), str(raw.lens.model)
@@ -310,15 +280,8 @@ class PhotoHeader:
 def read_photo_header(path: Path) -> PhotoHeader | None:
     """Read the header of a photo.
 
-    Returns
-    -------
-    PhotoHeader or None
-        ``None`` where the format needs Pillow or an extra that is not installed.
-
-    Raises
-    ------
-    DatasetError
-        Not a regular file, no image, or larger than the limits.
+    Returns ``None`` where the format needs Pillow or an extra that is not installed.
+    Raises DatasetError: not a regular file, no image, or larger than the limits.
     """
     if not path.is_file():
         raise DatasetError(f"{path.name} is not a file.", "Remove the name or restore the photo.")

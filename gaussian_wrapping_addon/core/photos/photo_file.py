@@ -56,12 +56,8 @@ class DecodedPhoto:
 def photo_header(path: Path) -> PhotoHeader:
     """Return the header of a photo; Pillow is needed for other formats than JPEG and PNG.
 
-    Raises
-    ------
-    DatasetError
-        As :func:`~.formats.read_photo_header`, or Pillow is not installed.
-    MissingExtraError
-        The worker lacks the package for HEIF or RAW.
+    Raises DatasetError: as :func:`~.formats.read_photo_header`, or Pillow is not installed;
+    MissingExtraError: the worker lacks the package for HEIF or RAW.
     """
     header = read_photo_header(path)
     if header is None:
@@ -75,21 +71,11 @@ def photo_header(path: Path) -> PhotoHeader:
 def read_photo(path: Path, *, upright: bool = True, enough_px: int = 0) -> DecodedPhoto:
     """Decode a photo.
 
-    Parameters
-    ----------
-    path : Path
-    upright : bool
-        Apply the EXIF orientation. HEIF and RAW photos are upright always.
-    enough_px : int
-        If given, a RAW photo is developed at half its size where the long side of that still has
-        so many pixels.
-
-    Raises
-    ------
-    DatasetError
-        Names the file: not an image, cut, too large.
-    MissingExtraError
-        The worker lacks the package for HEIF or RAW.
+    ``upright``: apply the EXIF orientation. HEIF and RAW photos are upright always. ``enough_px``:
+    if given, a RAW photo is developed at half its size where the long side of that still has so
+    many pixels.
+    Raises DatasetError, which names the file: not an image, cut, too large; MissingExtraError: the
+    worker lacks the package for HEIF or RAW.
     """
     header = photo_header(path)
     if photo_kind(path) == RAW:
@@ -108,10 +94,7 @@ def read_photo(path: Path, *, upright: bool = True, enough_px: int = 0) -> Decod
 def read_mask(path: Path, *, upright: bool = True) -> np.ndarray:
     """Decode a mask to (h, w) uint8; if only the alpha varies, it is the mask.
 
-    Raises
-    ------
-    DatasetError
-        Names the file.
+    Raises DatasetError, which names the file.
     """
     header = photo_header(path)
     color, alpha = _to_arrays(_open(path))

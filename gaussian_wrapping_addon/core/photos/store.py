@@ -75,13 +75,8 @@ class PhotoMemory:
 def photo_memory(photos: int, pixels: float, *, masked: bool, free_bytes: int) -> PhotoMemory:
     """Return what photos take that are read at three sizes, each half of the one before.
 
-    Parameters
-    ----------
-    pixels : float
-        Of a photo at the largest of them.
-    masked : bool
-    free_bytes : int
-        Free memory of the machine; 0 if unknown.
+    ``pixels``: of a photo at the largest of them. ``free_bytes``: free memory of the machine; 0 if
+    unknown.
     """
     channels = 4 if masked else 3
     all_bytes = round(photos * pixels * channels * (1 + 1 / 4 + 1 / 16))
@@ -107,10 +102,6 @@ class KeptPhotos:
     asked for at another size since; then arrays more than :data:`MUCH_LARGER` times as large, as
     many small ones save more reading than one large one. Beyond the limit, the array used last is
     kept, one of each kind. Thread-safe.
-
-    Parameters
-    ----------
-    limit_bytes : int
     """
 
     MUCH_LARGER = 2
@@ -142,12 +133,8 @@ class KeptPhotos:
     def put(self, key: Key, array: np.ndarray) -> tuple[np.ndarray, list[tuple[Key, np.ndarray]]]:
         """Keep an array that was asked for.
 
-        Returns
-        -------
-        array : ndarray
-            The same, or that of another thread that was first.
-        left_out : list of (Key, ndarray)
-            What does not stay for later: what had to make room, or the array itself.
+        Returns ``array``: the same, or that of another thread that was first; ``left_out``: what
+        does not stay for later: what had to make room, or the array itself.
         """
         left_out: list[tuple[Key, np.ndarray]] = []
         with self._lock:
@@ -225,10 +212,7 @@ class DecodedFile:
     A file that cannot be written (a full disk, a folder without write access) is given up with a
     line in the log; photos are then decoded each time they are needed. Thread-safe.
 
-    Parameters
-    ----------
-    folder : Path
-        On the file system to write to. No entry appears in it.
+    ``folder``: on the file system to write to. No entry appears in it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -332,15 +316,9 @@ class PhotoStore:
     so that the camera of a level is exactly the base camera with intrinsics divided by d.
     What comes out does not depend on the budget. Thread-safe.
 
-    Parameters
-    ----------
-    scene : Scene
-    max_image_px : int
-        Long side of the base level, pixels.
-    memory_bytes : int, optional
-        Limit of the arrays kept (:class:`~.store.KeptPhotos`); by default a share of the
-        memory that is free now (:func:`~.store.photo_budget_bytes`). The photo and the mask
-        used last are kept beyond it.
+    ``max_image_px``: long side of the base level, pixels. ``memory_bytes``: limit of the arrays
+    kept (:class:`~.store.KeptPhotos`); by default a share of the memory that is free now
+    (:func:`~.store.photo_budget_bytes`). The photo and the mask used last are kept beyond it.
     """
 
     def __init__(self, scene: Scene, max_image_px: int, *, memory_bytes: int | None = None) -> None:
@@ -373,15 +351,8 @@ class PhotoStore:
     def photo(self, index: int, divisor: int = 1) -> np.ndarray:
         """Return the photo at a level.
 
-        Returns
-        -------
-        (h, w, 3) uint8
-            Read-only.
-
-        Raises
-        ------
-        DatasetError
-            The file was changed or removed after the scene was made.
+        Returns (h, w, 3) uint8, read-only.
+        Raises DatasetError: the file was changed or removed after the scene was made.
         """
         return self._array(("photo", index, divisor), lambda: self._make_photo(index, divisor))
 
@@ -436,10 +407,7 @@ class PhotoStore:
     def decoded_in(self, folder: Path) -> Iterator[None]:
         """Keep decoded on disk, in this context, what does not fit into memory.
 
-        Parameters
-        ----------
-        folder : Path
-            As for :class:`~.store.DecodedFile`.
+        ``folder``: as for :class:`~.store.DecodedFile`.
         """
         before, self._decoded = self._decoded, DecodedFile(folder)
         try:

@@ -52,10 +52,7 @@ def videos_in(folder: Path) -> list[Path]:
 def the_video_in(folder: Path) -> Path | None:
     """Return the only video of a folder, or ``None`` where it has none.
 
-    Raises
-    ------
-    DatasetError
-        There are several: cameras, lenses and zoom may differ between them.
+    Raises DatasetError: there are several: cameras, lenses and zoom may differ between them.
     """
     found = videos_in(folder)
     if len(found) > 1:
@@ -72,12 +69,8 @@ def container_of(path: Path) -> str:
 
     Going by the content keeps playlists and scripts, which name other files, from being opened.
 
-    Raises
-    ------
-    DatasetError
-        The file is empty, cannot be read, or begins like none of these.
-    ParseError
-        It is no regular file.
+    Raises DatasetError: the file is empty, cannot be read, or begins like none of these;
+    ParseError: it is no regular file.
     """
     try:
         with open_regular(path, follow_links=True) as stream:
@@ -129,18 +122,9 @@ class ProbedVideo:
 def probe_video(path: Path, python: str) -> ProbedVideo:
     """Look at a video.
 
-    Parameters
-    ----------
-    path : Path
-    python : str
-        The worker's interpreter, or the folder of its environment.
-
-    Raises
-    ------
-    DatasetError
-        It is no video that can be read.
-    WorkerError
-        The worker's Python does not answer.
+    ``python``: the worker's interpreter, or the folder of its environment.
+    Raises DatasetError: it is no video that can be read; WorkerError: the worker's Python does not
+    answer.
     """
     try:
         command = child_command("photos.video", str(path), python=python)
@@ -189,10 +173,7 @@ def main(arguments: list[str]) -> int:
 def probed(path: Path) -> ProbedVideo:
     """Return the facts of a video, with one frame decoded; needs PyAV.
 
-    Raises
-    ------
-    DatasetError, ParseError
-        It is no video that can be read.
+    Raises DatasetError, ParseError: it is no video that can be read.
     """
 
     with open_video(path) as video:
@@ -286,10 +267,7 @@ def open_video(path: Path, threads: int = 0) -> Iterator[OpenVideo]:
 
     FFmpeg gets an open file, not a name: nothing in it can make FFmpeg open something else.
 
-    Raises
-    ------
-    DatasetError, ParseError
-        It is no video, is cut before its index, or exceeds a limit.
+    Raises DatasetError, ParseError: it is no video, is cut before its index, or exceeds a limit.
     """
     import av
 
@@ -377,10 +355,7 @@ def frames_of(video: OpenVideo) -> Iterator[DecodedFrame]:
     ``video.bad_packets`` and ``video.is_cut`` tell of damage afterwards. Two passes over a file
     give the same frames with the same numbers.
 
-    Raises
-    ------
-    DatasetError
-        More frames than the limit.
+    Raises DatasetError: more frames than the limit.
     """
     import av
 

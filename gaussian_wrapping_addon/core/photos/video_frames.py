@@ -73,10 +73,8 @@ class MotionMeter:
     def add(self, grey: np.ndarray) -> float:
         """Return the way so far, in long sides of the picture.
 
-        Parameters
-        ----------
-        grey : (h, w) float32
-            The next frame, of the size of those before; ``MOTION_SIDE_PX`` long.
+        ``grey``: (h, w) float32, the next frame, of the size of those before; ``MOTION_SIDE_PX``
+            long.
         """
         if self._anchor is None:
             self._anchor = grey
@@ -192,10 +190,7 @@ def details(grey: np.ndarray) -> np.ndarray:
 
     Across, down and the two diagonals, since camera shake takes the detail of one direction.
 
-    Parameters
-    ----------
-    grey : (h, w) float32
-        Brightness, 0 to 255.
+    ``grey``: (h, w) float32, brightness, 0 to 255.
     """
     height, width = (side - side % _COARSE for side in grey.shape)
     cut = grey[:height, :width]
@@ -209,12 +204,8 @@ def relative_sharpness(details: np.ndarray, times_s: np.ndarray, ways: np.ndarra
 
     The worst direction counts. Only frames with the same content are compared.
 
-    Parameters
-    ----------
-    details : (n, 2, 4) float64
-        Of :func:`details`.
-    times_s, ways : (n,) float64
-        Time, and way of the picture so far in its sides.
+    ``details``: (n, 2, 4) float64, of :func:`details`. ``times_s``, ``ways``: (n,) float64, time,
+    and way of the picture so far in its sides.
     """
     fine = details[:, 0]
     relative = np.zeros(len(fine))
@@ -302,13 +293,8 @@ class Choice:
 def choose_frames(measures: FrameMeasures, *, frames: int = 0, fps: float = 0.0) -> Choice:
     """Choose frames.
 
-    Parameters
-    ----------
-    measures : FrameMeasures
-    frames : int
-        Number of stretches of equal motion, so the most frames; 0: by the motion.
-    fps : float
-        If not 0 and ``frames`` is: stretches of equal time instead, so many a second.
+    ``frames``: number of stretches of equal motion, so the most frames; 0: by the motion. ``fps``:
+    if not 0 and ``frames`` is: stretches of equal time instead, so many a second.
     """
     ways, times_s = measures.ways, measures.times_s
     if not len(ways):
@@ -557,22 +543,12 @@ def extract_frames(
 ) -> VideoFrames:
     """Choose sharp frames of a video and write them as JPEG into ``work_folder/frames``.
 
-    Parameters
-    ----------
-    video : Path
-        Nothing is written beside it.
-    work_folder : Path
-        What an interrupted run has left there is removed.
-    frames, fps : int, float
-        As of :func:`~.video_frames.choose_frames`; 0 chooses by the motion.
-    threads : int
-        Of the decoder; 0 uses every core.
-
-    Raises
-    ------
-    DatasetError, ParseError
-        It is no video that can be read, or fewer than ``MIN_IMAGES`` frames can be used.
-    Cancelled
+    ``video``: nothing is written beside it.
+    ``work_folder``: what an interrupted run has left there is removed.
+    ``frames``, ``fps``: as of :func:`~.video_frames.choose_frames`; 0 chooses by the motion.
+    ``threads``: of the decoder; 0 uses every core.
+    Raises DatasetError, ParseError: it is no video that can be read, or fewer than ``MIN_IMAGES``
+    frames can be used; Cancelled.
     """
     target = work_folder / FRAMES_FOLDER
     task_folder = work_folder / "video"

@@ -66,10 +66,7 @@ def pair_motion(
 ) -> PairMotion:
     """Judge the matches of photos ``first`` and ``second``, both of ``size`` (width, height).
 
-    Parameters
-    ----------
-    points, others : (n, 2) float
-        Matched positions in the two photos, pixels.
+    ``points``, ``others``: (n, 2) float, matched positions in the two photos, pixels.
     """
     long_side = max(size)
     distance = np.linalg.norm(np.subtract(points, others), axis=1)
@@ -94,17 +91,9 @@ def standing_groups(count: int, motions: Sequence[PairMotion]) -> list[list[int]
 
     Whether what moves turns as one body is left to :func:`are_turning`.
 
-    Parameters
-    ----------
-    count : int
-        Number of photos.
-    motions : sequence of PairMotion
-        Of all pairs that were matched, also of those without a match.
-
-    Returns
-    -------
-    list of list of int
-        Ascending numbers of photos; photos of no such group are in none.
+    ``count``: number of photos. ``motions``: of all pairs that were matched, also of those without
+    a match.
+    Numbers ascend; photos of no such group are in none.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -137,10 +126,8 @@ def standing_groups(count: int, motions: Sequence[PairMotion]) -> list[list[int]
 def are_turning(most_inliers: Sequence[int]) -> bool:
     """Tell whether photos of still cameras show a body that turns.
 
-    Parameters
-    ----------
-    most_inliers : sequence of int
-        For each photo: the most matches with another photo that move and agree with one motion.
+    ``most_inliers``: for each photo: the most matches with another photo that move and agree with
+        one motion.
     """
     return len(most_inliers) > 0 and float(np.median(most_inliers)) >= MIN_TURNING_MATCHES
 
@@ -402,12 +389,7 @@ _logger = logging.getLogger(__name__)
 def with_findings(model: SourceModel, folder: Path, source_names: Mapping[str, str]) -> SourceModel:
     """Add facts and warnings to a solved model; warnings also go to the log.
 
-    Parameters
-    ----------
-    folder : Path
-        The solver's.
-    source_names : mapping of str to str
-        Photos by the solver's names.
+    ``folder``: the solver's. ``source_names``: photos by the solver's names.
     """
     found = read_json(folder / SOLUTION_NAME)
     warnings = findings(found, source_names)

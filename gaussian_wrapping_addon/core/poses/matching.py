@@ -85,10 +85,8 @@ def pairs_by_name(count: int) -> Pairs:
 def nearest_pairs(distances: np.ndarray, nearest: int) -> Pairs:
     """Return each item with its ``nearest`` others.
 
-    Parameters
-    ----------
-    distances : (n, n) array
-        Symmetric; infinite or not a number where unknown. Of equal ones the first is taken.
+    ``distances``: (n, n) array, symmetric; infinite or not a number where unknown. Of equal ones
+        the first is taken.
     """
     known = np.where(np.isfinite(distances), distances, np.inf)
     np.fill_diagonal(known, np.inf)
@@ -106,10 +104,7 @@ def nearest_pairs(distances: np.ndarray, nearest: int) -> Pairs:
 def pairs_by_pose(centers: np.ndarray, forwards: np.ndarray) -> Pairs:
     """Return pairs (i < j) of posed photos with similar positions and viewing directions.
 
-    Parameters
-    ----------
-    centers, forwards : (n, 3) float64
-        Camera centres and unit viewing directions.
+    ``centers``, ``forwards``: (n, 3) float64, camera centres and unit viewing directions.
     """
     pairs: set[tuple[int, int]] = set()
     typical = max(float(np.linalg.norm(centers - centers.mean(0), axis=1).mean()), 1e-12)
@@ -153,16 +148,12 @@ def choose_pairs(
 ) -> Pairs:
     """Return the pairs of the first round.
 
-    Parameters
-    ----------
-    count : int
-        Photos, sorted by name.
-    in_order : bool
-        They were taken one after the other, as of a video.
-    metres : (count, count) array or None
-        Distances by GPS, infinite where unknown. They may be wrong: they add pairs only.
-    resemblance : (count, count) array or None
-        The more alike, the larger; needed for more than ``EXHAUSTIVE_LIMIT`` photos.
+    ``count``: photos, sorted by name.
+    ``in_order``: they were taken one after the other, as of a video.
+    ``metres``: (count, count) array or None, distances by GPS, infinite where unknown. They may be
+        wrong: they add pairs only.
+    ``resemblance``: (count, count) array or None, the more alike, the larger; needed for more than
+        ``EXHAUSTIVE_LIMIT`` photos.
     """
     if count <= EXHAUSTIVE_LIMIT:
         return all_pairs(count)
@@ -180,14 +171,10 @@ def second_round(
 ) -> Pairs:
     """Return more pairs for photos with few neighbours.
 
-    Parameters
-    ----------
-    tried : list of (int, int)
-        Pairs of the first round.
-    verified : mapping of (int, int) to int
-        Matches of a pair that agree with one motion.
-    resemblance : (count, count) array
-        Decides between equals, and for photos without any neighbour.
+    ``tried``: pairs of the first round.
+    ``verified``: matches of a pair that agree with one motion.
+    ``resemblance``: (count, count) array, decides between equals, and for photos without any
+        neighbour.
     """
     linked = np.zeros((count, count), bool)
     for (i, j), matches in verified.items():
@@ -378,13 +365,9 @@ def extract(
 def match_chosen(folder: Path, database: Path, task: dict[str, Any], names: list[str]) -> None:
     """Choose pairs, match them, and in large sets those of a second round; ``task`` gets both.
 
-    Parameters
-    ----------
-    task : dict
-        ``seed``, ``threads``, ``in_order`` and ``positions`` (degrees of latitude and longitude of
-        each photo, or None); gets ``pairs`` of names.
-    names : list of str
-        All photos, sorted.
+    ``task``: ``seed``, ``threads``, ``in_order`` and ``positions``
+    (degrees of latitude and longitude of each photo, or None); gets ``pairs`` of names. ``names``:
+    all photos, sorted.
     """
     count = len(names)
     if count <= EXHAUSTIVE_LIMIT:

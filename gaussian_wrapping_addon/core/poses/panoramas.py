@@ -100,12 +100,9 @@ def _has_panorama_size(width: int, height: int) -> bool:
 def panorama_evidence(photos: Sequence[Path]) -> str:
     """Return what tells that photos are panoramas, by the headers of those that can be read.
 
-    Returns
-    -------
-    str
-        :data:`BY_SHAPE` where all are exactly twice as wide as high, :data:`STATED` where one of
-        them also says that it is equirectangular. Empty where they are none: another shape, or one
-        says another projection.
+    Returns :data:`BY_SHAPE` where all are exactly twice as wide as high, :data:`STATED` where one
+    of them also says that it is equirectangular. Empty where they are none: another shape, or one
+    says another projection.
     """
     stated: set[str] = set()
     for path in photos:
@@ -134,10 +131,7 @@ def check_panorama(header: PhotoHeader, file_name: str) -> None:
 def panorama_pixels(view: PanoramaView, width: int, height: int) -> np.ndarray:
     """Return where the pixels of a view lie in a panorama of ``width`` x ``height``.
 
-    Returns
-    -------
-    (side, side, 2) float64
-        First pixel's centre at (0.5, 0.5); x in [0, width].
+    Returns (side, side, 2) float64, first pixel's centre at (0.5, 0.5); x in [0, width].
     """
     lens = view_lens(width)
     fx, fy, cx, cy = lens.params
@@ -192,17 +186,9 @@ def cut_panoramas(
 ) -> tuple[list[CutView], list[str]]:
     """Write the views below ``work_folder / CUT_FOLDER``, all of the same lens for a size.
 
-    Returns
-    -------
-    views : list of CutView
-        Of each panorama that could be read, in order.
-    bad : list of str
-        What is wrong with the others.
-
-    Raises
-    ------
-    DatasetError
-        A photo is not twice as wide as high.
+    Returns the views of each panorama that could be read, in order, and what is wrong with the
+    others.
+    Raises DatasetError: a photo is not twice as wide as high.
     """
     threads = threads or default_threads()
     cut: list[CutView] = []
@@ -301,17 +287,9 @@ def solve_panoramas(
     Views of a panorama share its place and keep the directions that they were cut in; their lens
     is known. Nothing of either is adjusted.
 
-    Parameters
-    ----------
-    cut : sequence of CutView
-        All of panoramas of one size.
-    cut_folder : Path
-        Holds the views.
-
-    Raises
-    ------
-    DatasetError
-        The panoramas differ in size, or fewer than ``MIN_IMAGES`` of them can be placed.
+    ``cut``: all of panoramas of one size. ``cut_folder``: holds the views.
+    Raises DatasetError: the panoramas differ in size, or fewer than ``MIN_IMAGES`` of them can be
+    placed.
     """
     widths = sorted({view.width for view in cut})
     if len(widths) != 1:

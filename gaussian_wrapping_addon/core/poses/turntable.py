@@ -54,20 +54,12 @@ def masks_of_turning(
 ) -> list[np.ndarray]:
     """Return (h, w) bool masks, true where a photo shows the turning object.
 
-    Parameters
-    ----------
-    count : int
-        Number of photos, all of one size and from one place.
-    read : callable
-        The (h, w, 3) uint8 photo of a number.
-    step : callable
-        Told the share that is done.
+    ``count``: number of photos, all of one size and from one place. ``read``: the (h, w, 3) uint8
+    photo of a number. ``step``: told the share that is done.
 
-    Notes
-    -----
     The background of a pixel is the colour that most photos agree on (docs/method.md, section 12):
-    a median would show the object wherever it covers a pixel in more than half of them. Where
-    few agree, the object is always there.
+    a median would show the object wherever it covers a pixel in more than half of them. Where few
+    agree, the object is always there.
     """
     chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_BACKGROUND_PHOTOS)).astype(int))
     stack = []
@@ -106,16 +98,9 @@ def masks_of_turning(
 def steady_colors(photos: np.ndarray, threads: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the colour that most of the photos agree on, for each pixel.
 
-    Parameters
-    ----------
-    photos : (n, h, w, 3) uint8
-
-    Returns
-    -------
-    colors : (h, w, 3) float32
-        Mean of those that agree.
-    support : (h, w) int32
-        How many agree.
+    ``photos``: (n, h, w, 3) uint8.
+    Returns ``colors``: (h, w, 3) float32, mean of those that agree; ``support``: (h, w) int32, how
+    many agree.
     """
     colors = np.empty(photos.shape[1:], np.float32)
     support = np.empty(photos.shape[1:3], np.int32)
@@ -225,12 +210,8 @@ pixel."""
 def turntable_groups(database: Path, task: Mapping[str, Any]) -> list[list[str]]:
     """Return names of photos from cameras that stand still before something that turns.
 
-    Parameters
-    ----------
-    database : Path
-        With matches.
-    task : mapping
-        ``turntable`` ("auto", "on" or "off"), ``groups`` of one lens and size, and ``pairs``.
+    ``database``: with matches. ``task``: ``turntable`` ("auto", "on" or "off"), ``groups`` of one
+    lens and size, and ``pairs``.
     """
     pycolmap = import_pycolmap()
 
@@ -261,12 +242,7 @@ def turning_masks(
 ) -> dict[str, np.ndarray]:
     """Return a (h, w) bool mask of what turns for each photo of the groups.
 
-    Parameters
-    ----------
-    photos : Path
-        Their folder.
-    step : callable
-        Told the share that is done.
+    ``photos``: their folder. ``step``: told the share that is done.
     """
     masks: dict[str, np.ndarray] = {}
     for number, group in enumerate(groups):

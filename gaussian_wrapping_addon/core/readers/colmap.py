@@ -68,12 +68,8 @@ def _model_in(folder: Path) -> ModelFiles | None:
 def read_colmap(source: Path) -> SourceModel:
     """Read the largest usable COLMAP model under ``source``.
 
-    Raises
-    ------
-    DatasetError
-        There is no model, or it has no usable image.
-    ParseError
-        A file is truncated or broken; names the byte or line.
+    Raises DatasetError: there is no model, or it has no usable image; ParseError: a file is
+    truncated or broken; names the byte or line.
     """
     models = find_models(source)
     if not models:
@@ -137,9 +133,7 @@ def _reader(model: ModelFiles) -> ModuleType:
 def read_model(model: ModelFiles) -> SourceModel:
     """Read one model; unusable images and points are left out with counted warnings.
 
-    Raises
-    ------
-    ParseError, DatasetError
+    Raises ParseError, DatasetError.
     """
     reader = _reader(model)
     cameras, warnings = reader.read_cameras(model.path("cameras"))

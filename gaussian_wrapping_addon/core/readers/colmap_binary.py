@@ -127,16 +127,9 @@ _NO_POINT = -1
 def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[ReportWarning]]:
     """Read ``cameras.bin``.
 
-    Returns
-    -------
-    cameras : dict
-        Camera number to camera.
-    warnings : list of ReportWarning
-
-    Raises
-    ------
-    ParseError
-        With the byte offset: cut file, impossible count, unknown model, unusable parameters.
+    Returns cameras by their numbers, and warnings.
+    Raises ParseError with the byte offset: cut file, impossible count, unknown model, unusable
+    parameters.
     """
     cursor = _Cursor(path)
     number = cursor.count(_CAMERA_HEAD_BYTES + 3 * 8, limits.MAX_IMAGES, "cameras")
@@ -173,10 +166,7 @@ def add_camera(
 def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
     """Read ``images.bin``; of the 2D points, those with a sparse point are counted.
 
-    Raises
-    ------
-    ParseError
-        With the byte offset where the file ends or a count cannot be true.
+    Raises ParseError with the byte offset where the file ends or a count cannot be true.
     """
     cursor = _Cursor(path)
     number = cursor.count(_IMAGE_BYTES, limits.MAX_IMAGES, "images")
@@ -206,10 +196,7 @@ def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
 def read_points(path: Path) -> tuple[RawPoints, list[ReportWarning]]:
     """Read ``points3D.bin``; tracks are skipped, their lengths kept.
 
-    Raises
-    ------
-    ParseError
-        With the byte offset where the file ends or a count cannot be true.
+    Raises ParseError with the byte offset where the file ends or a count cannot be true.
     """
     cursor = _Cursor(path)
     number = cursor.count(_POINT_BYTES, limits.MAX_POINTS, "points")

@@ -67,10 +67,7 @@ def _whole(path: Path, line: int, text: str, what: str) -> int:
 def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[ReportWarning]]:
     """Read ``cameras.txt``.
 
-    Raises
-    ------
-    ParseError
-        With the line: unknown model, wrong number of parameters, unusable values.
+    Raises ParseError with the line: unknown model, wrong number of parameters, unusable values.
     """
     cameras: dict[int, LensCamera] = {}
     for line, text in _lines(path):
@@ -103,10 +100,7 @@ def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
     Where a second line was left out, the next line is not a list of 2D points (triples of
     numbers); such a file is read with a warning instead of losing every second image.
 
-    Raises
-    ------
-    ParseError
-        With the line.
+    Raises ParseError with the line.
     """
     images: list[RawImage] = []
     without_points = 0
@@ -149,13 +143,7 @@ def _image(path: Path, line: int, text: str) -> RawImage:
 
 
 def read_points(path: Path) -> tuple[RawPoints, list[ReportWarning]]:
-    """Read ``points3D.txt``.
-
-    Raises
-    ------
-    ParseError
-        With the line.
-    """
+    """Read ``points3D.txt``. Raises ParseError with the line."""
     positions: list[list[float]] = []
     colors: list[list[int]] = []
     errors: list[float] = []

@@ -26,10 +26,7 @@ def import_pycolmap() -> Any:
 
     Its own log goes to stderr, not to files.
 
-    Raises
-    ------
-    ImportError
-        It is not installed.
+    Raises ImportError: it is not installed.
     """
     # One thread at a time: another one would take the half imported module, or the handlers that it
     # has just set for those to keep.
@@ -127,19 +124,10 @@ def fit_lens(
 ) -> tuple[LensCamera, bool, bool]:
     """Fit the intrinsics of the input to the size of the photo.
 
-    Returns
-    -------
-    lens : LensCamera
-        Intrinsics for exactly the photo's size.
-    upright : bool
-        Whether the EXIF orientation has to be applied.
-    rescaled : bool
-        Whether the photo is a scaled copy of the one described by the input.
-
-    Raises
-    ------
-    DatasetError
-        The photo's aspect ratio differs from its camera's.
+    Returns ``lens``: intrinsics for exactly the photo's size; ``upright``: whether the EXIF
+    orientation has to be applied; ``rescaled``: whether the photo is a scaled copy of the one
+    described by the input.
+    Raises DatasetError: the photo's aspect ratio differs from its camera's.
     """
     if posed.is_panorama:
         raise DatasetError(
@@ -206,10 +194,7 @@ _ROUND_TRIP_PX = 0.1
 def pinhole_of(camera: LensCamera) -> LensCamera:
     """Return the PINHOLE camera that a photo of ``camera`` is resampled to.
 
-    Raises
-    ------
-    DatasetError
-        The distortion leaves no usable rectangle.
+    Raises DatasetError: the distortion leaves no usable rectangle.
     """
     if camera.is_pinhole:
         (fx, fy), (cx, cy) = camera.focal, camera.principal_point
@@ -229,10 +214,8 @@ def pinhole_of(camera: LensCamera) -> LensCamera:
 def sampling_map(camera: LensCamera, pinhole: LensCamera) -> np.ndarray:
     """Return the photo coordinates of each pixel of the pinhole image.
 
-    Returns
-    -------
-    (height, width, 2) float32
-        Pixel coordinates x, y in the photo of ``camera``, first pixel's centre at (0.5, 0.5).
+    Returns (height, width, 2) float32, pixel coordinates x, y in the photo of ``camera``, first
+    pixel's centre at (0.5, 0.5).
     """
     fx, fy, cx, cy = pinhole.params
     out = np.zeros((pinhole.height, pinhole.width, 2), np.float32)

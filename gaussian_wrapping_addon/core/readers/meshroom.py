@@ -59,12 +59,8 @@ def is_meshroom(path: Path) -> bool:
 def read_meshroom(path: Path) -> SourceModel:
     """Read views with their intrinsics and poses, and landmarks.
 
-    Raises
-    ------
-    ParseError
-        Names the entry, such as ``intrinsics[0].type``.
-    DatasetError
-        No photo is usable.
+    Raises ParseError, which names the entry, such as ``intrinsics[0].type``; DatasetError: no photo
+    is usable.
     """
     values = read_json(path, most_bytes=_MAX_BYTES, follow_links=True)
     if not isinstance(values, dict) or "views" not in values:

@@ -65,12 +65,8 @@ class _Group:
 def read_metashape(path: Path) -> SourceModel:
     """Read the largest group of cameras in one frame; the file holds no points.
 
-    Raises
-    ------
-    ParseError
-        Names the camera or sensor and the entry.
-    DatasetError
-        No photo is usable.
+    Raises ParseError, which names the camera or sensor and the entry; DatasetError: no photo is
+    usable.
     """
     root = read_xml(path)
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")

@@ -53,12 +53,8 @@ def is_opensfm(path: Path) -> bool:
 def read_opensfm(path: Path) -> SourceModel:
     """Read the reconstruction with most shots, and its points.
 
-    Raises
-    ------
-    ParseError
-        Names the entry, such as ``[0].shots['a.jpg'].rotation``.
-    DatasetError
-        No photo is usable.
+    Raises ParseError, which names the entry, such as ``[0].shots['a.jpg'].rotation``; DatasetError:
+    no photo is usable.
     """
     values = read_json(path, most_bytes=_MAX_BYTES, follow_links=True)
     entries = values if isinstance(values, list) else [values]
@@ -129,9 +125,7 @@ def _table(path: Path, place: str, entry: dict[str, Any], key: str) -> dict[str,
 def lens_of(path: Path, place: str, camera: dict[str, Any]) -> LensCamera:
     """Return the lens of a camera of ``reconstruction.json`` or ``cameras.json``.
 
-    Raises
-    ------
-    ParseError
+    Raises ParseError.
     """
     kind = str(camera.get("projection_type", "perspective"))
     if kind not in _TYPES:
@@ -205,12 +199,8 @@ def is_shots(path: Path) -> bool:
 def read_shots(path: Path) -> SourceModel:
     """Read shots and their lenses; there are no points.
 
-    Raises
-    ------
-    ParseError
-        Names the entry, such as ``features[3].rotation``.
-    DatasetError
-        ``cameras.json`` is missing, or no photo is usable.
+    Raises ParseError, which names the entry, such as ``features[3].rotation``; DatasetError:
+    ``cameras.json`` is missing, or no photo is usable.
     """
     values = read_json(path, follow_links=True)
     features = values.get("features") if isinstance(values, dict) else None

@@ -23,16 +23,8 @@ _AGAIN = "Export the points again as PLY with x, y, z."
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read positions and colours of a PLY's vertices (ASCII or binary).
 
-    Returns
-    -------
-    points : (n, 3) float64
-    colors : (n, 3) uint8
-        Grey where the file has none.
-
-    Raises
-    ------
-    ParseError
-        With the place in the file.
+    Returns ``points``: (n, 3) float64; ``colors``: (n, 3) uint8, grey where the file has none.
+    Raises ParseError with the place in the file.
     """
     header = read_ply_header(path, _AGAIN)
     rows = read_vertices(path, header, _AGAIN, limits.MAX_POINTS)
@@ -108,10 +100,7 @@ class SplatHeader:
 def is_splat_path(path: Path) -> bool:
     """Tell by its suffix whether a file may be a splat; raise for unsupported splat formats.
 
-    Raises
-    ------
-    DatasetError
-        A splat in a compressed or other format.
+    Raises DatasetError: a splat in a compressed or other format.
     """
     suffix = path.suffix.lower()
     if suffix in OTHER_FORMATS:
@@ -125,12 +114,8 @@ def is_splat_path(path: Path) -> bool:
 def read_splat_header(path: Path) -> SplatHeader:
     """Read the header of a splat PLY, with its properties in any order and others beside them.
 
-    Raises
-    ------
-    ParseError
-        The file is not a splat (names the missing property), or a compressed variant.
-    DatasetError
-        The suffix is that of another splat format, or there are no Gaussians.
+    Raises ParseError: the file is not a splat (names the missing property), or a compressed
+    variant; DatasetError: the suffix is that of another splat format, or there are no Gaussians.
     """
     is_splat_path(path)
     ply = read_ply_header(path, EXPECTED)

@@ -45,12 +45,7 @@ def polycam_folders(source: Path) -> tuple[Path, Path] | None:
 def read_polycam(cameras: Path, photo_folder: Path) -> SourceModel:
     """Read one camera a file; there are no points.
 
-    Raises
-    ------
-    ParseError
-        Names the file and the entry.
-    DatasetError
-        No photo is usable.
+    Raises ParseError, which names the file and the entry; DatasetError: no photo is usable.
     """
     files = []
     for path in cameras.iterdir():

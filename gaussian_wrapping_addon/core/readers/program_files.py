@@ -51,12 +51,7 @@ class ProgramCameras:
     photo_folders: tuple[Path, ...]
 
     def read(self) -> SourceModel:
-        """Read them.
-
-        Raises
-        ------
-        ParseError, DatasetError
-        """
+        """Read them. Raises ParseError, DatasetError."""
         if self.kind == polycam.KIND:
             return polycam.read_polycam(self.path, self.photo_folders[0])
         if self.kind == realityscan.XMP_KIND:
@@ -67,10 +62,7 @@ class ProgramCameras:
 def find_program_cameras(source: Path) -> ProgramCameras | None:
     """Return the cameras of a program that ``source`` is or holds, or ``None``.
 
-    Raises
-    ------
-    DatasetError
-        A folder holds several files of one format.
+    Raises DatasetError: a folder holds several files of one format.
     """
     if source.is_file():
         if source.suffix.lower() == ".xmp":

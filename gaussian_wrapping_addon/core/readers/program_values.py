@@ -33,12 +33,7 @@ _LARGEST = 1e15
 
 
 def number(path: Path, place: str, value: Any) -> float:
-    """Return a finite number, also where the file writes it as text.
-
-    Raises
-    ------
-    ParseError
-    """
+    """Return a finite number, also where the file writes it as text. Raises ParseError."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise ParseError(path, place, "a number was expected.", AGAIN)
     try:
@@ -53,9 +48,7 @@ def number(path: Path, place: str, value: Any) -> float:
 def numbers(path: Path, place: str, values: Any, count: int) -> np.ndarray:
     """Return (count,) float64 of a list of numbers, or of a text with blanks between them.
 
-    Raises
-    ------
-    ParseError
+    Raises ParseError.
     """
     if isinstance(values, str):
         values = values.split()
@@ -65,12 +58,7 @@ def numbers(path: Path, place: str, values: Any, count: int) -> np.ndarray:
 
 
 def whole(path: Path, place: str, value: Any) -> int:
-    """Return a whole number of at most 10 digits.
-
-    Raises
-    ------
-    ParseError
-    """
+    """Return a whole number of at most 10 digits. Raises ParseError."""
     result = number(path, place, value)
     if result != round(result) or abs(result) > 1e10:
         raise ParseError(path, place, "a whole number was expected.", AGAIN)
@@ -78,12 +66,7 @@ def whole(path: Path, place: str, value: Any) -> int:
 
 
 def image_size(path: Path, place: str, width: Any, height: Any) -> tuple[int, int]:
-    """Return a photo's width and height in pixels.
-
-    Raises
-    ------
-    ParseError
-    """
+    """Return a photo's width and height in pixels. Raises ParseError."""
     size = whole(path, f"{place}.width", width), whole(path, f"{place}.height", height)
     if not all(0 < side <= limits.MAX_IMAGE_SIDE_PX for side in size):
         raise ParseError(path, place, f"image size {size[0]} x {size[1]} is out of range.", AGAIN)
@@ -93,10 +76,7 @@ def image_size(path: Path, place: str, width: Any, height: Any) -> tuple[int, in
 def rotation(path: Path, place: str, matrix: np.ndarray) -> np.ndarray:
     """Return the rotation nearest to a (3, 3) matrix that is one but for the digits written.
 
-    Raises
-    ------
-    ParseError
-        The matrix is not orthonormal, or it mirrors.
+    Raises ParseError: the matrix is not orthonormal, or it mirrors.
     """
     u, sizes, vt = np.linalg.svd(matrix)
     nearest: np.ndarray = u @ vt
@@ -164,11 +144,8 @@ class _RefusedError(Exception):
 def read_xml(path: Path, most_bytes: int = MAX_XML_BYTES) -> Element:
     """Read an XML file and return its root; names with a namespace are ``{uri}name``.
 
-    Raises
-    ------
-    ParseError
-        Not XML, larger or deeper than the limits, or with a document type or entities, which a
-        hostile file uses to expand without bounds or to name other files.
+    Raises ParseError: not XML, larger or deeper than the limits, or with a document type or
+    entities, which a hostile file uses to expand without bounds or to name other files.
     """
     try:
         data = read_bounded(path, most_bytes, follow_links=True)
@@ -261,13 +238,7 @@ def relative_names(names: Iterable[str]) -> dict[str, str]:
 
 @dataclass
 class PhotoList:
-    """Collects the photos that a camera file poses.
-
-    Parameters
-    ----------
-    path : Path
-        The camera file.
-    """
+    """Collects the photos that a camera file poses. ``path``: the camera file."""
 
     path: Path
     photos: list[PosedPhoto] = field(default_factory=list)
@@ -316,10 +287,7 @@ class PhotoList:
     def finished(self) -> tuple[PosedPhoto, ...]:
         """Return the photos; what was left out becomes warnings.
 
-        Raises
-        ------
-        DatasetError
-            None is usable.
+        Raises DatasetError: None is usable.
         """
         for reason, names in self._left_out.items():
             listed = ", ".join(names[:_EXAMPLES]) + (" ..." if len(names) > _EXAMPLES else "")

@@ -70,12 +70,7 @@ def is_csv_of_cameras(path: Path) -> bool:
 def read_csv(path: Path) -> SourceModel:
     """Read the cameras of a CSV file; it holds no points.
 
-    Raises
-    ------
-    ParseError
-        Names the line and the column.
-    DatasetError
-        No photo is usable.
+    Raises ParseError, which names the line and the column; DatasetError: no photo is usable.
     """
     data = read_bounded(path, _MAX_CSV_BYTES, follow_links=True)
     try:
@@ -223,17 +218,8 @@ def _is_of_program(path: Path) -> bool:
 def read_xmp_files(root: Path, files: dict[Path, Path]) -> SourceModel:
     """Read the XMP files of photos under ``root``; they hold no points.
 
-    Parameters
-    ----------
-    files : dict of Path to Path
-        As of :func:`xmp_files`.
-
-    Raises
-    ------
-    ParseError
-        A file is broken; names it and the entry.
-    DatasetError
-        No photo is usable.
+    ``files``: as of :func:`xmp_files`.
+    Raises ParseError: a file is broken; names it and the entry; DatasetError: no photo is usable.
     """
     photos = PhotoList(root / "the XMP files")
     posed: dict[str, list[tuple[str, np.ndarray, RelativeLens]]] = {}

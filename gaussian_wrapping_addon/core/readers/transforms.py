@@ -53,12 +53,8 @@ def find_transforms(source: Path) -> Path | None:
 def read_transforms(path: Path) -> SourceModel:
     """Read poses, intrinsics and the start points that the file names.
 
-    Raises
-    ------
-    ParseError
-        An entry is invalid; names it, such as ``frames[3].transform_matrix``.
-    DatasetError
-        No usable frame.
+    Raises ParseError: an entry is invalid; names it, such as ``frames[3].transform_matrix``;
+    DatasetError: no usable frame.
     """
     values = read_json(path, follow_links=True)
     if not isinstance(values, dict):

@@ -117,10 +117,8 @@ class Similarity:
     def from_json(cls, values: dict[str, Any]) -> Similarity:
         """Build from :meth:`to_json`'s values.
 
-        Raises
-        ------
-        KeyError, TypeError, ValueError
-            An entry is missing, of another kind, or beyond float64.
+        Raises KeyError, TypeError, ValueError: an entry is missing, of another kind, or beyond
+        float64.
         """
         try:
             return cls(
@@ -185,12 +183,8 @@ class Camera:
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project (n, 3) world points.
 
-        Returns
-        -------
-        pixels : (n, 2) float64
-            Pixel coordinates; meaningless where ``depth <= 0``.
-        depth : (n,) float64
-            z-depth, world units.
+        Returns ``pixels``, (n, 2) float64, meaningless where ``depth <= 0``, and ``depth``, (n,)
+        float64, the z-depth in world units.
         """
         local = self.to_camera(points)
         depth = local[:, 2]
@@ -203,14 +197,8 @@ class Camera:
     def shown(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Look (n, 3) world points up in the image.
 
-        Returns
-        -------
-        indices : (m,) int64
-            Of the points that project into the image.
-        row, column : (m,) int64
-            Their pixels.
-        depth : (m,) float64
-            Their z-depths, > 0, world units.
+        Returns ``indices``, (m,) int64, of the points that project into the image; ``row`` and
+        ``column``, (m,) int64, of their pixels; ``depth``, (m,) float64, z-depths > 0, world units.
         """
         pixels, depth = self.project(points)
         size = (self.width, self.height)
@@ -264,10 +252,8 @@ class Camera:
     def from_json(cls, values: dict[str, Any]) -> Camera:
         """Build from :meth:`to_json`'s values.
 
-        Raises
-        ------
-        KeyError, TypeError, ValueError
-            An entry is missing, of another kind, or such as no camera has.
+        Raises KeyError, TypeError, ValueError: an entry is missing, of another kind, or such as no
+        camera has.
         """
         values = dict(values)
         try:

@@ -47,17 +47,9 @@ def umeyama(source: np.ndarray, target: np.ndarray, *, with_scale: bool) -> Simi
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
     PAMI 1991. The rotation is proper even where a reflection would fit better.
 
-    Parameters
-    ----------
-    source, target : (n, 3) float64
-        Corresponding points, n >= 3, not collinear.
-    with_scale : bool
-        Also fit the scale; otherwise it is 1.
-
-    Raises
-    ------
-    DatasetError
-        Fewer than three pairs, values that are not finite, or collinear points.
+    ``source``, ``target``: (n, 3) float64, corresponding points, n >= 3, not collinear.
+    ``with_scale``: also fit the scale; otherwise it is 1.
+    Raises DatasetError: fewer than three pairs, values that are not finite, or collinear points.
     """
     source, target = _pairs(source, target)
     for points, name in ((source, "source"), (target, "target")):
@@ -121,18 +113,10 @@ def umeyama_ransac(
     one is refitted to its inliers until these no longer change. Drawing ends early once an
     outlier-free triple was drawn with a probability of ``RANSAC_CONFIDENCE``.
 
-    Parameters
-    ----------
-    source, target : (n, 3) float64
-    threshold : float
-        Largest distance of an inlier, units of the target.
-    iterations : int
-        Maximum number of triples.
-
-    Raises
-    ------
-    DatasetError
-        Degenerate pairs (see :func:`umeyama`), or no triple with at least three inliers.
+    ``source``, ``target``: (n, 3) float64. ``threshold``: largest distance of an inlier, units of
+    the target. ``iterations``: maximum number of triples.
+    Raises DatasetError: degenerate pairs (see :func:`umeyama`), or no triple with at least three
+    inliers.
     """
     source, target = _pairs(source, target)
     for points, name in ((source, "source"), (target, "target")):
@@ -237,16 +221,9 @@ def scale_step(points: np.ndarray, length: float) -> Similarity:
 
     A ground at z = 0 and a chosen origin stay where they are.
 
-    Parameters
-    ----------
-    points : (2, 3) float64
-    length : float
-        True distance, in the unit of the placed scene.
-
-    Raises
-    ------
-    UsageError
-        There are not exactly two points, they coincide, or the length is not positive.
+    ``points``: (2, 3) float64. ``length``: true distance, in the unit of the placed scene.
+    Raises UsageError: there are not exactly two points, they coincide, or the length is not
+    positive.
     """
     points = _finite(points)
     if len(points) != 2:
@@ -264,17 +241,9 @@ def scale_step(points: np.ndarray, length: float) -> Similarity:
 def plane_through(points: np.ndarray, above: np.ndarray) -> Plane:
     """Return the plane through three points, or the least-squares plane of more.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    above : (k, 3) float64
-        Points above the plane, such as camera centres. Without any, or with as many below as
-        above, up is the side nearer to +Z.
-
-    Raises
-    ------
-    UsageError
-        Fewer than three points, or all of them on one line.
+    ``points``: (n, 3) float64. ``above``: (k, 3) float64, points above the plane, such as camera
+    centres. Without any, or with as many below as above, up is the side nearer to +Z.
+    Raises UsageError: fewer than three points, or all of them on one line.
     """
     points = _finite(points)
     if len(points) < 3:
@@ -331,16 +300,9 @@ def _least_turn(direction: np.ndarray) -> np.ndarray:
 def similarity_of_matrix(matrix: np.ndarray, name: str) -> Similarity:
     """Convert a (4, 4) matrix to a similarity.
 
-    Parameters
-    ----------
-    matrix : (4, 4) float64
-    name : str
-        Name of the object, for the message.
-
-    Raises
-    ------
-    UsageError
-        The matrix is not finite, is singular, mirrors, or scales its axes differently.
+    ``matrix``: (4, 4) float64. ``name``: name of the object, for the message.
+    Raises UsageError: the matrix is not finite, is singular, mirrors, or scales its axes
+    differently.
     """
     matrix = np.asarray(matrix, np.float64)
     linear = matrix[:3, :3]
@@ -359,10 +321,7 @@ def similarity_of_matrix(matrix: np.ndarray, name: str) -> Similarity:
 def check_scale(placement: Similarity) -> None:
     """Raise if the scale of a placement is too small or large for single precision.
 
-    Raises
-    ------
-    UsageError
-        The scale lies outside of :data:`SMALLEST_SCALE` to :data:`LARGEST_SCALE`.
+    Raises UsageError: the scale lies outside of :data:`SMALLEST_SCALE` to :data:`LARGEST_SCALE`.
     """
     if not SMALLEST_SCALE <= placement.scale <= LARGEST_SCALE:
         raise UsageError(
@@ -395,10 +354,7 @@ def write_placement(
 ) -> None:
     """Write a placement together with its scene frame.
 
-    Raises
-    ------
-    UsageError
-        The file cannot be written.
+    Raises UsageError: the file cannot be written.
     """
     values = {
         "version": VERSION,
@@ -416,22 +372,10 @@ def write_placement(
 def read_placement(path: Path, world_from_scene: Similarity) -> Similarity | None:
     """Read ``blender_from_scene``.
 
-    Parameters
-    ----------
-    path : Path
-    world_from_scene : Similarity
-        Scene frame of the result that the placement applies to.
-
-    Returns
-    -------
-    Similarity or None
-        None if the file was written for another scene frame (the cameras were solved again), in
-        which its lengths and directions differ.
-
-    Raises
-    ------
-    ParseError
-        The file holds no placement.
+    ``world_from_scene``: scene frame of the result that the placement applies to.
+    Returns None if the file was written for another scene frame (the cameras were solved again), in
+    which its lengths and directions differ.
+    Raises ParseError: the file holds no placement.
     """
     hint = "Delete the file; the scene is then placed as it was trained."
     try:

@@ -173,12 +173,8 @@ def save_scene(scene: Scene, folder: Path) -> None:
 def load_saved_scene(folder: Path) -> Scene:
     """Read what :func:`save_scene` wrote.
 
-    Raises
-    ------
-    ParseError
-        A file is missing, damaged or of another version.
-    DatasetError
-        A photo no longer exists.
+    Raises ParseError: a file is missing, damaged or of another version; DatasetError: a photo no
+    longer exists.
     """
     path = folder / SCENE_NAME
     if not path.is_file():
@@ -212,9 +208,7 @@ def scene_to_json(scene: Scene, folder: Path | None = None) -> dict[str, Any]:
 def scene_from_json(values: Any, folder: Path) -> Scene:
     """Build a scene from :func:`scene_to_json`'s values and ``points.npz`` of ``folder``.
 
-    Raises
-    ------
-    ParseError, DatasetError
+    Raises ParseError, DatasetError.
     """
     path = folder / SCENE_NAME
     if not isinstance(values, dict) or values.get("version") != VERSION:
@@ -308,17 +302,9 @@ def save_poses(folder: Path, poses: np.ndarray | None) -> None:
 def load_refined_scene(cameras: Path, training: Path) -> Scene:
     """Read a scene as its training left it: with refined poses, where there are any.
 
-    Parameters
-    ----------
-    cameras, training : Path
-        Folders of the two stages.
-
-    Raises
-    ------
-    ParseError
-        A file is missing, truncated or of another version, or the poses are none.
-    DatasetError
-        A photo no longer exists.
+    ``cameras``, ``training``: folders of the two stages.
+    Raises ParseError: a file is missing, truncated or of another version, or the poses are none;
+    DatasetError: a photo no longer exists.
     """
     scene = load_saved_scene(cameras)
     path = training / POSES_NAME

@@ -55,20 +55,10 @@ def triangulate(
 ) -> TriangulatedPoint | None:
     """Find the point that most observations agree with, then minimise their squared distances.
 
-    Parameters
-    ----------
-    cameras : sequence of n Camera
-    pixels : (n, 2) float64
-        Where each camera shows the point.
-    threshold_px : float
-        Observations further away are wrong.
-    noise_px : float
-        Smallest error of an observation to reckon with.
-
-    Returns
-    -------
-    TriangulatedPoint or None
-        None if no two photos agree whose rays meet under :data:`MIN_ANGLE_DEG`.
+    ``pixels``: (n, 2) float64, where each camera shows the point.
+    ``threshold_px``: observations further away are wrong.
+    ``noise_px``: smallest error of an observation to reckon with.
+    Returns None if no two photos agree whose rays meet under :data:`MIN_ANGLE_DEG`.
     """
     pixels = np.asarray(pixels, np.float64).reshape(-1, 2)
     centers = np.array([c.center for c in cameras]).reshape(-1, 3)
@@ -229,12 +219,8 @@ class ControlFile:
 def read_control_file(path: Path) -> ControlFile:
     """Read a file of control points.
 
-    Raises
-    ------
-    DatasetError
-        The file does not exist or is too large.
-    ParseError
-        Names the line that is wrong.
+    Raises DatasetError: the file does not exist or is too large; ParseError, which names the line
+    that is wrong.
     """
     try:
         with path.open("rb") as stream:
@@ -256,10 +242,7 @@ def read_control_file(path: Path) -> ControlFile:
 def parse_control_file(text: str, path: Path) -> ControlFile:
     """Parse the text of a file of control points; ``path`` is for messages.
 
-    Raises
-    ------
-    ParseError
-        Names the line that is wrong.
+    Raises ParseError, which names the line that is wrong.
     """
     system: CoordinateSystem | None = None
     seen: dict[str, list[tuple[np.ndarray, str, tuple[float, float], int]]] = {}
@@ -401,11 +384,8 @@ def observations(
 ) -> list[Observations]:
     """Gather the observations of each point.
 
-    Parameters
-    ----------
-    pixels : mapping
-        Camera and pinhole pixel of each observation whose photo was placed, by the point's name
-        and the index of the observation.
+    ``pixels``: camera and pinhole pixel of each observation whose photo was placed, by the point's
+        name and the index of the observation.
     """
     out = []
     for point in content.points:
@@ -421,10 +401,8 @@ def fit_control_points(
 ) -> ControlFit:
     """Triangulate the points and fit a similarity.
 
-    Raises
-    ------
-    DatasetError
-        Fewer than three points are seen well, they lie on one line, or they disagree.
+    Raises DatasetError: fewer than three points are seen well, they lie on one line, or they
+    disagree.
     """
     names, known, found, errors_px, skipped = [], [], [], [], []
     for point in seen:

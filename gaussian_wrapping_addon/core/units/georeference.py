@@ -56,14 +56,8 @@ class GeoPoint:
 def ecef_from_geographic(places: np.ndarray) -> np.ndarray:
     """Return earth-centred, earth-fixed coordinates.
 
-    Parameters
-    ----------
-    places : (n, 3) float64
-        Latitude and longitude in degrees, height in metres.
-
-    Returns
-    -------
-    (n, 3) float64, metres
+    ``places``: (n, 3) float64, latitude and longitude in degrees, height in metres.
+    Returns (n, 3) float64, metres.
     """
     places = np.asarray(places, np.float64).reshape(-1, 3)
     latitude, longitude = np.radians(places[:, 0]), np.radians(places[:, 1])
@@ -281,19 +275,12 @@ def robust_similarity(
 ) -> RobustFit:
     """Fit a similarity to pairs of which up to a third are wrong.
 
-    Parameters
-    ----------
-    source, target : (n, 3) float64
-    largest_error : float
-        Error, units of the target, beyond which a pair is wrong in any case.
-    noise : float
-        Smallest standard deviation of a target coordinate to reckon with, units of the target:
-        residuals of few pairs may be small by chance.
-
-    Raises
-    ------
-    DatasetError
-        Fewer than three pairs, all on one line or in one place, or no agreement of two thirds.
+    ``source``, ``target``: (n, 3) float64.
+    ``largest_error``: error, units of the target, beyond which a pair is wrong in any case.
+    ``noise``: smallest standard deviation of a target coordinate to reckon with, units of the
+        target: residuals of few pairs may be small by chance.
+    Raises DatasetError: fewer than three pairs, all on one line or in one place, or no agreement of
+    two thirds.
     """
     needed = max(3, math.ceil(MIN_AGREEING_SHARE * len(source)))
     threshold, best = largest_error, None
@@ -439,11 +426,7 @@ def blender_start(record: Any, world_from_scene: Similarity) -> Similarity | Non
     Where z is up in the metric frame, the scene is placed in that frame, far coordinates less whole
     metres; else it keeps its own axes and origin, in metres.
 
-    Parameters
-    ----------
-    record : object
-        The entry ``georeference``, perhaps None.
-    world_from_scene : Similarity
+    ``record``: the entry ``georeference``, perhaps None.
     """
     metric = metric_from_world(record)
     if metric is None or not record.get("applied"):
@@ -547,24 +530,11 @@ def georeference(
 ) -> Georeference:
     """Fit the cameras' centres to the GPS positions of their photos.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        In any common frame ("world").
-    positions : mapping
-        By the cameras' names; photos without one are left out.
-    needs : Needs
-        What the positions have to determine.
-
-    Returns
-    -------
-    Georeference
-        The origin is the median of the positions.
-
-    Raises
-    ------
-    DatasetError
-        Too few positions, or they do not determine scale and up direction; says why.
+    ``cameras``: in any common frame ("world"). ``positions``: by the cameras' names; photos without
+    one are left out. ``needs``: what the positions have to determine.
+    The origin is the median of the positions.
+    Raises DatasetError: too few positions, or they do not determine scale and up direction; says
+    why.
     """
     known = [c for c in cameras if c.name in positions]
     check_positions([positions[c.name] for c in known], len(cameras))
