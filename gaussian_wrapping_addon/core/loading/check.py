@@ -31,7 +31,6 @@ from .source_kind import SPLAT, VIDEO, SourceKind, read_poses, source_kind
 
 # -- Take over the sparse points of an input ------------------------------------------------------
 
-
 MIN_POINTS = 100
 """Smallest number of points to start from."""
 _ONE_PLACE_REACH = 100.0 * SCENE_RADIUS
@@ -118,7 +117,6 @@ def points_in_scene(
 
 # -- What cameras cover: photos with few sparse points, and photos that show nothing of the others
 
-
 _WEAK_SHARE = 0.1
 """Of the median number of sparse points in a photo: with fewer, its pose hangs on few matches."""
 _WEAK_POINTS = 30
@@ -193,7 +191,6 @@ def listed(names: Sequence[str]) -> str:
 
 
 # -- Check an input quickly before any long work: needs numpy only, solves no poses ---------------
-
 
 Severity = Literal["error", "warning", "fact"]
 

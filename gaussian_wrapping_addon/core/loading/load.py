@@ -41,7 +41,6 @@ from .views import PreparedView, prepare_views
 
 # -- Make start points for inputs without any: triangulated from the photos, else random ----------
 
-
 _logger = logging.getLogger(__name__)
 
 RANDOM_POINTS = 20_000
@@ -139,7 +138,6 @@ def count_observing_views(cameras: Sequence[Camera], points: np.ndarray) -> np.n
 
 
 # -- Load an input path as a :class:`~.scene.Scene`: poses, photos, frame, start points ----------
-
 
 _CAMERAS_ARE_GIVEN = ReportWarning(
     "no-turntable",

@@ -35,7 +35,6 @@ from .source_kind import SourceKind
 
 # -- Panoramas of an input replaced by their pinhole views, posed or to be solved -----------------
 
-
 _CUTTING = 0.3
 """Share of the progress that cutting takes where cameras are solved afterwards."""
 
@@ -160,7 +159,6 @@ def _warnings(bad: Sequence[str], missing: Sequence[str]) -> list[ReportWarning]
 
 
 # -- Place virtual cameras around a splat that comes without photos -------------------------------
-
 
 PHOTO_SIDE_PX = 800
 FIELD_OF_VIEW_DEG = 50.0

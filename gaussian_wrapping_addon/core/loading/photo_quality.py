@@ -24,7 +24,6 @@ from .source_kind import WITHOUT_PHOTOS, SourceKind, read_poses, source_kind
 
 # -- Measure one photo at a reduced size: sharpness, brightness, and a small picture of it --------
 
-
 MEASURED_PX = 1024
 """Long side that photos are measured at: about what training sees, and quick to decode."""
 SMALL_PX = 96
@@ -168,7 +167,6 @@ def _tile_means(values: np.ndarray, rows: int, columns: int) -> np.ndarray:
 
 # -- Compare the measures of a set's photos: which are blurred, brighter or darker, the same again
 
-
 NEIGHBOURS = 4
 """Photos before and after one, by name, that it is compared with: they show much the same."""
 SIDE = 3
@@ -263,7 +261,6 @@ def _edge_strength(small: np.ndarray) -> float:
 
 
 # -- Look at the photos of an input, and say what should be done about which ----------------------
-
 
 _SAID_EVERY_S = 2.0
 """Progress is reported this often."""

@@ -22,7 +22,6 @@ from ..training.start import LEAST_REACH, onto_sphere
 #
 # Without them, training explains a plain background by fog around the object, inside the region.
 
-
 CELL_PX = 8
 """Side of the cells that are looked at, pixels of the photos."""
 MOST_POINTS = 8000
@@ -72,7 +71,6 @@ def _near_points(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 # -- Silhouettes of the Gaussians that stand in a region, as photos show them ---------------------
-
 
 WHITE = 0.5 / (0.5 / math.sqrt(math.pi))
 """Coefficient of the constant harmonic of a Gaussian whose colour is 1; minus that, of colour 0."""

@@ -45,7 +45,6 @@ def check_model_file(path: Path) -> None:
 #
 # Standard library only, so that Blender can load it.
 
-
 FOLDER = "masks"
 """In the job folder."""
 LIST_NAME = "masks.json"

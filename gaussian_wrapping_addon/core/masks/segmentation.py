@@ -16,7 +16,6 @@ from .mask_folder import check_model_file
 
 # -- From how much of a pixel shows the object to a mask of the photo -----------------------------
 
-
 THRESHOLD = 0.5
 """Share of a pixel from which it belongs to the object."""
 SMALLEST_SHARE = 0.02
@@ -84,7 +83,6 @@ def encoded(mask: np.ndarray) -> bytes:
 #
 # Conventions (docs/file-formats.md): one input ``(1, 3, h, w)`` float, colours normalised in one
 # of three ways; the first output ``(1, 1, h, w)`` or ``(1, h, w)``, shares or logits.
-
 
 USUAL_SIDE_PX = 1024
 """Side of the input where the model leaves it open."""

@@ -14,7 +14,6 @@ from .formats import RAW, open_image, photo_kind, raw_focal, without_warnings
 
 # -- Read lens identity and focal length from a photo's EXIF --------------------------------------
 
-
 _EXIF_FOLDER = 0x8769
 _MAKE, _MODEL, _LENS = 0x010F, 0x0110, 0xA434
 _FOCAL_MM, _FOCAL_35MM = 0x920A, 0xA405
@@ -94,7 +93,6 @@ def _positive_number(value: Any) -> float:
 
 
 # -- Read where a photo was taken from its EXIF: GPS latitude, longitude and altitude -------------
-
 
 _GPS_FOLDER = 0x8825
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE = 1, 2, 3, 4

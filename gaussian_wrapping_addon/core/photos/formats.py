@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 # Pillow goes by the content of a file, not by its name, and knows some forty formats: a
 # PostScript file named ``.jpg`` would start Ghostscript.
 
-
 IMAGE_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "AVIF")
 """Pillow's names; a JPEG with several pictures (MPO) is opened as JPEG."""
 PLAIN_FORMATS = IMAGE_FORMATS[:5]
@@ -174,7 +173,6 @@ def _formats() -> tuple[str, ...]:
 # its white level are stretched, so that exposures of a set stay comparable. The colours are sRGB,
 # with the camera's orientation applied. It comes out darker than the camera's own JPEG.
 
-
 _SRGB_GAMMA = (2.4, 12.92)
 """Exponent and slope at black; LibRaw's default is that of television."""
 _TURNED = (4, 5, 6, 7)
@@ -248,7 +246,6 @@ def _opened(path: Path) -> Iterator[Any]:
 #
 # JPEG and PNG are parsed here, so that a Python with numpy alone (Blender's) can check an input;
 # other formats are read by Pillow and the worker's extras if these are installed.
-
 
 _EXIF_ORIENTATION = 0x0112
 _JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 # -- Decode one photo or mask to 8-bit arrays: any mode, any EXIF orientation, within the limits
 
-
 JPEG_QUALITY = 97
 """Of written photos: no visible loss, a fifth of a PNG's size."""
 

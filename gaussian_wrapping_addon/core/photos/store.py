@@ -85,7 +85,6 @@ def photo_memory(photos: int, pixels: float, *, masked: bool, free_bytes: int) -
 
 # -- Arrays of photos kept in memory, up to a number of bytes, for readers that come round again
 
-
 Key = tuple[str, int, int]
 """Kind of array, number of the photo, divisor of its size."""
 
@@ -201,7 +200,6 @@ class KeptPhotos:
 
 
 # -- A file without a name that holds decoded photos: quicker to read again than to decode again
-
 
 _logger = logging.getLogger(__name__)
 

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 # -- Recognise video files by name and first bytes, and find the one of an input; decodes nothing
 
-
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 _HEAD_BYTES = 16
 _QUICKTIME_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
@@ -98,7 +97,6 @@ def container_of(path: Path) -> str:
 #
 # :func:`probe_video` needs the standard library alone, as Blender has no PyAV. The child writes
 # one JSON line: the facts, or ``{"error", "hint"}``.
-
 
 PROBE_DEADLINE_S = 60.0
 _AGAIN = "Copy it from the camera again, or export it as MP4."
@@ -175,7 +173,6 @@ def probed(path: Path) -> ProbedVideo:
 
     Raises DatasetError, ParseError: it is no video that can be read.
     """
-
     with open_video(path) as video:
         first = next(frames_of(video), None)
         if first is None:
@@ -215,7 +212,6 @@ def interlaced_warning(video: Path) -> ReportWarning:
 # -- Open a video with PyAV and decode its frames one by one, within limits and past damage -------
 #
 # Frames are read as the file has them; :func:`upright_color` turns them as players show them.
-
 
 MAX_DECODE_ERRORS = 1000
 """Packets that cannot be decoded until the rest of the file is given up."""

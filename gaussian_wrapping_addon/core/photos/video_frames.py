@@ -39,7 +39,6 @@ from .video import (
 #
 # docs/method.md, section 14.1.
 
-
 MOTION_SIDE_PX = 160
 """Long side of the pictures that motion is measured in."""
 _BLOCKS = 12
@@ -165,7 +164,6 @@ def _block_sums(values: np.ndarray, cut: Sequence[slice], block: int) -> np.ndar
 #
 # docs/method.md, section 14.2.
 
-
 SHARPNESS_SIDE_PX = 960
 """Long side of the pictures that sharpness is measured in."""
 _COARSE = 4
@@ -248,7 +246,6 @@ def _noise_variance(grey: np.ndarray) -> float:
 # -- Choose the frames of a video: the sharpest of each stretch of motion -------------------------
 #
 # docs/method.md, section 14.3.
-
 
 MOTION_STEP = 0.08
 """Way of the picture from one chosen frame to the next, in its long sides."""
@@ -356,7 +353,6 @@ def _show_the_same(ways: np.ndarray, blurred: np.ndarray) -> np.ndarray:
 #    chosen
 #
 # Reads ``task.json`` of its folder; writes ``frames/`` and, last, ``chosen.json``.
-
 
 FRAMES_FOLDER = "frames"
 CHOSEN_NAME = "chosen.json"
@@ -510,7 +506,6 @@ class _Ticker:
 
 
 # -- Take photos out of a video, in a helper process: FFmpeg may crash or hang on damaged files
-
 
 _HELPER = "photos.video_frames"
 _DEADLINE_S = 4 * 3600.0

@@ -22,7 +22,6 @@ from ..readers.source_model import SourceModel
 # Between two such photos the background's features stay where they are and the object's move. A
 # camera that moves leaves no feature in its place; a pause of it leaves all of them.
 
-
 TURNTABLE_NAME = "turntable.json"
 """How many ``photos`` are of a turntable, and whether it ``is_masked``."""
 TURNING_FOLDER = "turning"
@@ -136,7 +135,6 @@ def are_turning(most_inliers: Sequence[int]) -> bool:
 #
 # Plain geometry, no solver: pairs of photos whose matches agree with some motion, against the
 # motion that the solved cameras have.
-
 
 EPIPOLAR_PX = 6.0
 """Largest Sampson distance of a match that agrees; the matcher lets 4 pass."""
@@ -328,7 +326,6 @@ def check_solution(database: Path, model: Any) -> Verdict:
     Pairs that the solver did not use, or gave up, count like all others.
     """
     pycolmap = import_pycolmap()
-
     placed = {image_id: _Placed(model, image_id) for image_id in sorted(model.reg_image_ids())}
     pairs = []
     with pycolmap.Database.open(database) as db:
@@ -375,7 +372,6 @@ class _Placed:
 
 
 # -- What the solver's check of its own cameras found: facts and warnings of the report -----------
-
 
 SOLUTION_NAME = "solution.json"
 """Of the helper, in its folder."""

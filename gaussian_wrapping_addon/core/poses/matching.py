@@ -15,7 +15,6 @@ from ..worker.helper_process import emit
 
 # -- Distances between photos by their GPS positions ----------------------------------------------
 
-
 EARTH_RADIUS_M = 6_371_000.0
 MIN_POSITIONS = 3
 SAME_PLACE_M = 0.5
@@ -46,7 +45,6 @@ def gps_distances(positions: Sequence[GpsPosition | None]) -> np.ndarray | None:
 
 
 # -- Pairs of photos by their order, and by known poses -------------------------------------------
-
 
 Pairs = list[tuple[int, int]]
 """Sorted, without repetition, (i, j) with i < j."""
@@ -123,7 +121,6 @@ def pairs_by_pose(centers: np.ndarray, forwards: np.ndarray) -> Pairs:
 #
 # Up to 150 photos: all. Beyond, the nearest by order, by GPS and by resemblance; then, for photos
 # with few verified neighbours, the neighbours of their neighbours.
-
 
 ALIKE_NEIGHBOURS = 20
 ALIKE_IN_ORDER = 8
@@ -227,7 +224,6 @@ def _components(linked: np.ndarray) -> np.ndarray:
 # A vocabulary is learnt from the set's own descriptors by k-means; a photo is described by how
 # its descriptors differ from their words (docs/method.md, section 15.1).
 
-
 WORDS = 64
 SAMPLED_DESCRIPTORS = 60_000
 """Of all photos together, for the vocabulary."""
@@ -306,7 +302,6 @@ def _nearest_words(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
 
 # -- Find and match features, in the helper processes that solve cameras and points ---------------
 
-
 EXTRACT_END, MATCH_END = 0.5, 0.85
 """Shares of the solver's progress."""
 _SECOND_ROUND_BEGIN = 0.8
@@ -324,7 +319,6 @@ def extract(
 ) -> None:
     """Find features of photos of each camera, in order, with progress."""
     pycolmap = import_pycolmap()
-
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.use_gpu = False
@@ -375,7 +369,6 @@ def match_chosen(folder: Path, database: Path, task: dict[str, Any], names: list
         match(folder, database, task)
         return
     pycolmap = import_pycolmap()
-
     emit(fraction=EXTRACT_END, message=f"comparing {count} photos")
     with pycolmap.Database.open(database) as db:
         number_of = {image.name: image.image_id for image in db.read_all_images()}
@@ -419,7 +412,6 @@ def match(
 ) -> None:
     """Match and verify the pairs of ``task``, with progress from ``begin`` to ``end``."""
     pycolmap = import_pycolmap()
-
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = task["threads"]
@@ -447,7 +439,6 @@ def match(
 def verify_again(database: Path, task: dict[str, Any], *, is_turntable: bool) -> None:
     """Verify all matches anew."""
     pycolmap = import_pycolmap()
-
     with pycolmap.Database.open(database) as db:
         db.clear_two_view_geometries()
     verifier = pycolmap.GeometricVerifierOptions()

@@ -40,7 +40,6 @@ from .solver import HELPER
 # A panorama's frame has x right, y down and z forward, where forward is the middle of the photo;
 # its long side is a full turn about y. Needs numpy only.
 
-
 FIELD_OF_VIEW_DEG = 84.0
 """Of each view: neighbours on the horizon, 45 degrees apart, share nearly half of their width; with
 80 degrees there are gaps between the horizon and the tilted views."""
@@ -147,7 +146,6 @@ def panorama_pixels(view: PanoramaView, width: int, height: int) -> np.ndarray:
 
 # -- Cut equirectangular photos and their masks into pinhole views --------------------------------
 
-
 CUT_FOLDER, CUT_MASKS = "panoramas", "panorama-masks"
 """Folders of the views and of their masks, in the work folder."""
 
@@ -251,7 +249,6 @@ def _wrapped(pixels: np.ndarray) -> np.ndarray:
 
 
 # -- Solve the poses of panoramas from their views, which keep their known directions (a rig) -----
-
 
 _MAX_SIFT_PX = 1000
 """Side of the views that features are extracted from."""

@@ -41,7 +41,6 @@ from .matching import EXHAUSTIVE_LIMIT, pairs_by_pose
 
 # -- What the pose solver found of a turntable: facts, warnings and masks of the photos' full size
 
-
 _NOT_FOUND = ReportWarning(
     "no-turntable",
     f"No turntable was found: fewer than {MIN_GROUP} photos are of one size.",
@@ -107,7 +106,6 @@ def with_turntable(
 #
 # The photos are decoded here, oriented, limited in size and written under plain names; the native
 # solver reads only these files. Its result is a COLMAP model read by our own reader.
-
 
 MAX_SIFT_PX = 1600
 """Long side of the photos that features are extracted from."""

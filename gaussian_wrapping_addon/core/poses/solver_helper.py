@@ -39,7 +39,6 @@ from .turntable import (
 #
 # Runs in the helper process of :mod:`.solver`.
 
-
 MIN_MODEL = 3
 """Photos of the smallest part that is kept."""
 MIN_COMMON = 3
@@ -51,7 +50,6 @@ MAX_JOIN_SHARE = 0.02
 def mapping_options(seed: int) -> Any:
     """Return options of the incremental mapper that give the same result for the same seed."""
     pycolmap = import_pycolmap()
-
     options = pycolmap.IncrementalPipelineOptions()
     for part in (options, options.mapper, options.triangulation):
         part.random_seed = seed
@@ -77,7 +75,6 @@ def place_one_by_one(
     ``known_lens``: neither the lenses nor the places of cameras in their rig are adjusted.
     """
     pycolmap = import_pycolmap()
-
     options = mapping_options(seed)
     options.min_model_size = MIN_MODEL
     if known_lens:
@@ -109,7 +106,6 @@ def place_one_by_one(
 def place_at_once(database: Path, folder: Path, seed: int, total: int) -> list[Any]:
     """Return the reconstructions of the global mapper, the largest first."""
     pycolmap = import_pycolmap()
-
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = 1  # repeatable, as above
     options.random_seed = seed
@@ -146,7 +142,6 @@ def joined(database: Path, folder: Path, seed: int, models: Sequence[Any]) -> tu
     the others added.
     """
     pycolmap = import_pycolmap()
-
     first = models[0]
     added: dict[int, np.ndarray] = {}
     poses = _poses(first)
@@ -231,7 +226,6 @@ def _center(pose: np.ndarray) -> np.ndarray:
 # different things. They have less in common than true neighbours: beside what repeats, each shows
 # things that the other does not.
 
-
 MOST_ALIKE = 3
 """Pairs of each photo by which two solutions are compared."""
 TREE_STEPS = 3
@@ -291,7 +285,6 @@ def _contradictions(verdict: Verdict, pairs: set[frozenset[str]]) -> int:
 def pair_likeness(database: Path) -> dict[tuple[int, int], float]:
     """Return how alike the photos of verified pairs are, in (0, 1]."""
     pycolmap = import_pycolmap()
-
     with pycolmap.Database.open(database) as db:
         matches = {
             pycolmap.pair_id_to_image_pair(pair_id): geometry.inlier_matches
@@ -348,7 +341,6 @@ def _copy(source: Path, target: Path) -> None:
 # Reads ``task.json``, ``images/`` and ``masks/`` of its folder, writes ``model/`` (COLMAP
 # binary), and ``turntable.json``, ``turning/`` and ``solution.json`` where it solves.
 
-
 DEFAULT_FOCAL_FACTORS = (1.2, 0.85, 1.7, 2.5)
 """Focal lengths over the long side to try if EXIF gives none, the most common first."""
 _MIN_REGISTERED_SHARE = 0.8
@@ -366,7 +358,6 @@ _MAX_FEATURES_PANORAMA = 2048
 def main(folder: Path) -> None:
     """Run the task of ``folder``."""
     pycolmap = import_pycolmap()
-
     pycolmap.logging.minloglevel = 1
     task = read_json(folder / "task.json")
     pycolmap.set_random_seed(task["seed"])
@@ -380,7 +371,6 @@ def main(folder: Path) -> None:
 
 def _solve(folder: Path, task: dict[str, Any]) -> None:
     pycolmap = import_pycolmap()
-
     database = folder / "database.db"
     guessed: list[int] = []
     names_of_camera: dict[int, list[str]] = {}
@@ -440,7 +430,6 @@ def _solve(folder: Path, task: dict[str, Any]) -> None:
 def _solve_panoramas(folder: Path, task: dict[str, Any]) -> None:
     """Solve views of panoramas as a rig whose directions and lens are known and stay."""
     pycolmap = import_pycolmap()
-
     database = folder / "database.db"
     side, focal_px = task["side"], task["focal_px"]
     rotations = [np.array(rows) for rows in task["cam_from_panorama"]]
@@ -505,7 +494,6 @@ def _place_one_by_one(
 ) -> tuple[Any, dict[str, Any]]:
     """Try focal lengths, where EXIF gives none, until most photos can be placed."""
     pycolmap = import_pycolmap()
-
     best: list[Any] = []
     factors = DEFAULT_FOCAL_FACTORS if guessed else DEFAULT_FOCAL_FACTORS[:1]
     attempts = [(factor, False) for factor in factors] + [(factors[0], True)]
@@ -578,7 +566,6 @@ def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) ->
 
 def _triangulate(folder: Path, task: dict[str, Any]) -> None:
     pycolmap = import_pycolmap()
-
     database = folder / "database.db"
     photos_of_lens: dict[tuple[float, ...], list[str]] = {}
     for photo in task["photos"]:

@@ -20,7 +20,6 @@ from .checks import MIN_GROUP, pair_motion, standing_groups
 
 # -- Masks of what turns before a camera that stands still: what differs from the background ------
 
-
 MAX_BACKGROUND_PHOTOS = 32
 """Photos, evenly spread, that the background is found from: memory and time stay bounded."""
 SAME_LEVELS = 8.0
@@ -196,7 +195,6 @@ def without_holes(mask: np.ndarray, often: np.ndarray) -> np.ndarray:
 #
 # Runs in the helper process of :mod:`.solver`.
 
-
 MIN_MATCHES_INSIDE = 0.8
 """Share of the matches that turn which masks must contain; else something that turns looks the same
 from all sides, and the masks would cut it away."""
@@ -214,7 +212,6 @@ def turntable_groups(database: Path, task: Mapping[str, Any]) -> list[list[str]]
     lens and size, and ``pairs``.
     """
     pycolmap = import_pycolmap()
-
     if task["turntable"] == "off":
         return []
     if task["turntable"] == "on":
@@ -263,7 +260,6 @@ def most_inliers(
 ) -> list[int]:
     """Return for each of the photos how many verified matches it has with another one, at most."""
     pycolmap = import_pycolmap()
-
     most = dict.fromkeys(names, 0)
     with pycolmap.Database.open(database) as db:
         for first, second, matches in _verified(db, most, pairs):
@@ -280,7 +276,6 @@ def matches_inside(
     0 where there are none.
     """
     pycolmap = import_pycolmap()
-
     inside, total = 0, 0
     with pycolmap.Database.open(database) as db:
         images = {image.name: image.image_id for image in db.read_all_images()}
@@ -318,7 +313,6 @@ def _verified(
 def drop_still_features(database: Path, masks: Mapping[str, np.ndarray]) -> None:
     """Remove the features outside of the masks, and all matches, which number features."""
     pycolmap = import_pycolmap()
-
     with pycolmap.Database.open(database) as db:
         features = {
             image.name: (

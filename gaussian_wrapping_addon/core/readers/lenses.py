@@ -17,7 +17,6 @@ from .source_model import SKEWED_BROWN, LensCamera, PosedPhoto
 
 # -- The one place where pycolmap is imported -----------------------------------------------------
 
-
 _importing = threading.Lock()
 
 
@@ -46,7 +45,6 @@ def import_pycolmap() -> Any:
 # With ``r`` the length of the ray's slope (x, y): ``x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4
 # r^8) + 2 p1 x y + p2 (r^2 + 2 x^2)`` and y' likewise with p1 and p2 swapped; ``u = fx x' + skew
 # y' + cx``, ``v = fy y' + cy``. See docs/method.md, section 1.2.
-
 
 _STEPS = 50
 _SHORTEST_STEP = 1e-13
@@ -115,7 +113,6 @@ class SkewedBrown:
 
 # -- Fit the cameras of an input to the sizes of its photos; needs their headers only -------------
 
-
 MIN_PHOTO_SIDE_PX = 16
 
 
@@ -179,7 +176,6 @@ def same_proportions(size: tuple[int, int], lens: LensCamera) -> bool:
 # validated before, see :meth:`~.source_model.LensCamera.problem`. The pinhole image
 # shows the largest axis-parallel rectangle, in normalised coordinates, that the photo fills
 # without a black border.
-
 
 _MAX_SLOPE = math.tan(math.radians(65.0))
 """Fields of view are limited to 130 degrees: a planar image would waste its pixels on the rim."""
@@ -253,7 +249,6 @@ def _native(camera: LensCamera) -> Any:
     if camera.model == SKEWED_BROWN:
         return SkewedBrown(camera)
     pycolmap = import_pycolmap()
-
     return pycolmap.Camera(
         model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
     )

@@ -30,7 +30,6 @@ from .source_model import PANORAMA, Brown, LensCamera, SourceModel
 # A shot's ``rotation`` (axis times angle) and ``translation`` lead from world to camera (x right,
 # y down, z forward). Lengths in the image are shares of its long side, counted from its middle.
 
-
 KIND = "OpenSfM reconstruction"
 
 _MAX_BYTES = 64 * 1024 * 1024
@@ -182,7 +181,6 @@ def _points(path: Path, place: str, entries: dict[str, Any]) -> tuple[np.ndarray
 # A shot's ``translation`` is the camera's centre in the map's metres, ``rotation`` (axis times
 # angle) leads from there to the camera. Lenses are in ``cameras.json``; a shot names its lens by
 # photo size and focal length only.
-
 
 SHOTS_KIND = "OpenDroneMap shots"
 

@@ -16,7 +16,6 @@ from ..ply import PlyHeader, read_ply_header, read_vertices
 
 # -- Bounded reader of a point cloud in PLY format (the ``ply_file_path`` of transforms.json) -----
 
-
 _AGAIN = "Export the points again as PLY with x, y, z."
 
 
@@ -58,7 +57,6 @@ def _as_declared(header: PlyHeader, table: np.ndarray) -> np.ndarray:
 
 
 # -- Tell from its header whether a file is a 3D Gaussian splat, and of which known variant -------
-
 
 MAX_FILE_DEGREE = 4
 """Highest degree of the harmonics that files are known to have."""

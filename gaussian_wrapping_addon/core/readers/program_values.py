@@ -23,7 +23,6 @@ from .source_model import LensCamera, PosedPhoto, RelativeLens
 
 # -- Checked values of camera files: numbers, vectors, rotations, sizes ---------------------------
 
-
 AGAIN = "Export the cameras again."
 
 ROTATION_TOLERANCE = 1e-2
@@ -129,7 +128,6 @@ def fisheye_lens(
 
 # -- Bounded reader of XML: no document types, no entities, limits on size, depth and elements ----
 
-
 MAX_XML_BYTES = 64 * 1024 * 1024
 """A camera of a Metashape project takes about 1 kB: 64 MB are 60 000 of them."""
 _MAX_ELEMENTS = 4_000_000
@@ -201,7 +199,6 @@ def _full(name: str) -> str:
 
 
 # -- Photos of a camera file, collected: names made relative, unusable ones counted and left out
-
 
 _EXAMPLES = 3
 """Names quoted in a warning about several photos."""

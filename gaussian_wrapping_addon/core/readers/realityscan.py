@@ -38,7 +38,6 @@ from .source_model import Brown, RelativeLens, SourceModel
 # down and the photo's top is +y. The file states no photo sizes: lenses are completed when the
 # photos are known.
 
-
 KIND = "RealityScan CSV"
 
 FILM_WIDTH_MM = 36.0
@@ -173,7 +172,6 @@ def _world_from_opengl(heading: float, pitch: float, roll: float) -> np.ndarray:
 # ``xcr:Position`` is the camera's centre. Focal length in millimetres of a film 36 mm wide,
 # principal point in shares of the photo's long side from its middle, distortion ``k1 k2 k3 k4 t1
 # t2``.
-
 
 XMP_KIND = "RealityScan XMP"
 

@@ -24,7 +24,6 @@ from .placement import COINCIDENT, Plane
 # far coarser than rounding errors of float64 in the input and far finer than the errors of solved
 # cameras.
 
-
 CENTER_STEP = 2.0**-17
 """Step of camera centres in scene units. Moves a camera by at most 7e-6: 0.01 pixels for a focal
 length of 4000 pixels and a distance of 3. Models in UTM coordinates have errors of 1e-9."""
@@ -71,7 +70,6 @@ def snapped_length(length: float) -> float:
 
 
 # -- Compute the scene frame: Z up, mean camera centre at 0, cameras within a fixed radius --------
-
 
 RADIUS_MARGIN = 1.1
 """The largest camera distance times this becomes ``SCENE_RADIUS`` (docs/method.md, section 1.7)."""
@@ -262,7 +260,6 @@ def _rotation_to_z(up: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 
 # -- Estimate the up direction from cameras that may be rolled by quarter turns -------------------
 
-
 MIN_AGREEING_SHARE = 0.7
 """Share of the cameras that must agree with an up direction: about three quarters of hand-held
 photos are level or turned by quarters, and a random direction reaches at most half
@@ -413,7 +410,6 @@ def _sign(rotations: np.ndarray, up: np.ndarray) -> float:
 
 # -- Find the ground plane of a scene from its surface --------------------------------------------
 
-
 LEVEL_DEG = 20.0
 """Largest tilt of ground faces: the up direction from cameras is off by a few degrees at most."""
 BAND_SHARE = 0.02
@@ -490,7 +486,6 @@ def _fullest_band(heights: np.ndarray, weights: np.ndarray, width: float) -> flo
 # -- Coordinate frame of an exported file: target frame, axes and offset --------------------------
 #
 # Files of Y-up formats hold (x, z, -y) of the Z-up coordinates, as Blender's own exporters write.
-
 
 FAR_FROM_ORIGIN = 100.0
 """Further than this many sizes from the origin, float32 rounding exceeds 1e-5 of the size."""

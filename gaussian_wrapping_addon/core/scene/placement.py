@@ -18,7 +18,6 @@ from .camera import Similarity
 # Everything is computed about the centroids, so that coordinates of millions of units (a
 # cadastral frame) cost no digits beyond those already lost in the input.
 
-
 COLLINEAR_SHARE = 1e-6
 """Ratio of second to first extent below which points count as collinear: the rotation about their
 line would depend on a millionth of the scene, less than the error of any pose estimate."""
@@ -191,7 +190,6 @@ def _score_triples(
 # Each step is a similarity applied after the present placement. Scaling is always uniform, and
 # steps are idempotent: a step from points that are placed already is the identity.
 
-
 COINCIDENT = 1e-6
 """Distance over size of the coordinates below which two points coincide: in Blender's single
 precision such a distance has hardly one significant digit."""
@@ -341,7 +339,6 @@ def _finite(points: np.ndarray) -> np.ndarray:
 
 
 # -- Read and write ``placement.json``: the transform of Blender's parent empty in float64 --------
-
 
 FILE_NAME = "placement.json"
 VERSION = 1

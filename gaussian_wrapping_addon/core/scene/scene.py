@@ -106,7 +106,6 @@ class Scene:
 
 # -- Which views of a scene are held out, which are trained on, and a few of many -----------------
 
-
 FEW_PHOTOS = 8
 """Below this number of photos, only one is held out."""
 
@@ -148,7 +147,6 @@ def _has_visible_pixels(photos: PhotoSource, index: int) -> bool:
 
 
 # -- Save and load a :class:`~.scene.Scene`: ``scene.json`` and ``points.npz``, no pickles --------
-
 
 VERSION = 1
 SCENE_NAME = "scene.json"
@@ -276,7 +274,6 @@ def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 # -- A saved scene with the camera poses that training refined ------------------------------------
-
 
 POSES_NAME = "camera_poses.npz"
 ROTATION_TOLERANCE = 1e-6

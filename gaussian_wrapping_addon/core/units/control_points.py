@@ -28,7 +28,6 @@ from .georeference import (
 
 # -- Triangulate a point that several posed photos show, some of them perhaps wrongly -------------
 
-
 MIN_ANGLE_DEG = 1.5
 """Between two rays: at one degree, a pixel of error moves the point by 50 pixels along them."""
 MAX_PAIRS = 300
@@ -147,7 +146,6 @@ def _least_squares(
 # -- Read control points: known places, and where photos show them (docs/file-formats.md) ---------
 #
 # The first line names the coordinates, each further one is a place seen in a photo.
-
 
 LOCAL = "local"
 """Name of coordinates in metres in a frame of their own."""
@@ -339,7 +337,6 @@ def _point(
 
 
 # -- Similarity from the cameras' frame to control points: triangulate, fit, name what is wrong
-
 
 PIXEL_THRESHOLD_PX = 10.0
 """Clicks further from the point that most photos agree about are wrong; people hit a mark within a

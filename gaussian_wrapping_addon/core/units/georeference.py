@@ -20,7 +20,6 @@ from ..scene.placement import fit_similarity, umeyama_ransac
 #
 # Formulas and their orders: docs/method.md, section 13.1. Heights are above the ellipsoid.
 
-
 SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY_2 = FLATTENING * (2.0 - FLATTENING)
@@ -231,7 +230,6 @@ def _series() -> tuple[float, tuple[float, ...], tuple[float, ...]]:
 # Errors of GPS are not known beforehand: the inlier threshold is halved for as long as enough
 # pairs agree (docs/method.md, section 13.2).
 
-
 MIN_AGREEING_SHARE = 2.0 / 3.0
 """Share of the pairs that a threshold has to keep: with fewer, most of a set may be wrong alike."""
 INLIER_SIGMAS = 3.0
@@ -343,7 +341,6 @@ def _sigma(residuals: np.ndarray, noise: float) -> float:
 
 # -- The record of how a scene got its metres, as it goes with results and exports ----------------
 
-
 VERSION = 1
 GPS, MARKERS, CONTROL_POINTS = "gps", "markers", "control points"
 """Sources of metres."""
@@ -450,7 +447,6 @@ def rounded(value: float, digits: int = 4) -> float | None:
 
 
 # -- Place solved cameras on the earth by the GPS positions of their photos -----------------------
-
 
 MIN_POSITIONS = 5
 """Photos with a position: with three or four, nothing tells a wrong one."""

@@ -31,7 +31,6 @@ from .georeference import listed, rounded
 # A corner is rounded by the lens and the pixels, which moves it inwards; edges are not
 # (docs/method.md, section 13.3).
 
-
 MIN_MODULE_PX = 2.5
 """Size of a bit of the marker below which the profile across an edge would reach the bits."""
 _END_SHARE = 0.12
@@ -152,7 +151,6 @@ def _crossing(
 # In: ``task.json`` with the dictionary and paths of photos. Out: ``markers.json``, for each photo
 # the numbers and corners of its markers. Photos are decoded by our own reader.
 
-
 TASK, RESULT = "task.json", "markers.json"
 MARKERS_EXTRA = "markers"
 BORDER_BITS = 1
@@ -210,7 +208,6 @@ def _markers(grey: np.ndarray, corners: Any, numbers: Any, modules: int) -> list
 
 
 # -- Scale of a scene from markers of known size: detect, triangulate their corners, compare sides
-
 
 CORNER_THRESHOLD_PX = 3.0
 """Corners further from their common point are of another marker, or the photo's pose is wrong."""
