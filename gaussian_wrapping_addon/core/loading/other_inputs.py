@@ -29,7 +29,7 @@ from ..poses.panoramas import (
 from ..poses.solver import check_unreadable_share
 from ..progress import UNREADABLE_HINT, Progress, ReportWarning
 from ..readers.source_model import PosedPhoto, SourceModel
-from ..scene.camera import Camera, Similarity
+from ..scene.camera import Camera, Similarity, pose_at
 from ..scene.frames import RADIUS_MARGIN
 from .source_kind import SourceKind
 
@@ -264,8 +264,7 @@ def _look_at(eye: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """Return (3, 4) ``cam_from_world`` with Z up; no direction of the lattice is a pole."""
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return np.concatenate([rotation, -(rotation @ eye)[:, None]], axis=1)
+    return pose_at(np.stack([right, np.cross(forward, right), forward]), eye)
 
 
 def scene_frame(cameras: list[Camera]) -> Similarity:

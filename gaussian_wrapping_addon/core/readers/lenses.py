@@ -136,9 +136,8 @@ def fit_lens(
         lens = posed.relative.of_size(width, height)
         problem = lens.problem()
         if problem:
-            raise DatasetError(
-                f"The camera of {file_name}: {problem}.", "Export the cameras again."
-            )
+            text = f"The camera of {file_name}: {problem}."
+            raise DatasetError(text, "Export the cameras again.")
         return lens, not prefers_stored, False
     if posed.lens is None:
         assert posed.angle_x is not None

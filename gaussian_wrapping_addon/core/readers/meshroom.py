@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from .. import limits
 from ..errors import ParseError
 from ..files import read_json
+from ..scene.camera import pose_at
 from .program_values import (
     AGAIN,
     PhotoList,
@@ -25,7 +25,7 @@ from .program_values import (
     image_size,
     number,
     numbers,
-    pose_at,
+    points_of,
     relative_names,
     rotation,
     unsupported,
@@ -88,13 +88,14 @@ def read_meshroom(path: Path) -> SourceModel:
             raise unsupported(path, f"views[{i}].rigId", "a rig", "Solve without rigs.")
         if lens_id not in lenses:
             if lens_id not in intrinsics:
-                raise ParseError(
-                    path, f"views[{i}].intrinsicId", "not among the intrinsics.", AGAIN
-                )
+                place = f"views[{i}].intrinsicId"
+                raise ParseError(path, place, "not among the intrinsics.", AGAIN)
             lenses[lens_id] = _lens(path, *intrinsics[lens_id], version)
         photos.add(name, lenses[lens_id], poses[pose_id])
     usable = photos.finished()
-    points, colors = _points(path, _list(path, values, "structure"))
+    landmarks = _list(path, values, "structure")
+    named = ((f"structure[{i}]", entry) for i, entry in enumerate(landmarks))
+    points, colors = points_of(path, "structure", named, "X", len(landmarks))
     facts = {
         "views": len(views),
         "camera_models": sorted({lens.model for lens in lenses.values()}),
@@ -136,9 +137,7 @@ def _poses(path: Path, entries: Sequence[dict[str, Any]]) -> dict[str, np.ndarra
 def _lens(path: Path, place: str, entry: dict[str, Any], version: tuple[int, ...]) -> LensCamera:
     width, height = image_size(path, place, entry.get("width"), entry.get("height"))
     written = str(entry.get("type", "pinhole"))
-    kind = (
-        str(entry["distortionType"]) if "distortionType" in entry else _OLD_TYPES.get(written, "")
-    )
+    kind = str(entry.get("distortionType", _OLD_TYPES.get(written, "")))
     if written not in _OLD_TYPES or kind not in _COUNTS:
         raise unsupported(path, f"{place}.type", f"the lens {written} {kind}".strip(), _OTHER_LENS)
     if str(entry.get("undistortionType", "none")) != "none":
@@ -152,11 +151,9 @@ def _lens(path: Path, place: str, entry: dict[str, Any], version: tuple[int, ...
     k = numbers(path, f"{place}.distortionParams", params, _COUNTS[kind]).tolist()
     if kind == "fisheye4":
         lens = fisheye_lens(width, height, focal, center, (k[0], k[1], k[2], k[3]))
-    elif kind == "brown":
-        brown = Brown(k[0], k[1], k[2], p1=k[3], p2=k[4])
-        lens = brown.lens(width, height, focal, center)
     else:
-        lens = Brown(*k).lens(width, height, focal, center)
+        brown = Brown(k[0], k[1], k[2], p1=k[3], p2=k[4]) if kind == "brown" else Brown(*k)
+        lens = brown.lens(width, height, focal, center)
     return checked_lens(path, place, lens)
 
 
@@ -178,17 +175,3 @@ def _focal(
         raise ParseError(path, f"{place}.focalLength", "a length is not positive.", AGAIN)
     fx = length / sensor * width
     return fx, fx * ratio if version >= (1, 2, 5) else fx / ratio
-
-
-def _points(path: Path, entries: Sequence[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 3) float64 positions and (n, 3) uint8 colours of the landmarks."""
-    if len(entries) > limits.MAX_POINTS:
-        raise ParseError(path, "structure", f"{len(entries)} points are too many.", AGAIN)
-    points = np.zeros((len(entries), 3))
-    colors = np.full((len(entries), 3), 128, np.uint8)
-    for i, entry in enumerate(entries):
-        points[i] = numbers(path, f"structure[{i}].X", entry.get("X"), 3)
-        if "color" in entry:
-            color = numbers(path, f"structure[{i}].color", entry["color"], 3)
-            colors[i] = color.clip(0, 255).astype(np.uint8)
-    return points, colors

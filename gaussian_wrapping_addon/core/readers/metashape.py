@@ -15,10 +15,11 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ..errors import ParseError
-from ..scene.camera import Similarity
+from ..scene.camera import Similarity, pose_at
 from .program_values import (
     AGAIN,
     PhotoList,
+    begins_with,
     checked_lens,
     fisheye_lens,
     image_size,
@@ -43,13 +44,7 @@ _NO_LENS = ("p3", "p4")
 
 def is_metashape(path: Path) -> bool:
     """Whether an XML file is of the program: its start names a document with chunks."""
-    if path.suffix.lower() != ".xml" or not path.is_file():
-        return False
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(4096)
-    except OSError:
-        return False
+    start = begins_with(path, ".xml", 4096)
     return b"<document" in start and b"<chunk" in start
 
 
@@ -158,14 +153,13 @@ def _similarity(path: Path, place: str, transform: Element | None) -> Similarity
 
 def _pose(path: Path, place: str, camera: Element, world_from_group: Similarity) -> np.ndarray:
     """Return (3, 4) cam_from_world."""
-    matrix = numbers(path, f"{place}, transform", camera.findtext("transform") or "", 16)
-    matrix = matrix.reshape(4, 4)
+    place = f"{place}, transform"
+    matrix = numbers(path, place, camera.findtext("transform") or "", 16).reshape(4, 4)
     if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
-        raise ParseError(path, f"{place}, transform", "the last row is not 0 0 0 1.", AGAIN)
-    group_from_camera = rotation(path, f"{place}, transform", matrix[:3, :3])
+        raise ParseError(path, place, "the last row is not 0 0 0 1.", AGAIN)
+    group_from_camera = rotation(path, place, matrix[:3, :3])
     cam_from_world = (world_from_group.rotation @ group_from_camera).T
-    center = world_from_group.points(matrix[None, :3, 3])[0]
-    return np.concatenate([cam_from_world, -(cam_from_world @ center)[:, None]], 1)
+    return pose_at(cam_from_world, world_from_group.points(matrix[None, :3, 3])[0])
 
 
 def _lens(path: Path, sensor: Element) -> LensCamera:
@@ -174,9 +168,8 @@ def _lens(path: Path, sensor: Element) -> LensCamera:
     found = sensor.findall("calibration")
     adjusted = [entry for entry in found if entry.get("class", "adjusted") == "adjusted"]
     if not found:
-        raise ParseError(
-            path, place, "it has no calibration.", "Align the photos and export again."
-        )
+        hint = "Align the photos and export again."
+        raise ParseError(path, place, "it has no calibration.", hint)
     calibration = (adjusted or found)[0]
     size = calibration.find("resolution")
     if size is None:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from .. import limits
 from ..errors import DatasetError, ParseError
 from ..files import read_json
+from ..scene.camera import pose_at
 from .program_values import (
     AGAIN,
     PhotoList,
@@ -19,7 +19,7 @@ from .program_values import (
     image_size,
     number,
     numbers,
-    pose_at,
+    points_of,
     relative_names,
     unsupported,
 )
@@ -84,16 +84,18 @@ def read_opensfm(path: Path) -> SourceModel:
             camera = cameras.get(key)
             if not isinstance(camera, dict):
                 raise ParseError(path, f"{here}.camera", "it is not among the cameras.", AGAIN)
-            whole = camera.get("projection_type") in _PANORAMAS
-            lenses[key] = (
-                None if whole else lens_of(path, f"{place}.cameras[{key[:80]!r}]", cameras[key])
-            )
+            lens = None
+            if camera.get("projection_type") not in _PANORAMAS:
+                lens = lens_of(path, f"{place}.cameras[{key[:80]!r}]", camera)
+            lenses[key] = lens
         turned = rotation_of(numbers(path, f"{here}.rotation", shot.get("rotation"), 3))
         shift = numbers(path, f"{here}.translation", shot.get("translation"), 3)
         pose = np.concatenate([turned, shift[:, None]], 1)
         photos.add(names[name], lenses[key], pose, is_panorama=lenses[key] is None)
     usable = photos.finished()
-    points, colors = _points(path, f"{place}.points", _table(path, place, entry, "points"))
+    table, here = _table(path, place, entry, "points"), f"{place}.points"
+    named = ((f"{here}[{key[:80]!r}]", point) for key, point in table.items())
+    points, colors = points_of(path, here, named, "coordinates", len(table))
     facts = {
         "reconstruction": chosen,
         "camera_models": sorted({lens.model if lens else PANORAMA for lens in lenses.values()}),
@@ -110,8 +112,7 @@ def rotation_of(vector: np.ndarray) -> np.ndarray:
     # sin(a) / a and (1 - cos(a)) / a^2, smooth at 0.
     first = float(np.sinc(angle / np.pi))
     second = 0.5 * float(np.sinc(0.5 * angle / np.pi)) ** 2
-    turned: np.ndarray = np.eye(3) + first * cross + second * (cross @ cross)
-    return turned
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
 
 
 def _table(path: Path, place: str, entry: dict[str, Any], key: str) -> dict[str, Any]:
@@ -145,34 +146,16 @@ def lens_of(path: Path, place: str, camera: dict[str, Any]) -> LensCamera:
         fy = value("focal_y", fx / side) * side
         center = 0.5 * width + value("c_x") * side, 0.5 * height + value("c_y") * side
     k1, k2, k3 = value("k1"), value("k2"), value("k3")
+    known = width, height, (fx, fy), center
     if kind == "fisheye":
-        lens = fisheye_lens(width, height, (fx, fy), center, (k1, k2, 0.0, 0.0))
+        lens = fisheye_lens(*known, (k1, k2, 0.0, 0.0))
     elif kind == "fisheye_opencv":
-        lens = fisheye_lens(width, height, (fx, fy), center, (k1, k2, k3, value("k4")))
+        lens = fisheye_lens(*known, (k1, k2, k3, value("k4")))
     elif kind == "brown":
-        brown = Brown(k1, k2, k3, p1=value("p1"), p2=value("p2"))
-        lens = brown.lens(width, height, (fx, fy), center)
+        lens = Brown(k1, k2, k3, p1=value("p1"), p2=value("p2")).lens(*known)
     else:
-        k2 = 0.0 if kind == "simple_radial" else k2
-        lens = Brown(k1, k2).lens(width, height, (fx, fy), center)
+        lens = Brown(k1, 0.0 if kind == "simple_radial" else k2).lens(*known)
     return checked_lens(path, place, lens)
-
-
-def _points(path: Path, place: str, entries: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 3) float64 positions and (n, 3) uint8 colours."""
-    if len(entries) > limits.MAX_POINTS:
-        raise ParseError(path, place, f"{len(entries)} points are too many.", AGAIN)
-    points = np.zeros((len(entries), 3))
-    colors = np.full((len(entries), 3), 128, np.uint8)
-    for i, (key, entry) in enumerate(entries.items()):
-        here = f"{place}[{key[:80]!r}]"
-        if not isinstance(entry, dict):
-            raise ParseError(path, here, "an object was expected.", AGAIN)
-        points[i] = numbers(path, f"{here}.coordinates", entry.get("coordinates"), 3)
-        if "color" in entry:
-            color = numbers(path, f"{here}.color", entry["color"], 3)
-            colors[i] = color.clip(0, 255).astype(np.uint8)
-    return points, colors
 
 
 # -- Read ``shots.geojson`` with ``cameras.json`` of OpenDroneMap: what its archive of results
@@ -218,12 +201,11 @@ def read_shots(path: Path) -> SourceModel:
         place = f"features[{i}]"
         turned = rotation_of(numbers(path, f"{place}.rotation", shot.get("rotation"), 3))
         center = numbers(path, f"{place}.translation", shot.get("translation"), 3)
-        lens = _lens(path, place, shot, cameras)
-        photos.add(names[shot["filename"]], lens, pose_at(turned, center))
-    usable = photos.finished()
-    return SourceModel(
-        SHOTS_KIND, usable, warnings=tuple(photos.warnings), facts={"shots": len(features)}
-    )
+        photos.add(
+            names[shot["filename"]], _lens(path, place, shot, cameras), pose_at(turned, center)
+        )
+    usable, facts = photos.finished(), {"shots": len(features)}
+    return SourceModel(SHOTS_KIND, usable, warnings=tuple(photos.warnings), facts=facts)
 
 
 def _cameras(shots: Path) -> list[tuple[float, LensCamera]]:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,6 +65,7 @@ EXPECTED = (
     "rot_0..3, as Inria's code, gsplat, nerfstudio and SuperSplat (uncompressed) write them."
 )
 
+_NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
 _UNPACK = "Open it in a splat editor, such as SuperSplat, and export it as an uncompressed PLY."
 
 OTHER_FORMATS = {".spz": "SPZ", ".splat": "antimatter15 .splat", ".ksplat": "KSPLAT", ".sog": "SOG"}
@@ -125,18 +125,14 @@ def read_splat_header(path: Path) -> SplatHeader:
     if ply.elements[0].name != "vertex":
         raise ParseError(path, "header", "the vertices do not come first.", EXPECTED)
     names = set(elements["vertex"].names)
-    if "f_dc_0" not in names and {"red", "green", "blue"} <= names:
-        colors: tuple[str, ...] = ("red", "green", "blue")
-    else:
-        colors = ("f_dc_0", "f_dc_1", "f_dc_2")
-    wanted = [
-        *("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"),
-        *colors,
-    ]
-    missing = [name for name in wanted if name not in names]
+    plain = "f_dc_0" not in names and {"red", "green", "blue"} <= names
+    colors = ("red", "green", "blue") if plain else ("f_dc_0", "f_dc_1", "f_dc_2")
+    missing = [name for name in (*_NEEDED, *colors) if name not in names]
     if missing:
+        is_cloud = {"x", "y", "z"} <= names
+        what = "a mesh" if "face" in elements else "a point cloud" if is_cloud else "another PLY"
         raise ParseError(
-            path, "header", f"not a splat but {_described(elements, names)}: property "
+            path, "header", f"not a splat but {what}: property "
             f"{', '.join(missing[:3])} is missing.", EXPECTED,
         )  # fmt: skip
     axes = 3 if "scale_2" in names else 2
@@ -157,10 +153,3 @@ def _degree(path: Path, names: set[str]) -> int:
         f"{MAX_FILE_DEGREE} (0, 9, 24, 45 or 72 of them, numbered from 0).",
         "Export the splat again.",
     )  # fmt: skip
-
-
-def _described(elements: Container[str], names: set[str]) -> str:
-    """Describe a PLY without Gaussians."""
-    if "face" in elements:
-        return "a mesh"
-    return "a point cloud" if {"x", "y", "z"} <= names else "another PLY"

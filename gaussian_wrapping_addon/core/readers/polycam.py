@@ -15,7 +15,16 @@ from .. import limits
 from ..errors import ParseError
 from ..files import read_json
 from ..photos.formats import PHOTO_SUFFIXES
-from .program_values import AGAIN, PhotoList, checked_lens, image_size, number, pose_at, rotation
+from ..scene.camera import pose_at
+from .program_values import (
+    AGAIN,
+    OPENGL_FROM_COLMAP,
+    PhotoList,
+    checked_lens,
+    image_size,
+    number,
+    rotation,
+)
 from .source_model import LensCamera, SourceModel
 
 KIND = "Polycam keyframes"
@@ -28,7 +37,6 @@ _PAIRS = (
 """Folders of cameras and of their photos below ``keyframes``, the best first: corrected by the
 program's own optimisation."""
 _MAX_BYTES = 1024 * 1024
-_OPENGL_FROM_COLMAP = np.diag([1.0, -1.0, -1.0])
 
 
 def polycam_folders(source: Path) -> tuple[Path, Path] | None:
@@ -64,7 +72,7 @@ def read_polycam(cameras: Path, photo_folder: Path) -> SourceModel:
 
         matrix = np.array([[value(f"t_{row}{column}") for column in range(4)] for row in range(3)])
         world_from_camera = rotation(path, "t_00 to t_22", matrix[:, :3])
-        pose = pose_at((world_from_camera @ _OPENGL_FROM_COLMAP).T, matrix[:, 3])
+        pose = pose_at((world_from_camera @ OPENGL_FROM_COLMAP).T, matrix[:, 3])
         width, height = image_size(path, "photo", values.get("width"), values.get("height"))
         params = value("fx"), value("fy"), value("cx"), value("cy")
         lens = checked_lens(path, "photo", LensCamera("PINHOLE", width, height, params))
@@ -77,7 +85,5 @@ def read_polycam(cameras: Path, photo_folder: Path) -> SourceModel:
 
 def _photo_name(folder: Path, stem: str) -> str:
     """Return the name of the photo of a camera file; its stem where there is none."""
-    for suffix in PHOTO_SUFFIXES:
-        if (folder / f"{stem}{suffix}").is_file():
-            return f"{stem}{suffix}"
-    return stem
+    names = (f"{stem}{suffix}" for suffix in PHOTO_SUFFIXES)
+    return next((name for name in names if (folder / name).is_file()), stem)

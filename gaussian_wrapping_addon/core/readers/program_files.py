@@ -23,19 +23,12 @@ class _Format:
 
 
 _FORMATS = (
-    _Format(
-        opensfm.KIND, opensfm.is_opensfm, opensfm.read_opensfm, (".", "opensfm")
-    ),
+    _Format(opensfm.KIND, opensfm.is_opensfm, opensfm.read_opensfm, (".", "opensfm")),
     _Format(meshroom.KIND, meshroom.is_meshroom, meshroom.read_meshroom),
     _Format(metashape.KIND, metashape.is_metashape, metashape.read_metashape),
-    _Format(
-        realityscan.KIND, realityscan.is_csv_of_cameras, realityscan.read_csv
-    ),
-    _Format(
-        opensfm.SHOTS_KIND, opensfm.is_shots, opensfm.read_shots,
-        (".", "odm_report"),
-    ),
-)  # fmt: skip
+    _Format(realityscan.KIND, realityscan.is_csv_of_cameras, realityscan.read_csv),
+    _Format(opensfm.SHOTS_KIND, opensfm.is_shots, opensfm.read_shots, (".", "odm_report")),
+)
 
 CAMERA_FILE_SUFFIXES = (".json", ".sfm", ".xml", ".csv", ".geojson", ".xmp")
 """Of files that are inputs themselves."""
@@ -108,16 +101,8 @@ def _photo_folders(folder: Path) -> tuple[Path, ...]:
 
     OpenDroneMap writes its files into folders beside the one of the photos.
     """
-    parent = _project_photos(folder)
-    own = photo_root(folder)
-    return tuple(dict.fromkeys([*([parent] if parent else []), own, folder]))
-
-
-def _project_photos(folder: Path) -> Path | None:
-    """Return the photos' folder of an OpenDroneMap project, given its folder of camera files."""
-    if folder.name not in ("opensfm", "odm_report"):
-        return None
-    for name in PHOTO_FOLDERS:
-        if (folder.parent / name).is_dir():
-            return folder.parent / name
-    return None
+    of_project = []
+    if folder.name in ("opensfm", "odm_report"):
+        beside = [folder.parent / name for name in PHOTO_FOLDERS]
+        of_project = [path for path in beside if path.is_dir()][:1]
+    return tuple(dict.fromkeys([*of_project, photo_root(folder), folder]))

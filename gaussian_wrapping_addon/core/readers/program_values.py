@@ -24,6 +24,8 @@ from .source_model import LensCamera, PosedPhoto, RelativeLens
 # -- Checked values of camera files: numbers, vectors, rotations, sizes ---------------------------
 
 AGAIN = "Export the cameras again."
+OPENGL_FROM_COLMAP = np.diag([1.0, -1.0, -1.0])
+"""From x right, y down, z forward to x right, y up, z back."""
 
 ROTATION_TOLERANCE = 1e-2
 """How far a matrix may be from a rotation; exporters write as few as 4 digits."""
@@ -86,17 +88,44 @@ def rotation(path: Path, place: str, matrix: np.ndarray) -> np.ndarray:
     return nearest
 
 
-def pose_at(cam_from_world: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Return the (3, 4) pose of a camera with rotation (3, 3) and centre (3,)."""
-    return np.concatenate([cam_from_world, -(cam_from_world @ center)[:, None]], 1)
-
-
 def checked_lens(path: Path, place: str, lens: LensCamera) -> LensCamera:
     """Return the lens, or raise :class:`ParseError` with what makes it unusable."""
     problem = lens.problem()
     if problem:
         raise ParseError(path, place, f"{problem}.", AGAIN)
     return lens
+
+
+def points_of(
+    path: Path, place: str, entries: Iterable[tuple[str, Any]], position: str, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (n, 3) float64 positions and (n, 3) uint8 colours of the ``count`` points of a file.
+
+    ``entries``: the place and the object of each, whose position has the name ``position``.
+    """
+    if count > limits.MAX_POINTS:
+        raise ParseError(path, place, f"{count} points are too many.", AGAIN)
+    points = np.zeros((count, 3))
+    colors = np.full((count, 3), 128, np.uint8)
+    for i, (here, entry) in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise ParseError(path, here, "an object was expected.", AGAIN)
+        points[i] = numbers(path, f"{here}.{position}", entry.get(position), 3)
+        if "color" in entry:
+            color = numbers(path, f"{here}.color", entry["color"], 3)
+            colors[i] = color.clip(0, 255).astype(np.uint8)
+    return points, colors
+
+
+def begins_with(path: Path, suffix: str, most_bytes: int) -> bytes:
+    """Return the beginning of a file of a suffix; empty where it is none, or cannot be read."""
+    if path.suffix.lower() != suffix or not path.is_file():
+        return b""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(most_bytes)
+    except OSError:
+        return b""
 
 
 def unsupported(path: Path, place: str, what: str, hint: str) -> ParseError:
@@ -148,9 +177,8 @@ def read_xml(path: Path, most_bytes: int = MAX_XML_BYTES) -> Element:
     try:
         data = read_bounded(path, most_bytes, follow_links=True)
     except PermissionError as error:
-        raise ParseError(
-            path, "whole file", f"cannot be read: {error.strerror}.", "Check its permissions."
-        ) from error
+        text = f"cannot be read: {error.strerror}."
+        raise ParseError(path, "whole file", text, "Check its permissions.") from error
     parser = expat.ParserCreate(namespace_separator="}")
     parser.buffer_text = True
     builder = TreeBuilder()
@@ -187,9 +215,8 @@ def read_xml(path: Path, most_bytes: int = MAX_XML_BYTES) -> Element:
     except (expat.ExpatError, ValueError, LookupError) as error:
         # Besides its own errors expat raises those of Python's decoders.
         reason = expat.errors.messages.get(getattr(error, "code", -1), str(error))
-        raise ParseError(
-            path, f"line {parser.CurrentLineNumber}", f"not XML: {reason}.", _AGAIN
-        ) from None
+        place = f"line {parser.CurrentLineNumber}"
+        raise ParseError(path, place, f"not XML: {reason}.", _AGAIN) from None
     return builder.close()
 
 
@@ -235,9 +262,10 @@ def relative_names(names: Iterable[str]) -> dict[str, str]:
 
 @dataclass
 class PhotoList:
-    """Collects the photos that a camera file poses. ``path``: the camera file."""
+    """Collects the photos that a camera file poses."""
 
     path: Path
+    """The camera file."""
     photos: list[PosedPhoto] = field(default_factory=list)
     warnings: list[ReportWarning] = field(default_factory=list)
     offered: int = 0
@@ -277,7 +305,7 @@ class PhotoList:
         self.offered += 1
         self._left_out.setdefault(reason, []).append(repr(name[:80]))
 
-    def warn(self, code: str, text: str, hint: str = "") -> None:
+    def warn(self, code: str, text: str, hint: str) -> None:
         """Add a warning."""
         self.warnings.append(ReportWarning(code, text, hint))
 
@@ -288,11 +316,8 @@ class PhotoList:
         """
         for reason, names in self._left_out.items():
             listed = ", ".join(names[:_EXAMPLES]) + (" ..." if len(names) > _EXAMPLES else "")
-            self.warn(
-                "images-left-out",
-                f"{len(names)} photos were left out for {reason}: {listed}.",
-                LEFT_OUT_HINT,
-            )
+            text = f"{len(names)} photos were left out for {reason}: {listed}."
+            self.warn("images-left-out", text, LEFT_OUT_HINT)
         if not self.photos:
             raise DatasetError(
                 f"None of the {self.offered} photos of {self.path.name} is usable.",

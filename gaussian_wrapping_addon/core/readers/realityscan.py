@@ -16,13 +16,14 @@ from .. import limits
 from ..errors import ParseError
 from ..files import read_bounded
 from ..photos.finder import list_photos
-from ..progress import ReportWarning
+from ..scene.camera import pose_at
 from .program_values import (
     AGAIN,
+    OPENGL_FROM_COLMAP,
     PhotoList,
+    begins_with,
     number,
     numbers,
-    pose_at,
     read_xml,
     relative_names,
     rotation,
@@ -50,19 +51,12 @@ _SYNONYMS = {
 """Later versions of the program call the same columns otherwise."""
 _NEEDED = ("x", "y", "alt", "heading", "pitch", "roll", "f")
 _OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
-_OPENGL_FROM_COLMAP = np.diag([1.0, -1.0, -1.0])
 _CHOOSE = 'Export "Internal/External camera parameters" as CSV.'
 
 
 def is_csv_of_cameras(path: Path) -> bool:
     """Whether a CSV file begins with the column of photo names that the program writes."""
-    if path.suffix.lower() != ".csv" or not path.is_file():
-        return False
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(256)
-    except OSError:
-        return False
+    start = begins_with(path, ".csv", 256)
     return start.removeprefix(b"\xef\xbb\xbf").lstrip().lower().startswith(b"#name")
 
 
@@ -75,9 +69,8 @@ def read_csv(path: Path) -> SourceModel:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ParseError(
-            path, f"byte {error.start}", "not UTF-8 text.", "Save it as UTF-8."
-        ) from None
+        place = f"byte {error.start}"
+        raise ParseError(path, place, "not UTF-8 text.", "Save it as UTF-8.") from None
     if "\0" in text:
         raise ParseError(path, "whole file", "not text.", _CHOOSE)
     rows = _rows(path, text)
@@ -87,28 +80,26 @@ def read_csv(path: Path) -> SourceModel:
     names = relative_names(row[header[_FIRST_COLUMN]] for _, row in rows[1:] if row)
     for line, row in rows[1:]:
         if len(row) < len(header):
-            raise ParseError(
-                path, f"line {line}", f"{len(row)} columns instead of {len(header)}.", AGAIN
-            )
+            text = f"{len(row)} columns instead of {len(header)}."
+            raise ParseError(path, f"line {line}", text, AGAIN)
 
         def value(column: str, line: int = line, row: list[str] = row) -> float:
             if column not in header:
                 return 0.0
             return number(path, f"line {line}, {column}", row[header[column]])
 
-        name = names[row[header[_FIRST_COLUMN]]]
         world_from_camera = _world_from_opengl(
             *(math.radians(value(angle)) for angle in ("heading", "pitch", "roll"))
         )
         center = np.array([value("x"), value("y"), value("alt")])
-        pose = pose_at((world_from_camera @ _OPENGL_FROM_COLMAP).T, center)
+        pose = pose_at((world_from_camera @ OPENGL_FROM_COLMAP).T, center)
         focal = value("f") / FILM_WIDTH_MM
         if focal <= 0:
             raise ParseError(path, f"line {line}, f", "the focal length is not positive.", AGAIN)
         # The program's t1 and t2 are OpenCV's p2 and p1.
         brown = Brown(*(value(k) for k in ("k1", "k2", "k3", "k4", "t2", "t1")))
         lens = RelativeLens(focal, 1.0, (value("px"), value("py")), brown)
-        photos.add(name, None, pose, relative=lens)
+        photos.add(names[row[header[_FIRST_COLUMN]]], None, pose, relative=lens)
     usable = photos.finished()
     return SourceModel(KIND, usable, warnings=tuple(photos.warnings), facts={"rows": len(rows) - 1})
 
@@ -148,21 +139,12 @@ def _header(path: Path, cells: list[str]) -> dict[str, int]:
 
 def _world_from_opengl(heading: float, pitch: float, roll: float) -> np.ndarray:
     """Return the (3, 3) rotation of a camera with OpenGL axes (x right, y up, z back)."""
-    about_z = np.array([
-        [math.cos(heading), math.sin(heading), 0.0],
-        [-math.sin(heading), math.cos(heading), 0.0],
-        [0.0, 0.0, 1.0],
-    ])  # fmt: skip
-    about_x = np.array([
-        [1.0, 0.0, 0.0],
-        [0.0, math.cos(pitch), -math.sin(pitch)],
-        [0.0, math.sin(pitch), math.cos(pitch)],
-    ])  # fmt: skip
-    about_y = np.array([
-        [math.cos(roll), 0.0, math.sin(roll)],
-        [0.0, 1.0, 0.0],
-        [-math.sin(roll), 0.0, math.cos(roll)],
-    ])  # fmt: skip
+    c, s = math.cos(heading), math.sin(heading)
+    about_z = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    c, s = math.cos(pitch), math.sin(pitch)
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    c, s = math.cos(roll), math.sin(roll)
+    about_y = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
     return about_z @ about_x @ about_y
 
 
@@ -229,9 +211,8 @@ def read_xmp_files(root: Path, files: dict[Path, Path]) -> SourceModel:
         if entry is None or matrix is None or center is None:
             photos.leave_out(name, "no pose in their XMP file")
             continue
-        turned = rotation(
-            path, "xcr:Rotation", numbers(path, "xcr:Rotation", matrix, 9).reshape(3, 3)
-        )
+        written = numbers(path, "xcr:Rotation", matrix, 9).reshape(3, 3)
+        turned = rotation(path, "xcr:Rotation", written)
         pose = pose_at(turned, numbers(path, "xcr:Position", center, 3))
         component = _value(entry, "ComponentId") or ""
         posed.setdefault(component, []).append((name, pose, _lens(path, entry)))
@@ -242,13 +223,12 @@ def read_xmp_files(root: Path, files: dict[Path, Path]) -> SourceModel:
                 photos.add(name, None, pose, relative=lens)
             else:
                 photos.leave_out(name, "another component than the largest")
-    usable = photos.finished()
-    warnings = list(photos.warnings)
+    usable, facts = photos.finished(), {"files": len(files)}
     without = len(list_photos(root)) - len(files)
     if without > 0:
         text = f"{without} photos have no camera of RealityScan beside them and are left out."
-        warnings.append(ReportWarning("photos-without-camera", text, _WITHOUT_HINT))
-    return SourceModel(XMP_KIND, usable, warnings=tuple(warnings), facts={"files": len(files)})
+        photos.warn("photos-without-camera", text, _WITHOUT_HINT)
+    return SourceModel(XMP_KIND, usable, warnings=tuple(photos.warnings), facts=facts)
 
 
 def _description(path: Path) -> Element | None:
@@ -281,14 +261,9 @@ def _lens(path: Path, entry: Element) -> RelativeLens:
     model = _value(entry, "DistortionModel") or _PLAIN
     text = _value(entry, "DistortionCoeficients") or "0 0 0 0 0 0"
     k1, k2, k3, k4, t1, t2 = numbers(path, "xcr:DistortionCoeficients", text, 6).tolist()
-    skew = value("Skew", "0")
-    if skew:
-        raise unsupported(
-            path,
-            "xcr:Skew",
-            "a skewed camera",
-            "Choose a distortion model without K+, align again.",
-        )
+    if value("Skew", "0"):
+        hint = "Choose a distortion model without K+, align again."
+        raise unsupported(path, "xcr:Skew", "a skewed camera", hint)
     if model == _PLAIN or not any((k1, k2, k3, k4, t1, t2)):
         return RelativeLens(focal, aspect, offset, Brown())
     if model not in _BROWN:

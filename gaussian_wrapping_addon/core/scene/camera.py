@@ -51,6 +51,11 @@ def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
     return quaternion if quaternion[0] >= 0 else -quaternion
 
 
+def pose_at(cam_from_world: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Return the (3, 4) pose of a camera with rotation (3, 3) and centre (3,)."""
+    return np.concatenate([cam_from_world, -(cam_from_world @ center)[:, None]], 1)
+
+
 # -- Similarity transforms in float64: scale, rotation, translation -------------------------------
 
 
@@ -226,20 +231,14 @@ class Camera:
         """Return the camera of the same photo resampled to ``width`` x ``height`` pixels."""
         sx, sy = width / self.width, height / self.height
         return dataclasses.replace(
-            self,
-            width=int(width),
-            height=int(height),
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
-        )
+            self, width=int(width), height=int(height), fx=self.fx * sx, fy=self.fy * sy,
+            cx=self.cx * sx, cy=self.cy * sy,
+        )  # fmt: skip
 
     def moved(self, new_from_old: Similarity) -> Camera:
         """Return the same camera expressed in another world frame (depths scale along)."""
         rotation = self.rotation @ new_from_old.rotation.T
-        center = new_from_old.points(self.center[None])[0]
-        pose = np.concatenate([rotation, -(rotation @ center)[:, None]], 1)
+        pose = pose_at(rotation, new_from_old.points(self.center[None])[0])
         return dataclasses.replace(self, cam_from_world=pose)
 
     def to_json(self) -> dict[str, Any]:

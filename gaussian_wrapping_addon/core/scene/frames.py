@@ -14,7 +14,13 @@ import numpy as np
 from ..errors import DatasetError, UsageError
 from ..limits import MIN_IMAGES, SCENE_RADIUS
 from ..names import EXPORT_FORMATS
-from .camera import Camera, Similarity, quaternion_from_rotation, rotation_from_quaternion
+from .camera import (
+    Camera,
+    Similarity,
+    pose_at,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from .placement import COINCIDENT, Plane
 
 # -- Round the scene to a grid, so that every similarity of an input gives the same bits ----------
@@ -58,8 +64,7 @@ def snapped_rotation(rotation: np.ndarray, step: float) -> np.ndarray:
 def snapped_camera(camera: Camera) -> Camera:
     """Return a camera of the scene frame with centre and rotation on the grid."""
     rotation = snapped_rotation(camera.rotation, ROTATION_STEP)
-    center = snapped(camera.center, CENTER_STEP)
-    pose = np.concatenate([rotation, -(rotation @ center)[:, None]], 1)
+    pose = pose_at(rotation, snapped(camera.center, CENTER_STEP))
     return dataclasses.replace(camera, cam_from_world=pose)
 
 
