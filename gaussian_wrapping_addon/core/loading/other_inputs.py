@@ -19,7 +19,6 @@ from ..poses.panoramas import (
     BY_SHAPE,
     CUT_FOLDER,
     VIEWS,
-    CutView,
     Panorama,
     cut_panoramas,
     panorama_evidence,
@@ -86,9 +85,8 @@ def with_views_of_panoramas(
         if photo.mask_name is None:
             mask = find_mask(kind.mask_roots, photo.name, kind.photo_roots)
         else:
-            mask = resolve_photo(kind.folder, photo.mask_name)
-            if mask is not None and not mask.is_file():
-                mask = None
+            named = resolve_photo(kind.folder, photo.mask_name)
+            mask = named if named is not None and named.is_file() else None
             if mask is None:
                 masks_missing.append(photo.mask_name)
         found.append(Panorama(photo.name, match.path, mask))
@@ -134,7 +132,6 @@ def solve_views_of_panoramas(
         Panorama(name, path, find_mask(kind.mask_roots, name, [root]))
         for name, path in zip(names, photos, strict=True)
     ]
-    cut: list[CutView]
     cut, bad = cut_panoramas(
         panoramas, work_folder, progress.span(0.0, _CUTTING), reading, threads=threads
     )
@@ -208,10 +205,8 @@ def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
     """
     opaque = opacities >= MIN_OPACITY
     if not opaque.any():
-        raise DatasetError(
-            "All Gaussians of the splat are transparent.",
-            "Check that opacities are stored as logits.",
-        )
+        hint = "Check that opacities are stored as logits."
+        raise DatasetError("All Gaussians of the splat are transparent.", hint)
     points = np.asarray(means, np.float64)[opaque]
     weights = np.asarray(opacities, np.float64)[opaque]
     center = np.array([_quantile(points[:, k], weights, 0.5) for k in range(3)])
@@ -222,9 +217,8 @@ def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
     if not whole > 0.0:
         raise DatasetError("All Gaussians of the splat coincide.", "Export it again.")
     if not middle < MAX_RADIUS:
-        raise DatasetError(
-            "The Gaussians of the splat are scattered too far for one scene.", "Export it again."
-        )
+        text = "The Gaussians of the splat are scattered too far for one scene."
+        raise DatasetError(text, "Export it again.")
     has_surroundings = middle > 0.0 and whole > SURROUNDINGS_RATIO * middle
     radius = SURROUNDINGS_RATIO * middle if has_surroundings else whole
     return SplatExtent(center, float(radius), bool(has_surroundings))
@@ -245,26 +239,13 @@ def cameras_on_spheres(extent: SplatExtent) -> list[Camera]:
     for count, distance in ((FAR_VIEWS, far), (NEAR_VIEWS, NEAR_DISTANCE)):
         for direction in fibonacci_directions(count):
             eye = extent.center + distance * extent.radius * direction
-            cameras.append(
-                Camera(
-                    f"view_{len(cameras):03d}.png",
-                    PHOTO_SIDE_PX,
-                    PHOTO_SIDE_PX,
-                    focal_px,
-                    focal_px,
-                    0.5 * PHOTO_SIDE_PX,
-                    0.5 * PHOTO_SIDE_PX,
-                    _look_at(eye, -direction),
-                )
-            )
+            right = np.cross(-direction, [0.0, 0.0, 1.0])  # no direction of the lattice is a pole
+            right /= np.linalg.norm(right)
+            rotation = np.stack([right, np.cross(-direction, right), -direction])
+            name, side, middle = f"view_{len(cameras):03d}.png", PHOTO_SIDE_PX, 0.5 * PHOTO_SIDE_PX
+            lens = (side, side, focal_px, focal_px, middle, middle)
+            cameras.append(Camera(name, *lens, pose_at(rotation, eye)))
     return cameras
-
-
-def _look_at(eye: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """Return (3, 4) ``cam_from_world`` with Z up; no direction of the lattice is a pole."""
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return pose_at(np.stack([right, np.cross(forward, right), forward]), eye)
 
 
 def scene_frame(cameras: list[Camera]) -> Similarity:

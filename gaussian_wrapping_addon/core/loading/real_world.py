@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 import math
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DatasetError, ParseError
-from ..photos.exif import GpsPosition, read_gps_exif
+from ..photos.exif import read_gps_exif
 from ..photos.finder import PhotoIndex
 from ..photos.photo_file import stored_pixels
 from ..progress import Progress, ReportWarning
@@ -117,13 +118,13 @@ def find_real_units(
     if content is None and spec is None and request.georeference == "off":
         return None, ""
     cameras = [camera_of(view) for view in views]
-    control = (
-        None
-        if content is None
-        else _control(content, request.control_points, views, cameras, kind, warnings)
-    )
-    gps, note = None, ""
-    positions = {} if request.georeference == "off" else _positions(views)
+    control, gps, markers, note = None, None, None, ""
+    if content is not None:
+        control = _control(content, request.control_points, views, cameras, kind, warnings)
+    positions = {}
+    if request.georeference != "off":
+        found = ((view.name, read_gps_exif(view.source_path)) for view in views)
+        positions = {name: position for name, position in found if position is not None}
     if positions or request.georeference == "on":
         try:
             needs = ENOUGH if request.georeference == "on" else GOOD
@@ -136,7 +137,6 @@ def find_real_units(
         text = f"GPS places the scene badly: {gps.doubt}"
         hint = "Check scale and up; give a measured length, markers or control points."
         warnings.append(ReportWarning("georeference-uncertain", text, hint))
-    markers = None
     if spec is not None:
         photos = [view.photo_path for view in views]
         seen = find_markers(spec, photos, work_folder, progress, threads=threads)
@@ -157,10 +157,8 @@ def _not_placed(error: DatasetError) -> DatasetError:
 
 def camera_of(view: PreparedView) -> Camera:
     """Return the pinhole camera of a view, world frame."""
-    fx, fy, cx, cy = view.pinhole.params
-    return Camera(
-        view.name, view.pinhole.width, view.pinhole.height, fx, fy, cx, cy, view.cam_from_world
-    )
+    size, (fx, fy, cx, cy) = (view.pinhole.width, view.pinhole.height), view.pinhole.params
+    return Camera(view.name, *size, fx, fy, cx, cy, view.cam_from_world)
 
 
 def moved_views(views: Sequence[PreparedView], target_from_world: Similarity) -> list[PreparedView]:
@@ -192,48 +190,35 @@ def _combined(
     }
     known = {name: found for name, found in scales.items() if found}
     _warn_of_contradictions(known, warnings)
+    sources = tuple(known)
     if control is not None:
-        return RealUnits(
-            tuple(known), control.metric_from_world, True, True, control.fit.scale_error,
-            control.origin, details,
-        )  # fmt: skip
+        placed, error = control.metric_from_world, control.fit.scale_error
+        return RealUnits(sources, placed, True, True, error, control.origin, details)
     if gps is not None and (own_frame or markers is None):
-        placed, error = gps, gps.scale_error
+        error = gps.scale_error
         if markers is not None:
-            placed, error = gps.with_scale(markers.metres_per_unit), markers.error
-        return RealUnits(
-            tuple(known), placed.enu_from_world, own_frame, True, error,
-            placed.origin, details | placed.details,
-        )  # fmt: skip
+            gps, error = gps.with_scale(markers.metres_per_unit), markers.error
+            details |= gps.details
+        return RealUnits(sources, gps.enu_from_world, own_frame, True, error, gps.origin, details)
     if markers is not None:
         sources = (MARKERS, *(name for name in known if name != MARKERS))
-        return RealUnits(
-            sources, Similarity(markers.metres_per_unit), True, False, markers.error,
-            details=details,
-        )  # fmt: skip
+        placed = Similarity(markers.metres_per_unit)
+        return RealUnits(sources, placed, True, False, markers.error, details=details)
     return None
 
 
 def _warn_of_contradictions(
     known: dict[str, tuple[float, float]], warnings: list[ReportWarning]
 ) -> None:
-    names = list(known)
-    for i, first in enumerate(names):
-        for second in names[i + 1 :]:
-            (a, error_a), (b, error_b) = known[first], known[second]
-            apart = abs(math.log(a / b))
-            if apart > max(CONTRADICTION_SIGMAS * math.hypot(error_a, error_b), MIN_CONTRADICTION):
-                text = (
-                    f"The scale by {second} is {100 * (b / a - 1):+.2g} % off that by {first}, "
-                    "more than their errors explain."
-                )
-                hint = "Check the size of the markers, the coordinates, and their unit (metres)."
-                warnings.append(ReportWarning("scales-contradict", text, hint))
-
-
-def _positions(views: Sequence[PreparedView]) -> dict[str, GpsPosition]:
-    found = {view.name: read_gps_exif(view.source_path) for view in views}
-    return {name: position for name, position in found.items() if position is not None}
+    for (first, (a, error_a)), (second, (b, error_b)) in itertools.combinations(known.items(), 2):
+        apart = abs(math.log(a / b))
+        if apart > max(CONTRADICTION_SIGMAS * math.hypot(error_a, error_b), MIN_CONTRADICTION):
+            text = (
+                f"The scale by {second} is {100 * (b / a - 1):+.2g} % off that by {first}, "
+                "more than their errors explain."
+            )
+            hint = "Check the size of the markers, the coordinates, and their unit (metres)."
+            warnings.append(ReportWarning("scales-contradict", text, hint))
 
 
 def _control(

@@ -19,7 +19,6 @@ from ..photos.formats import PhotoHeader, require_extras
 from ..photos.photo_file import (
     AS_WRITTEN,
     MASK_THRESHOLD,
-    DecodedPhoto,
     MaskReading,
     apply_orientation,
     photo_header,
@@ -77,6 +76,11 @@ class _Notes:
     photos: frozenset[Path] = frozenset()
     """Real paths of all photos: none of them is the mask of another."""
     lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def add(self, items: list[str], text: str) -> None:
+        """Add to one of the lists; photos are prepared on several threads."""
+        with self.lock:
+            items.append(text)
 
 
 def prepare_views(
@@ -137,7 +141,12 @@ def prepare_views(
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return views, _warnings(notes, len(model.photos), model.kind), _facts(notes)
+    counts = {
+        "photos_undistorted": notes.undistorted, "photos_rescaled": notes.rescaled,
+        "photos_masked": notes.masked,
+    }  # fmt: skip
+    facts = {name: count for name, count in counts.items() if count}
+    return views, _warnings(notes, len(model.photos), model.kind), facts
 
 
 def _prepare(
@@ -158,12 +167,10 @@ def _prepare(
             raise DatasetError(f"{path.name} is {header.width} x {header.height} pixels.")
         photo = read_photo(path, upright=False)
     except DatasetError as error:
-        with notes.lock:
-            notes.bad.append(error.message)
+        notes.add(notes.bad, error.message)
         return None
     if photo.color.shape[:2] != (header.height, header.width):
-        with notes.lock:
-            notes.bad.append(f"{path.name} decodes to another size than its header says.")
+        notes.add(notes.bad, f"{path.name} decodes to another size than its header says.")
         return None
     prefers_stored = counts_stored_pixels(model.kind)
     lens, upright, rescaled = fit_lens(posed, header, path.name, prefers_stored=prefers_stored)
@@ -173,8 +180,7 @@ def _prepare(
         alpha = None if alpha is None else apply_orientation(alpha, header.orientation)
     mask = _find_mask(posed, path, kind, reading, color.shape[:2], alpha, header, upright, notes)
     if mask is None and _is_one_colour(color):  # a mask's outline tells about shape
-        with notes.lock:
-            notes.one_colour.append(posed.name)
+        notes.add(notes.one_colour, posed.name)
         return None
     pinhole = pinhole_of(lens)
     photo_path = path
@@ -184,7 +190,8 @@ def _prepare(
         if mask is not None:
             mask = sample_bicubic(np.where(mask, 255, 0).astype(np.uint8)[..., None], pixels)
             mask = mask[..., 0] >= MASK_THRESHOLD
-    if not lens.is_pinhole or not _is_plain(photo, header):
+    # Every program reads the same pixels from a plain file without orientation.
+    if not (lens.is_pinhole and photo.plain and header.orientation == 1):
         photo_path = work_folder / "images" / f"{index:06d}.jpg"
         write_photo(photo_path, color)
     mask_path = None
@@ -215,11 +222,6 @@ def _is_one_colour(color: np.ndarray) -> bool:
     )
 
 
-def _is_plain(photo: DecodedPhoto, header: PhotoHeader) -> bool:
-    """Whether every program reads the prepared pixels from the original file."""
-    return photo.plain and header.orientation == 1
-
-
 def _find_mask(
     posed: PosedPhoto,
     path: Path,
@@ -243,8 +245,7 @@ def _find_mask(
         if stored.shape != shape:
             stored = _resized_mask(stored, shape, mask_path)
     except DatasetError as error:
-        with notes.lock:
-            notes.wrong_masks.append(f"Mask {error.message}")
+        notes.add(notes.wrong_masks, f"Mask {error.message}")
         return mask
     made = posed.mask_path is not None
     from_file = (AS_WRITTEN if made else reading).kept(stored)
@@ -264,8 +265,7 @@ def _mask_file(posed: PosedPhoto, path: Path, kind: SourceKind, notes: _Notes) -
     found = resolve_photo(kind.folder, posed.mask_name)
     if found is not None and os.path.isfile(found):
         return found
-    with notes.lock:
-        notes.wrong_masks.append(f"{posed.mask_name} is missing")
+    notes.add(notes.wrong_masks, f"{posed.mask_name} is missing")
     return None
 
 
@@ -309,43 +309,19 @@ def _warnings(notes: _Notes, total: int, kind: str) -> list[ReportWarning]:
             listed = ", ".join(sorted(items)[:3]) + (" ..." if len(items) > 3 else "")
             out.append(ReportWarning(code, f"{len(items)} {text}: {listed}.", hint))
 
-    add(
-        "photos-not-found",
-        notes.missing,
-        f"of the {total} photos that the {kind} names were not found",
-    )
-    add(
-        "photos-unreadable",
-        [m.rstrip(".") for m in notes.bad],
-        "photos cannot be read and are not used",
-        UNREADABLE_HINT,
-    )
+    text = f"of the {total} photos that the {kind} names were not found"
+    add("photos-not-found", notes.missing, text)
+    bad, text = [m.rstrip(".") for m in notes.bad], "photos cannot be read and are not used"
+    add("photos-unreadable", bad, text, UNREADABLE_HINT)
     add("masks-not-used", [m.rstrip(".") for m in notes.wrong_masks], "masks were not used")
-    add(
-        "photos-masked-altogether",
-        notes.fully_masked,
-        "photos are masked altogether and are not used",
-        "White or opaque is kept, black or transparent is masked: check the masks.",
-    )
-    add(
-        "photos-of-one-colour",
-        notes.one_colour,
-        "photos show one colour only and are not used",
-        "Remove them, or take photos that show something with texture.",
-    )
+    text = "photos are masked altogether and are not used"
+    hint = "White or opaque is kept, black or transparent is masked: check the masks."
+    add("photos-masked-altogether", notes.fully_masked, text, hint)
+    text = "photos show one colour only and are not used"
+    hint = "Remove them, or take photos that show something with texture."
+    add("photos-of-one-colour", notes.one_colour, text, hint)
     if notes.renamed:
-        text = (
-            f"{notes.renamed} photos were found under a name that differs in case, extension or "
-            "folder."
-        )
+        differs = "a name that differs in case, extension or folder"
+        text = f"{notes.renamed} photos were found under {differs}."
         out.append(ReportWarning("photos-renamed", text))
     return out
-
-
-def _facts(notes: _Notes) -> dict[str, int]:
-    counts = {
-        "photos_undistorted": notes.undistorted,
-        "photos_rescaled": notes.rescaled,
-        "photos_masked": notes.masked,
-    }
-    return {name: count for name, count in counts.items() if count}

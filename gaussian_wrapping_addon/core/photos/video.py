@@ -190,23 +190,20 @@ def probed(path: Path) -> ProbedVideo:
 # -- Warnings about kinds of videos, the same when one is checked and when it is read -------------
 
 
-def hdr_warning(video: Path) -> ReportWarning:
-    """Return the warning of a video with a transfer function of HDR."""
-    return ReportWarning(
+def kind_warnings(video: Path, is_hdr: bool, is_interlaced: bool) -> list[ReportWarning]:
+    """Return the warnings of a video with a transfer function of HDR, and of an interlaced one."""
+    hdr = ReportWarning(
         "video-hdr",
         f"{video.name} is an HDR video (PQ or HLG): its colours are taken as they are stored, and "
         "look pale.",
         "Film without HDR, or export it as SDR.",
     )
-
-
-def interlaced_warning(video: Path) -> ReportWarning:
-    """Return the warning of an interlaced video."""
-    return ReportWarning(
+    interlaced = ReportWarning(
         "video-interlaced",
         f"{video.name} is interlaced: what moves has combs at its edges.",
         "Film or export it progressive.",
     )
+    return [hdr] * is_hdr + [interlaced] * is_interlaced
 
 
 # -- Open a video with PyAV and decode its frames one by one, within limits and past damage -------

@@ -29,8 +29,7 @@ from .video import (
     OpenVideo,
     frames_of,
     grey_of,
-    hdr_warning,
-    interlaced_warning,
+    kind_warnings,
     open_video,
     upright_color,
 )
@@ -589,26 +588,15 @@ def extract_frames(
 def _warnings(video: Path, chosen: dict[str, Any]) -> list[ReportWarning]:
     found = []
     if chosen["is_cut"] or chosen["damaged"] > _MOST_DAMAGED_SHARE * chosen["read"]:
-        found.append(
-            ReportWarning(
-                "video-damaged",
-                f"{chosen['damaged']} frames of {video.name} cannot be decoded and are not used; "
-                f"{chosen['read']} can.",
-                "Copy it from the camera again.",
-            )
+        text = (
+            f"{chosen['damaged']} frames of {video.name} cannot be decoded and are not used; "
+            f"{chosen['read']} can."
         )
+        found.append(ReportWarning("video-damaged", text, "Copy it from the camera again."))
     if chosen["gaps_s"]:
         gaps = [f"{begin:.1f} to {end:.1f} s" for begin, end in chosen["gaps_s"]]
         listed = ", ".join(gaps[:_LISTED_GAPS]) + (", ..." if len(gaps) > _LISTED_GAPS else "")
-        found.append(
-            ReportWarning(
-                "video-blurred",
-                f"All frames of {video.name} are blurred at {listed}; nothing is used of it.",
-                "Where cameras or surface are missing, film that part again, more slowly.",
-            )
-        )
-    if chosen["is_hdr"]:
-        found.append(hdr_warning(video))
-    if chosen["is_interlaced"]:
-        found.append(interlaced_warning(video))
-    return found
+        text = f"All frames of {video.name} are blurred at {listed}; nothing is used of it."
+        hint = "Where cameras or surface are missing, film that part again, more slowly."
+        found.append(ReportWarning("video-blurred", text, hint))
+    return found + kind_warnings(video, chosen["is_hdr"], chosen["is_interlaced"])
