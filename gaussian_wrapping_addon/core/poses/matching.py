@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,7 @@ def gps_distances(positions: Sequence[GpsPosition | None]) -> np.ndarray | None:
     Heights are left out: cameras measure them worst, and what they see lies on the ground. None
     where fewer than three photos have a position, or all have the same.
     """
-    known = [p for p in positions if p is not None]
-    if len(known) < MIN_POSITIONS:
+    if sum(p is not None for p in positions) < MIN_POSITIONS:
         return None
     angles = np.radians(
         [[np.nan] * 2 if p is None else [p.latitude_deg, p.longitude_deg] for p in positions]
@@ -62,7 +62,7 @@ _MAX_VIEW_ANGLE_COS = np.cos(np.radians(60.0))
 
 def all_pairs(count: int) -> Pairs:
     """Return all pairs of ``count`` photos."""
-    return [(i, j) for i in range(count) for j in range(i + 1, count)]
+    return list(itertools.combinations(range(count), 2))
 
 
 def pairs_in_order(count: int) -> Pairs:
@@ -70,13 +70,18 @@ def pairs_in_order(count: int) -> Pairs:
 
     Each with the 12 next ones, and with those 16, 32, 64, ... later.
     """
-    steps = [*range(1, _ORDER_NEIGHBOURS + 1), *(2**k for k in range(4, count.bit_length()))]
-    return sorted((i, i + step) for step in steps for i in range(count - step))
+    return pairs_at_steps(
+        count, [*range(1, _ORDER_NEIGHBOURS + 1), *(2**k for k in range(4, count.bit_length()))]
+    )
 
 
 def pairs_by_name(count: int) -> Pairs:
     """Return each photo with the next ones by name, which mostly were taken next."""
-    steps = range(1, _NAME_NEIGHBOURS + 1)
+    return pairs_at_steps(count, range(1, _NAME_NEIGHBOURS + 1))
+
+
+def pairs_at_steps(count: int, steps: Iterable[int]) -> Pairs:
+    """Return each photo with those that come so many steps after it."""
     return sorted((i, i + step) for step in steps for i in range(count - step))
 
 
@@ -89,14 +94,8 @@ def nearest_pairs(distances: np.ndarray, nearest: int) -> Pairs:
     known = np.where(np.isfinite(distances), distances, np.inf)
     np.fill_diagonal(known, np.inf)
     order = np.argsort(known, axis=1, kind="stable")[:, :nearest]
-    return sorted(
-        {
-            (min(i, j), max(i, j))
-            for i, row in enumerate(order.tolist())
-            for j in row
-            if np.isfinite(known[i, j])
-        }
-    )
+    both = {(i, j) for i, row in enumerate(order.tolist()) for j in row if np.isfinite(known[i, j])}
+    return sorted({(min(pair), max(pair)) for pair in both})
 
 
 def pairs_by_pose(centers: np.ndarray, forwards: np.ndarray) -> Pairs:
@@ -173,6 +172,9 @@ def second_round(
     ``resemblance``: (count, count) array, decides between equals, and for photos without any
         neighbour.
     """
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import connected_components
+
     linked = np.zeros((count, count), bool)
     for (i, j), matches in verified.items():
         if matches >= VERIFIED_MATCHES:
@@ -182,7 +184,7 @@ def second_round(
         done[i, j] = done[j, i] = True
     # Neighbours in common, then resemblance, which lies in [-1, 1].
     common = linked.astype(np.float32) @ linked.astype(np.float32)
-    apart = _components(linked)
+    apart = connected_components(csr_matrix(linked), directed=False)[1]
     largest = np.bincount(apart).argmax()
     pairs: set[tuple[int, int]] = set()
     for i in range(count):
@@ -209,14 +211,6 @@ def _at_ranks(metres: np.ndarray) -> set[tuple[int, int]]:
         for i, j in enumerate(order[:, rank].tolist())
         if np.isfinite(known[i, j])
     }
-
-
-def _components(linked: np.ndarray) -> np.ndarray:
-    """Return the number of each item's connected part."""
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    return connected_components(csr_matrix(linked), directed=False)[1]
 
 
 # -- How much photos resemble each other, by the features that were found in them (VLAD) ----------
@@ -332,12 +326,9 @@ def extract(
         reader.existing_camera_id = camera_id
         # Import in order first: extraction would number the photos as its threads finish.
         pycolmap.import_images(
-            database,
-            folder / "images",
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            image_names=names,
-            options=reader,
-        )
+            database, folder / "images", camera_mode=pycolmap.CameraMode.SINGLE,
+            image_names=names, options=reader,
+        )  # fmt: skip
         for begin in range(0, len(names), 2 * threads):
             block = names[begin : begin + 2 * threads]
             emit(
@@ -345,14 +336,10 @@ def extract(
                 message=f"searching features, photo {done + 1} of {total}",
             )
             pycolmap.extract_features(
-                database,
-                folder / "images",
-                image_names=block,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=options,
-                device=pycolmap.Device.cpu,
-            )
+                database, folder / "images", image_names=block,
+                camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
+                extraction_options=options, device=pycolmap.Device.cpu,
+            )  # fmt: skip
             done += len(block)
 
 
@@ -377,12 +364,8 @@ def match_chosen(folder: Path, database: Path, task: dict[str, Any], names: list
             return np.asarray(db.read_descriptors(number_of[names[index]]).data)
 
         alike = resemblances(count, descriptors, seed=task["seed"])
-    metres = gps_distances(
-        [
-            None if place is None else GpsPosition(place[0], place[1], None)
-            for place in task["positions"]
-        ]
-    )
+    places = [place and GpsPosition(place[0], place[1], None) for place in task["positions"]]
+    metres = gps_distances(places)
     first = choose_pairs(count, in_order=task["in_order"], metres=metres, resemblance=alike)
     task["pairs"] = _named(first, names)
     match(folder, database, task, end=_SECOND_ROUND_BEGIN)
@@ -394,10 +377,10 @@ def match_chosen(folder: Path, database: Path, task: dict[str, Any], names: list
             verified[i, j] = len(geometry.inlier_matches)
     more = _named(second_round(count, first, verified, alike), names)
     match(folder, database, {**task, "pairs": more}, begin=_SECOND_ROUND_BEGIN)
-    task["pairs"] = task["pairs"] + more
+    task["pairs"] += more
 
 
-def _named(pairs: list[tuple[int, int]], names: list[str]) -> list[list[str]]:
+def _named(pairs: Pairs, names: list[str]) -> list[list[str]]:
     return [[names[i], names[j]] for i, j in pairs]
 
 
@@ -428,12 +411,9 @@ def match(
         block = pairs[done : done + step]
         pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in block))
         pycolmap.match_image_pairs(
-            database,
-            matching_options=matching,
-            pairing_options=pairing,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
+            database, matching_options=matching, pairing_options=pairing,
+            verification_options=verification, device=pycolmap.Device.cpu,
+        )  # fmt: skip
 
 
 def verify_again(database: Path, task: dict[str, Any], *, is_turntable: bool) -> None:
@@ -443,10 +423,9 @@ def verify_again(database: Path, task: dict[str, Any], *, is_turntable: bool) ->
         db.clear_two_view_geometries()
     verifier = pycolmap.GeometricVerifierOptions()
     verifier.num_threads = task["threads"]
+    options = _options_of(task, is_turntable=is_turntable)
     pycolmap.geometric_verification(
-        database,
-        verifier_options=verifier,
-        two_view_geometry_options=_options_of(task, is_turntable=is_turntable),
+        database, verifier_options=verifier, two_view_geometry_options=options
     )
 
 

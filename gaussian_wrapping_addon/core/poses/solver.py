@@ -33,7 +33,7 @@ from ..photos.photo_file import (
 )
 from ..progress import UNREADABLE_HINT, Progress, ReportWarning
 from ..readers.colmap import ModelFiles, read_model
-from ..readers.source_model import PosedPhoto, SourceModel
+from ..readers.source_model import PHOTOS, PosedPhoto, SourceModel
 from ..scene.camera import Camera
 from ..worker.helper_process import run_helper
 from .checks import MIN_GROUP, TURNING_FOLDER, TURNTABLE_NAME, photos_in_parts, with_findings
@@ -113,7 +113,7 @@ MAX_UNREADABLE_SHARE = 0.2
 """Largest share of photos that cannot be decoded; with more, loading fails."""
 TURNTABLE_FOLDER = "turntable"
 """Masks of what turns, of the photos' full size."""
-HELPER = "poses.solver_helper"
+_HELPER = "poses.solver_helper"
 """Module of the process that solves."""
 _SECONDS_A_PHOTO = 60.0
 """Longest time that solving may take: more than ten times what 400 photos took on two cores."""
@@ -165,7 +165,7 @@ def solve_poses(
     Raises DatasetError: too few photos can be decoded, or fewer than ``MIN_IMAGES`` can be
     registered.
     """
-    folder = _fresh_folder(work_folder)
+    folder = fresh_folder(work_folder)
     prepared: list[_SolverPhoto] = []
     names: list[str] = []
     bad: list[str] = []
@@ -188,40 +188,27 @@ def solve_poses(
         raise DatasetError(
             f"Only {len(prepared)} photos can be read; {MIN_IMAGES} are needed.", "Add photos."
         )
-    threads = threads or default_threads()
     groups: dict[tuple[Any, ...], list[_SolverPhoto]] = {}
     for photo in prepared:
         key = (photo.full_width, photo.full_height, *photo.lens_key)
         groups.setdefault(key, []).append(photo)
+    told = []
+    for group in groups.values():
+        size = {"width": group[0].width, "height": group[0].height}
+        names_of_group = [p.name for p in group]
+        told.append({**size, "focal_px": group[0].focal_px, "names": names_of_group})
     task = {
-        "mode": "solve",
-        "seed": seed,
-        "threads": threads,
-        "turntable": turntable,
-        "groups": [
-            {
-                "width": group[0].width,
-                "height": group[0].height,
-                "focal_px": group[0].focal_px,
-                "names": [p.name for p in group],
-            }
-            for group in groups.values()
-        ],
-        "in_order": in_order,
+        "mode": "solve", "seed": seed, "threads": threads or default_threads(),
+        "turntable": turntable, "groups": told, "in_order": in_order,
         "positions": [p and [p.latitude_deg, p.longitude_deg] for p in positions],
-    }
-    write_json(folder / "task.json", task)
-    run_helper(
-        HELPER, folder, progress.span(0.08, 1.0), memory_bytes=helper_memory_limit_bytes(),
-        deadline_s=max(HELPER_DEADLINE_S, _SECONDS_A_PHOTO * len(prepared)),
-    )  # fmt: skip
-    model = read_model(ModelFiles(folder / "model", ".bin"))
+    }  # fmt: skip
+    model = run_solver(folder, task, progress, expected_s=_SECONDS_A_PHOTO * len(prepared))
     sizes = {p.name: (p.full_width, p.full_height) for p in prepared}
     target = work_folder / TURNTABLE_FOLDER
     model = with_turntable(model, folder, sizes, target, wanted=turntable == "on")
     model = with_findings(model, folder, {p.name: n for p, n in zip(prepared, names, strict=True)})
     in_parts = photos_in_parts(folder)
-    _save_model(folder, work_folder)
+    save_model(folder, work_folder)
     return _with_source_names(model, prepared, names, bad, len(photos), in_parts)
 
 
@@ -231,7 +218,7 @@ def _with_source_names(
     names: list[str],
     bad: list[str],
     offered: int,
-    in_parts: Collection[str] = (),
+    in_parts: Collection[str],
 ) -> SourceModel:
     """Restore original names and full-size intrinsics of the solved photos.
 
@@ -259,14 +246,10 @@ def _with_source_names(
     ]
     if unregistered:
         listed = ", ".join(unregistered[:5]) + (" ..." if len(unregistered) > 5 else "")
-        warnings.append(
-            ReportWarning(
-                "photos-not-placed",
-                f"{len(unregistered)} of {len(names)} photos could not be placed and are not used: "
-                f"{listed}.",
-                "Take more photos with more overlap there, or remove blurred ones.",
-            )
-        )
+        count = f"{len(unregistered)} of {len(names)}"
+        text = f"{count} photos could not be placed and are not used: {listed}."
+        hint = "Take more photos with more overlap there, or remove blurred ones."
+        warnings.append(ReportWarning("photos-not-placed", text, hint))
     if bad:
         text = f"{len(bad)} photos cannot be read and are not used: {bad[0]}"
         warnings.append(ReportWarning("photos-unreadable", text, UNREADABLE_HINT))
@@ -277,7 +260,7 @@ def _with_source_names(
         **{k: v for k, v in model.facts.items() if k != "images_in_model"},
     }
     return dataclasses.replace(
-        model, kind="photos", photos=tuple(photos), warnings=tuple(warnings), facts=facts
+        model, kind=PHOTOS, photos=tuple(photos), warnings=tuple(warnings), facts=facts
     )
 
 
@@ -296,37 +279,43 @@ def triangulate_points(
     Returns ``points``: (n, 3) float64, in the frame of ``cameras``; may be empty; ``colors``:
     (n, 3) uint8.
     """
-    folder = _fresh_folder(work_folder)
+    folder = fresh_folder(work_folder)
     entries = []
     for i, (camera, path) in enumerate(zip(cameras, photos, strict=True)):
         size = (camera.width, camera.height)
         prepared = _write_solver_photo(folder, i, read_photo(path), size, None, masks[i])
         small = camera.resized(prepared.width, prepared.height)
-        entries.append(
-            {
-                "name": prepared.name,
-                "width": small.width,
-                "height": small.height,
-                "params": [small.fx, small.fy, small.cx, small.cy],
-                "cam_from_world": np.asarray(small.cam_from_world).tolist(),
-            }
-        )
+        entries.append({
+            "name": prepared.name, "width": small.width, "height": small.height,
+            "params": [small.fx, small.fy, small.cx, small.cy],
+            "cam_from_world": np.asarray(small.cam_from_world).tolist(),
+        })  # fmt: skip
         progress.update(0.08 * (i + 1) / len(photos), f"reading photo {i + 1} of {len(photos)}")
     pairs = pairs_by_pose(
         np.array([c.center for c in cameras]), np.array([c.forward for c in cameras])
     )
     task = {
-        "mode": "triangulate",
-        "seed": seed,
-        "threads": threads or default_threads(),
-        "photos": entries,
-        "pairs": [[entries[i]["name"], entries[j]["name"]] for i, j in pairs],
-    }
-    write_json(folder / "task.json", task)
-    run_helper(HELPER, folder, progress.span(0.08, 1.0), memory_bytes=helper_memory_limit_bytes())
-    model = read_model(ModelFiles(folder / "model", ".bin"))
+        "mode": "triangulate", "seed": seed, "threads": threads or default_threads(),
+        "photos": entries, "pairs": [[entries[i]["name"], entries[j]["name"]] for i, j in pairs],
+    }  # fmt: skip
+    model = run_solver(folder, task, progress)
     shutil.rmtree(folder)
     return model.points, model.point_colors
+
+
+def run_solver(
+    folder: Path, task: dict[str, Any], progress: Progress, *, expected_s: float = 0.0
+) -> SourceModel:
+    """Run a task of the helper in ``folder``, with the last 92 % of ``progress``; read its model.
+
+    ``expected_s`` is the longest time that it may take, where that is more than usual.
+    """
+    write_json(folder / "task.json", task)
+    run_helper(
+        _HELPER, folder, progress.span(0.08, 1.0), memory_bytes=helper_memory_limit_bytes(),
+        deadline_s=max(HELPER_DEADLINE_S, expected_s),
+    )  # fmt: skip
+    return read_model(ModelFiles(folder / "model", ".bin"))
 
 
 def check_unreadable_share(bad: Sequence[str], offered: int) -> None:
@@ -351,22 +340,14 @@ def _write_solver_photo(
 
     ``full_size`` is (width, height) of the whole photo, which may be decoded at less.
     """
-    from PIL import Image
-
     full_width, full_height = full_size
     factor = min(1.0, MAX_SIFT_PX / max(full_width, full_height))
     size = (max(1, round(full_width * factor)), max(1, round(full_height * factor)))
-    color = decoded.color
-    if size != (color.shape[1], color.shape[0]):
-        color = np.asarray(Image.fromarray(color).resize(size, Image.Resampling.LANCZOS))
     name = f"{index:06d}.jpg"
-    write_photo(folder / "images" / name, color)
     visible = decoded.alpha
     if mask is not None:
         visible = np.where(reading.kept(read_mask(mask)), 255, 0).astype(np.uint8)
-    if visible is not None:
-        resized = Image.fromarray(visible).resize(size, Image.Resampling.NEAREST)
-        resized.save(folder / "masks" / f"{name}.png")
+    write_reduced(folder, name, decoded.color, visible, size)
     key: tuple[str, ...] = ()
     focal_px = None
     if source is not None:
@@ -376,7 +357,24 @@ def _write_solver_photo(
     return _SolverPhoto(name, size[0], size[1], full_width, full_height, key, focal_px)
 
 
-def _fresh_folder(work_folder: Path) -> Path:
+def write_reduced(
+    folder: Path, name: str, color: np.ndarray, visible: np.ndarray | None, size: tuple[int, int]
+) -> None:
+    """Write a photo of a task, and what is ``visible`` of it (uint8), at width and height."""
+    from PIL import Image
+
+    if size != (color.shape[1], color.shape[0]):
+        color = np.asarray(Image.fromarray(color).resize(size, Image.Resampling.LANCZOS))
+    target, mask = folder / "images" / name, folder / "masks" / f"{name}.png"
+    target.parent.mkdir(exist_ok=True)
+    write_photo(target, color)
+    if visible is not None:
+        mask.parent.mkdir(exist_ok=True)
+        Image.fromarray(visible).resize(size, Image.Resampling.NEAREST).save(mask)
+
+
+def fresh_folder(work_folder: Path) -> Path:
+    """Return a new folder for a task of the helper; what an earlier run has left is removed."""
     folder = work_folder / "pose_solver"
     for earlier in (folder, work_folder / TURNTABLE_FOLDER):
         if earlier.exists():
@@ -386,7 +384,7 @@ def _fresh_folder(work_folder: Path) -> Path:
     return folder
 
 
-def _save_model(folder: Path, work_folder: Path) -> None:
+def save_model(folder: Path, work_folder: Path) -> None:
     """Keep the solved model as ``cameras/``, drop features and temporary photos."""
     target = work_folder / "cameras"
     if target.exists():
