@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,9 +101,8 @@ def standing_groups(count: int, motions: Sequence[PairMotion]) -> list[list[int]
     still = [motion for motion in motions if motion.is_still]
     if not still:
         return []
-    rows = [motion.first for motion in still]
-    columns = [motion.second for motion in still]
-    graph = coo_matrix((np.ones(len(still)), (rows, columns)), (count, count))
+    ends = [motion.first for motion in still], [motion.second for motion in still]
+    graph = coo_matrix((np.ones(len(still)), ends), (count, count))
     label = connected_components(graph, directed=False)[1]
     partners, matched, moved = (np.zeros(count, int) for _ in range(3))
     for motion in motions:
@@ -294,9 +294,9 @@ class Verdict:
             if pair.agrees:
                 one, other = sorted((root(pair.first), root(pair.second)))
                 part[other] = one
-        groups: dict[str, list[str]] = {}
+        groups: dict[str, list[str]] = defaultdict(list)
         for name in names:
-            groups.setdefault(root(name), []).append(name)
+            groups[root(name)].append(name)
         return sorted(groups.values(), key=lambda group: (-len(group), group[0]))
 
     def to_json(self, names: Sequence[str]) -> dict[str, Any]:
@@ -326,11 +326,12 @@ def check_solution(database: Path, model: Any) -> Verdict:
     Pairs that the solver did not use, or gave up, count like all others.
     """
     pycolmap = import_pycolmap()
-    placed = {image_id: _Placed(model, image_id) for image_id in sorted(model.reg_image_ids())}
     pairs = []
     with pycolmap.Database.open(database) as db:
-        for image_id, photo in placed.items():
-            photo.read_features(db.read_keypoints(image_id)[:, :2])
+        placed = {
+            image_id: _Placed(model, image_id, db.read_keypoints(image_id)[:, :2])
+            for image_id in sorted(model.reg_image_ids())
+        }
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
             ids = pycolmap.pair_id_to_image_pair(pair_id)
             matches = geometry.inlier_matches
@@ -343,32 +344,24 @@ def check_solution(database: Path, model: Any) -> Verdict:
 
 
 class _Placed:
-    """A placed photo with its features."""
+    """A placed photo with its features, at (n, 2) ``pixels``."""
 
-    def __init__(self, model: Any, image_id: int) -> None:
+    def __init__(self, model: Any, image_id: int, pixels: np.ndarray) -> None:
         image = model.image(image_id)
         self.name: str = image.name
         self.pose = np.asarray(image.cam_from_world().matrix())
         self._camera = model.camera(image.camera_id)
-        numbers = [p.point3D_id if p.has_point3D() else None for p in image.points2D]
-        self._points = np.full((len(numbers), 3), np.nan)
-        for at, number in enumerate(numbers):
-            if number is not None:
-                self._points[at] = model.point3D(number).xyz
-        self._rays = np.zeros((0, 2))
-
-    def read_features(self, pixels: np.ndarray) -> None:
-        """Set the rays of all features from their (n, 2) pixels."""
         self._rays = np.asarray(self._camera.cam_from_img(pixels.astype(np.float64)))
-        if len(self._points) != len(pixels):  # a photo without any match has no features there
-            self._points = np.full((len(pixels), 3), np.nan)
+        self._points = np.full((len(pixels), 3), np.nan)
+        if len(image.points2D) == len(pixels):  # a photo without any match has no features there
+            for at, feature in enumerate(image.points2D):
+                if feature.has_point3D():
+                    self._points[at] = model.point3D(feature.point3D_id).xyz
 
     def side(self, features: np.ndarray) -> Side:
         """Return this photo with the features of a pair's matches."""
-        return Side(
-            self.pose, self._rays[features], self._points[features],
-            float(self._camera.mean_focal_length()),
-        )  # fmt: skip
+        focal_px = float(self._camera.mean_focal_length())
+        return Side(self.pose, self._rays[features], self._points[features], focal_px)
 
 
 # -- What the solver's check of its own cameras found: facts and warnings of the report -----------
@@ -392,13 +385,10 @@ def with_findings(model: SourceModel, folder: Path, source_names: Mapping[str, s
     for warning in warnings:
         _logger.warning("%s %s", warning.text, warning.hint)
     facts = {
-        **model.facts,
-        "pairs_matched": found["pairs_matched"],
-        "pairs_verified": found["pairs"],
+        **model.facts, "pairs_matched": found["pairs_matched"], "pairs_verified": found["pairs"],
         "pairs_contradicting_cameras": found["contradicting_pairs"],
-        "photos_joined": found["joined"],
-        "mapper": found["mapper"],
-    }
+        "photos_joined": found["joined"], "mapper": found["mapper"],
+    }  # fmt: skip
     return dataclasses.replace(model, facts=facts, warnings=(*model.warnings, *warnings))
 
 
@@ -410,56 +400,48 @@ def photos_in_parts(folder: Path) -> frozenset[str]:
 def findings(found: Mapping[str, Any], source_names: Mapping[str, str]) -> list[ReportWarning]:
     """Return the warnings of ``solution.json``."""
     warnings = []
+
+    def add(code: str, text: str, hint: str) -> None:
+        warnings.append(ReportWarning(code, text, hint))
+
     share = f"{100 * found['contradicting_share']:.0f} %"
     if found["is_doubtful"]:
         strongest = "; ".join(
             f"{source_names[one]} and {source_names[other]} ({agreeing} of {matches} matches fit)"
             for one, other, matches, agreeing in found["strongest"][:_NAMED]
         )
-        warnings.append(
-            ReportWarning(
-                "cameras-contradicted",
-                f"The solved cameras may be wrong: {found['contradicting_pairs']} of "
-                f"{found['strong_pairs']} strong pairs of photos, with {share} of the matches, "
-                f"contradict them, as where things look alike or repeat. Strongest: {strongest}.",
-                "Look at the cameras before the mesh. Take photos that show what is different "
-                "from place to place, or mask what repeats.",
-            )
+        add(
+            "cameras-contradicted",
+            f"The solved cameras may be wrong: {found['contradicting_pairs']} of "
+            f"{found['strong_pairs']} strong pairs of photos, with {share} of the matches, "
+            f"contradict them, as where things look alike or repeat. Strongest: {strongest}.",
+            "Look at the cameras before the mesh. Take photos that show what is different "
+            "from place to place, or mask what repeats.",
         )
     if found["is_mended"]:
-        warnings.append(
-            ReportWarning(
-                "cameras-mended",
-                "The cameras solved first contradicted many matches. These are solved again from "
-                "the photos that have most in common, and contradict fewer of their matches.",
-                "Look at the cameras before the mesh.",
-            )
+        add(
+            "cameras-mended",
+            "The cameras solved first contradicted many matches. These are solved again from "
+            "the photos that have most in common, and contradict fewer of their matches.",
+            "Look at the cameras before the mesh.",
         )
     weak = [part for part in found["parts"][1:] if len(part) >= _MIN_PART]
     if weak:
-        warnings.append(
-            ReportWarning(
-                "cameras-weakly-linked",
-                f"{_count(weak)} placed photos are linked to the others by few matches; where they "
-                f"stand is uncertain: {_listed(weak, source_names)}.",
-                "Take photos in between, with more overlap.",
-            )
+        add(
+            "cameras-weakly-linked",
+            f"{sum(map(len, weak))} placed photos are linked to the others by few matches; where "
+            f"they stand is uncertain: {_listed(weak, source_names)}.",
+            "Take photos in between, with more overlap.",
         )
     if found["apart"]:
-        warnings.append(
-            ReportWarning(
-                "cameras-in-parts",
-                f"{_count(found['apart'])} photos fit each other but not the rest, in "
-                f"{len(found['apart'])} parts, and are not used: "
-                f"{_listed(found['apart'], source_names)}.",
-                "Take photos that connect the parts.",
-            )
+        add(
+            "cameras-in-parts",
+            f"{sum(map(len, found['apart']))} photos fit each other but not the rest, in "
+            f"{len(found['apart'])} parts, and are not used: "
+            f"{_listed(found['apart'], source_names)}.",
+            "Take photos that connect the parts.",
         )
     return warnings
-
-
-def _count(parts: Sequence[Sequence[str]]) -> int:
-    return sum(len(part) for part in parts)
 
 
 def _listed(parts: Sequence[Sequence[str]], source_names: Mapping[str, str]) -> str:
