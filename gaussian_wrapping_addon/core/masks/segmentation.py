@@ -11,6 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import DatasetError
+from ..photos.photo_file import large_parts
 from ..worker.environment import load_extra
 from .mask_folder import check_model_file
 
@@ -42,21 +43,12 @@ def cleaned(share: np.ndarray, size: tuple[int, int], grown_share: float = 0.0) 
 
     grey = Image.fromarray(np.ascontiguousarray(share, np.float32))
     whole = np.asarray(grey.resize(size, Image.Resampling.BILINEAR))
-    kept = _without_thin_spots(_large_parts(whole >= THRESHOLD), whole)
+    kept = _without_thin_spots(large_parts(whole >= THRESHOLD, SMALLEST_SHARE), whole)
     if not grown_share:
         return kept
     radius = max(1, round(grown_share * max(size)))
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     return np.asarray(ndimage.binary_dilation(kept, x * x + y * y <= radius * radius))
-
-
-def _large_parts(mask: np.ndarray) -> np.ndarray:
-    label, count = ndimage.label(mask)
-    if count < 2:
-        return mask
-    areas = np.bincount(label.ravel())
-    areas[0] = 0
-    return np.asarray((areas >= SMALLEST_SHARE * areas.max())[label] & mask)
 
 
 def _without_thin_spots(mask: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -163,11 +155,8 @@ class SegmentationModel:
         except Exception as error:  # as above
             raise self._unfit(f"fails ({_first_line(error)})") from None
         values = np.asarray(found)
-        if (
-            values.dtype.kind != "f"
-            or values.ndim not in (3, 4)
-            or (values.ndim == 4 and (values.shape[1] != 1))
-        ):
+        is_one_channel = values.ndim == 3 or (values.ndim == 4 and values.shape[1] == 1)
+        if values.dtype.kind != "f" or not is_one_channel:
             raise self._unfit(f"gives {values.dtype} of shape {values.shape}, not (1, 1, h, w)")
         if values.shape[0] != 1 or 0 in values.shape:
             raise self._unfit(f"gives an output of shape {values.shape}")

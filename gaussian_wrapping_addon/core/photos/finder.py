@@ -53,19 +53,10 @@ def _walk(root: Path) -> tuple[list[Path], list[Path]]:
             subfolders.clear()  # a job beside its video or transforms.json is no input
             continue
         here = Path(folder)
-        deep = len(here.parts) - base_depth >= _MAX_DEPTH
-        subfolders[:] = (
-            []
-            if deep
-            else sorted(
-                s for s in subfolders if not s.startswith(".") and s.lower() not in MASK_FOLDERS
-            )
-        )
-        shown = [
-            name
-            for name in names
-            if not name.startswith(".") and PurePosixPath(name).suffix.lower() in PHOTO_SUFFIXES
-        ]
+        inner = [s for s in subfolders if s[0] != "." and s.lower() not in MASK_FOLDERS]
+        is_deep = len(here.parts) - base_depth >= _MAX_DEPTH
+        subfolders[:] = [] if is_deep else sorted(inner)
+        shown = [name for name in names if _is_photo_name(name)]
         masks = set(masks_among(shown).values())
         photos = [name for name in shown if name not in masks]
         second = second_copies(photos)
@@ -80,6 +71,10 @@ def _walk(root: Path) -> tuple[list[Path], list[Path]]:
         return path.relative_to(root).as_posix()
 
     return sorted(found, key=name_of), sorted(left_out, key=name_of)
+
+
+def _is_photo_name(name: str) -> bool:
+    return not name.startswith(".") and PurePosixPath(name).suffix.lower() in PHOTO_SUFFIXES
 
 
 def second_copies(names: Iterable[str]) -> set[str]:
@@ -112,7 +107,7 @@ def masks_among(names: Iterable[str]) -> dict[str, str]:
     photos: dict[str, list[str]] = {}
     marked: list[tuple[str, str]] = []
     for name in sorted(names):
-        if PurePosixPath(name).suffix.lower() not in PHOTO_SUFFIXES or name.startswith("."):
+        if not _is_photo_name(name):
             continue
         key = name.casefold()
         stem = PurePosixPath(key).stem
@@ -194,12 +189,8 @@ def _keys(name: str) -> list[tuple[str, str]]:
     """Return the keys by which a name is matched, strictest first."""
     folded = unicodedata.normalize("NFC", name).casefold()
     stem = str(PurePosixPath(folded).with_suffix("")) if PurePosixPath(folded).name else folded
-    return [
-        ("case", folded),
-        ("extension", stem),
-        ("folder", PurePosixPath(folded).name),
-        ("folder", PurePosixPath(stem).name),
-    ]
+    in_folder = [("folder", PurePosixPath(key).name) for key in (folded, stem)]
+    return [("case", folded), ("extension", stem), *in_folder]
 
 
 def mask_candidates(name: str) -> list[str]:

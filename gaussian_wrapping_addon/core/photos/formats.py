@@ -117,36 +117,24 @@ def without_warnings() -> Iterator[None]:
     The filters belong to the process: photos are read on several threads, so that the first to
     come sets them and the last to go restores them.
     """
-    _quiet.enter()
+    global _quiet_threads
+    with _quiet_lock:
+        if not _quiet_threads:
+            _earlier_filters.enter_context(warnings.catch_warnings())
+            warnings.simplefilter("ignore")
+        _quiet_threads += 1
     try:
         yield
     finally:
-        _quiet.leave()
+        with _quiet_lock:
+            _quiet_threads -= 1
+            if not _quiet_threads:
+                _earlier_filters.close()
 
 
-class _QuietFilters:
-    """Filters that ignore every warning while at least one thread wants them."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._wanted_by = 0
-        self._earlier = contextlib.ExitStack()
-
-    def enter(self) -> None:
-        with self._lock:
-            if not self._wanted_by:
-                self._earlier.enter_context(warnings.catch_warnings())
-                warnings.simplefilter("ignore")
-            self._wanted_by += 1
-
-    def leave(self) -> None:
-        with self._lock:
-            self._wanted_by -= 1
-            if not self._wanted_by:
-                self._earlier.close()
-
-
-_quiet = _QuietFilters()
+_quiet_lock = threading.Lock()
+_quiet_threads = 0
+_earlier_filters = contextlib.ExitStack()
 
 
 def forbid_ghostscript() -> None:
@@ -203,16 +191,12 @@ def develop(path: Path, *, half: bool = False) -> np.ndarray:
     that LibRaw knows, or damaged.
     """
     with _one_at_a_time, _opened(path) as raw:
-        return np.ascontiguousarray(
-            raw.postprocess(
-                use_camera_wb=True,
-                no_auto_bright=True,
-                adjust_maximum_thr=0.0,  # else the brightest pixel of a photo may become white
-                gamma=_SRGB_GAMMA,
-                output_bps=8,
-                half_size=half,
-            )
-        )
+        # Without the last setting the brightest pixel of a photo may become white.
+        pixels = raw.postprocess(
+            use_camera_wb=True, no_auto_bright=True, gamma=_SRGB_GAMMA, output_bps=8,
+            half_size=half, adjust_maximum_thr=0.0,
+        )  # fmt: skip
+        return np.ascontiguousarray(pixels)
 
 
 def raw_focal(path: Path) -> tuple[float, str]:
@@ -269,9 +253,8 @@ class PhotoHeader:
     @property
     def upright_size(self) -> tuple[int, int]:
         """(width, height) after the EXIF orientation is applied."""
-        if self.orientation >= 5:
-            return (self.height, self.width)
-        return (self.width, self.height)
+        size = (self.width, self.height)
+        return size[::-1] if self.orientation >= 5 else size
 
 
 def read_photo_header(path: Path) -> PhotoHeader | None:
@@ -290,11 +273,10 @@ def read_photo_header(path: Path) -> PhotoHeader | None:
                 header = _read_jpeg(stream)
             elif magic == b"\x89PNG\r\n\x1a\n":
                 header = _read_png(stream)
-            else:
-                other = _read_other(path)
-                if other is None:
-                    return None
+            elif (other := _read_other(path)) is not None:
                 header = other
+            else:
+                return None
     except PermissionError as error:
         raise DatasetError(
             f"{path.name} cannot be read: {error.strerror}.", "Check its permissions."

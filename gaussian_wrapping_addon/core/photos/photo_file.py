@@ -79,7 +79,10 @@ def read_photo(path: Path, *, upright: bool = True, enough_px: int = 0) -> Decod
     header = photo_header(path)
     if photo_kind(path) == RAW:
         half = bool(enough_px) and max(header.width, header.height) >= 2 * enough_px
-        return DecodedPhoto(_developed(path, half=half), None, False)
+        try:
+            return DecodedPhoto(develop(path, half=half), None, False)
+        except (OSError, ValueError) as error:
+            raise DatasetError(f"{path.name} cannot be decoded ({error}).", _ANOTHER) from None
     image = _open(path)
     is_common = image.format in PLAIN_FORMATS
     plain = image.mode in ("RGB", "L") and header.orientation == 1 and is_common
@@ -141,13 +144,6 @@ def write_mask(path: Path, mask: np.ndarray) -> None:
     Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path, compress_level=1)
 
 
-def _developed(path: Path, *, half: bool) -> np.ndarray:
-    try:
-        return develop(path, half=half)
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{path.name} cannot be decoded ({error}).", _ANOTHER) from None
-
-
 def _open(path: Path) -> Image.Image:
     from PIL import Image, UnidentifiedImageError
 
@@ -196,11 +192,9 @@ def _to_arrays(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
     if mode in ("I;16", "I;16L", "I;16B", "I", "F"):
         grey = _grey_to_eight_bits(np.asarray(image))
         return np.repeat(grey[..., None], 3, 2), None
-    has_alpha = mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
-    if has_alpha:
+    if mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
         pixels = np.asarray(image.convert("RGBA"))
-        alpha = np.ascontiguousarray(pixels[..., 3])
-        color = np.ascontiguousarray(pixels[..., :3])
+        color, alpha = (np.ascontiguousarray(part) for part in (pixels[..., :3], pixels[..., 3]))
         return color, (None if alpha.min() == 255 else alpha)
     return np.array(image if mode == "RGB" else image.convert("RGB")), None
 
@@ -244,3 +238,15 @@ class MaskReading:
 
 
 AS_WRITTEN = MaskReading()
+
+
+def large_parts(mask: np.ndarray, smallest_share: float) -> np.ndarray:
+    """Return a (h, w) bool mask without parts smaller than this share of the largest one."""
+    from scipy import ndimage
+
+    label, count = ndimage.label(mask)
+    if count < 2:
+        return mask
+    areas = np.bincount(label.ravel())
+    areas[0] = 0
+    return np.asarray((areas >= smallest_share * areas.max())[label] & mask)

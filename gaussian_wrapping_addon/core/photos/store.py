@@ -229,12 +229,15 @@ class DecodedFile:
                 return
             try:
                 if self._file is None:
-                    self._begin()
-                assert self._file is not None
+                    free = shutil.disk_usage(self._folder).free
+                    self._limit_bytes = int(DECODED_PHOTOS_DISK_SHARE * free)
+                    # Unlinked at once, or removed by Windows with the last handle: none is left.
+                    self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
                 if self.bytes_written + array.nbytes > self._limit_bytes:
                     return
                 self._file.seek(self.bytes_written)
-                _write(self._file, np.ascontiguousarray(array))
+                if not _moved(np.ascontiguousarray(array), self._file.write):
+                    raise OSError("nothing more can be written")
             except OSError as error:
                 _logger.warning("decoded photos are not kept on disk: %s", error)
                 self._end()
@@ -252,7 +255,7 @@ class DecodedFile:
             array = np.zeros(shape, dtype)
             try:
                 self._file.seek(begin)
-                if _read(self._file, array):
+                if _moved(array, self._file.readinto):  # type: ignore[attr-defined]
                     return array
                 reason: object = "it is shorter than it was"
             except OSError as error:
@@ -266,11 +269,6 @@ class DecodedFile:
         with self._lock:
             self._end()
 
-    def _begin(self) -> None:
-        self._limit_bytes = int(DECODED_PHOTOS_DISK_SHARE * shutil.disk_usage(self._folder).free)
-        # Unlinked at once, or removed by Windows when the last handle goes: nothing can be left.
-        self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
-
     def _end(self) -> None:
         self._is_open = False
         self._places.clear()
@@ -282,21 +280,11 @@ class DecodedFile:
                 _logger.debug("closing decoded photos: %s", error)
 
 
-def _bytes_of(array: np.ndarray) -> memoryview:
-    return array.reshape(-1).view(np.uint8).data
-
-
-def _write(file: IO[bytes], array: np.ndarray) -> None:
-    left = _bytes_of(array)
+def _moved(array: np.ndarray, move: Callable[[memoryview], int]) -> bool:
+    """Let ``move`` write or read the bytes of an array; return whether it moved all of them."""
+    left = array.reshape(-1).view(np.uint8).data
     while len(left):
-        left = left[file.write(left) :]
-
-
-def _read(file: IO[bytes], array: np.ndarray) -> bool:
-    """Fill an array; return whether the file had enough."""
-    left = _bytes_of(array)
-    while len(left):
-        count = file.readinto(left)  # type: ignore[attr-defined]
+        count = move(left)
         if not count:
             return False
         left = left[count:]
@@ -337,14 +325,9 @@ class PhotoStore:
         if width < 1 or height < 1:
             raise ValueError(f"divisor {divisor} leaves nothing of {base.width} x {base.height}")
         return dataclasses.replace(
-            base,
-            width=width,
-            height=height,
-            fx=base.fx / divisor,
-            fy=base.fy / divisor,
-            cx=base.cx / divisor,
-            cy=base.cy / divisor,
-        )
+            base, width=width, height=height, fx=base.fx / divisor, fy=base.fy / divisor,
+            cx=base.cx / divisor, cy=base.cy / divisor,
+        )  # fmt: skip
 
     def photo(self, index: int, divisor: int = 1) -> np.ndarray:
         """Return the photo at a level.

@@ -9,7 +9,7 @@ import os
 import struct
 import subprocess
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,19 +41,14 @@ def is_video_path(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
 
 
-def videos_in(folder: Path) -> list[Path]:
-    """Return the video files directly in a folder, by name."""
-    with os.scandir(folder) as entries:
-        found = [Path(entry.path) for entry in entries if entry.is_file()]
-    return sorted(path for path in found if is_video_path(path))
-
-
 def the_video_in(folder: Path) -> Path | None:
     """Return the only video of a folder, or ``None`` where it has none.
 
     Raises DatasetError: there are several: cameras, lenses and zoom may differ between them.
     """
-    found = videos_in(folder)
+    with os.scandir(folder) as entries:
+        files = [Path(entry.path) for entry in entries if entry.is_file()]
+    found = sorted(path for path in files if is_video_path(path))
     if len(found) > 1:
         raise DatasetError(
             f"{folder.name} holds no photos, but {len(found)} videos: "
@@ -110,8 +105,8 @@ class ProbedVideo:
     height: int
     """As players show it."""
     frames: int
-    """0 where it is not known."""
     duration_s: float
+    """Both 0 where they are not known."""
     codec: str
     is_hdr: bool
     is_interlaced: bool
@@ -181,10 +176,10 @@ def probed(path: Path) -> ProbedVideo:
             )
         facts = video.facts
         width, height = upright_size(first.frame, facts.pixel_ratio)
-        frames = facts.frames or round(facts.duration_s * facts.fps)
         return ProbedVideo(
-            width, height, frames, facts.duration_s, facts.codec, facts.is_hdr, facts.is_interlaced
-        )
+            width, height, facts.expected_frames, facts.duration_s, facts.codec, facts.is_hdr,
+            facts.is_interlaced,
+        )  # fmt: skip
 
 
 # -- Warnings about kinds of videos, the same when one is checked and when it is read -------------
@@ -223,22 +218,17 @@ _INTERLACED = (2, 3, 4, 5)
 
 
 @dataclass(frozen=True)
-class VideoFacts:
-    """What the headers of a video say."""
+class VideoFacts(ProbedVideo):
+    """What the headers of a video say; its size is as stored, before any rotation."""
 
-    width: int
-    height: int
-    """As stored, before any rotation."""
-    frames: int
-    """0 where it is not stated."""
-    duration_s: float
-    """0 where it is not stated."""
     fps: float
-    codec: str
-    is_hdr: bool
-    is_interlaced: bool
     pixel_ratio: float
     """Width over height of a pixel."""
+
+    @property
+    def expected_frames(self) -> int:
+        """Number of frames as stated, else by the length; 0 where neither is known."""
+        return self.frames or round(self.duration_s * self.fps)
 
 
 @dataclass
@@ -250,7 +240,7 @@ class OpenVideo:
     stream: Any
     facts: VideoFacts
     bad_packets: int = 0
-    is_cut: bool = field(default=False)
+    is_cut: bool = False
     """Whether reading ended before the end of the file."""
 
 
@@ -297,27 +287,19 @@ def _facts(container: Any, stream: Any) -> VideoFacts:
         duration_s = float(stream.duration * stream.time_base)
     elif container.duration:
         duration_s = container.duration / 1e6  # FFmpeg's AV_TIME_BASE
-    rate = stream.average_rate or stream.guessed_rate
-    fps = float(rate) if rate else 0.0
-    ratio = stream.sample_aspect_ratio
+    ratio = float(stream.sample_aspect_ratio or 1.0)
     return VideoFacts(
         int(context.width), int(context.height), int(stream.frames or 0), max(duration_s, 0.0),
-        fps, str(context.name), int(context.color_trc or 0) in (PQ, HLG),
-        int(context.field_order) in _INTERLACED, _plausible(float(ratio) if ratio else 1.0),
+        str(context.name), int(context.color_trc or 0) in (PQ, HLG),
+        int(context.field_order) in _INTERLACED,
+        float(stream.average_rate or stream.guessed_rate or 0.0),
+        ratio if 0.25 <= ratio <= 4.0 else 1.0,  # what is stated may be absurd
     )  # fmt: skip
-
-
-def _plausible(pixel_ratio: float) -> float:
-    """Return the shape of a pixel, 1 where what is stated is absurd."""
-    return pixel_ratio if 0.25 <= pixel_ratio <= 4.0 else 1.0
 
 
 def _check_limits(name: str, facts: VideoFacts) -> None:
     width, height = facts.width, facts.height
-    too_large = (
-        max(width, height) > limits.MAX_IMAGE_SIDE_PX or width * height > limits.MAX_IMAGE_PIXELS
-    )
-    if too_large:
+    if max(width, height) > limits.MAX_IMAGE_SIDE_PX or width * height > limits.MAX_IMAGE_PIXELS:
         raise DatasetError(
             f"{name} claims to have {width} x {height} pixels; at most "
             f"{limits.MAX_IMAGE_PIXELS // 10**6} million are read.",
@@ -444,11 +426,9 @@ def _sign(value: int) -> int:
 def _turned(pixels: np.ndarray, matrix: tuple[int, int, int, int]) -> np.ndarray:
     """Apply a matrix of quarter turns and mirrors: (x, y) goes to (a x + c y, b x + d y)."""
     a, b, c, d = matrix
+    across, down = (c, b) if b else (a, d)
     if b:  # x becomes y, and y becomes x
         pixels = pixels.swapaxes(0, 1)
-        across, down = c, b
-    else:
-        across, down = a, d
     if across < 0:
         pixels = pixels[:, ::-1]
     if down < 0:

@@ -26,7 +26,6 @@ from ..progress import Progress, ReportWarning
 from ..worker.helper_process import emit, run_helper
 from .photo_file import write_photo
 from .video import (
-    OpenVideo,
     frames_of,
     grey_of,
     kind_warnings,
@@ -119,9 +118,9 @@ def displacement_px(first: np.ndarray, second: np.ndarray) -> float:
         # A block that lost its track goes no further than a block from the whole.
         flow[0] = flow[0].clip(shift_y - block, shift_y + block)
         flow[1] = flow[1].clip(shift_x - block, shift_x + block)
-    rows_at, columns_at = np.mgrid[:rows, :columns] * block
-    leaves = (rows_at + flow[0] < 0) | (rows_at + flow[0] > height - block)
-    leaves |= (columns_at + flow[1] < 0) | (columns_at + flow[1] > width - block)
+    row_at, column_at = np.mgrid[:rows, :columns] * block + flow
+    leaves = (row_at < 0) | (row_at > height - block)
+    leaves |= (column_at < 0) | (column_at > width - block)
     followed &= ~leaves if (followed & ~leaves).any() else True
     return float(np.percentile(np.hypot(flow[0], flow[1])[followed], _PERCENTILE))
 
@@ -134,8 +133,9 @@ def _whole_shift(first: np.ndarray, second: np.ndarray) -> tuple[int, int]:
     cross = b * a.conj()
     cross /= np.abs(cross) + 1e-3 * (np.abs(cross).max() + 1e-12)
     peak = np.fft.irfft2(cross, s=first.shape)
-    y, x = np.unravel_index(int(np.argmax(peak)), peak.shape)
-    shift = _signed(int(y), first.shape[0]), _signed(int(x), first.shape[1])
+    at = np.unravel_index(int(np.argmax(peak)), peak.shape)
+    y, x = (int(k) - n if k > n // 2 else int(k) for k, n in zip(at, first.shape, strict=True))
+    shift = y, x
     # A peak of chance would send all blocks astray.
     return shift if _misfit(first, second, shift) < _misfit(first, second, (0, 0)) else (0, 0)
 
@@ -147,10 +147,6 @@ def _misfit(first: np.ndarray, second: np.ndarray, shift: tuple[int, int]) -> fl
     moved = second[max(y, 0) : height + min(y, 0), max(x, 0) : width + min(x, 0)]
     base = first[max(-y, 0) : height - max(y, 0), max(-x, 0) : width - max(x, 0)]
     return float(np.abs(moved - base).mean())
-
-
-def _signed(value: int, size: int) -> int:
-    return value - size if value > size // 2 else value
 
 
 def _block_sums(values: np.ndarray, cut: Sequence[slice], block: int) -> np.ndarray:
@@ -211,8 +207,7 @@ def relative_sharpness(details: np.ndarray, times_s: np.ndarray, ways: np.ndarra
     first = np.maximum(first, np.searchsorted(ways, ways - _LOCAL_MOTION))
     last = np.minimum(last, np.searchsorted(ways, ways + _LOCAL_MOTION, side="right"))
     for i in range(len(fine)):
-        around = fine[first[i] : last[i]]
-        reference = np.percentile(around, _REFERENCE_PERCENTILE, axis=0)
+        reference = np.percentile(fine[first[i] : last[i]], _REFERENCE_PERCENTILE, axis=0)
         relative[i] = (fine[i] - reference).min()
     return relative
 
@@ -302,7 +297,8 @@ def choose_frames(measures: FrameMeasures, *, frames: int = 0, fps: float = 0.0)
         place = (times_s - times_s[0]) * fps
     else:
         total = float(ways[-1])
-        count = frames or automatic_count(total)
+        by_motion = np.clip(round(total / MOTION_STEP), FEWEST_FRAMES, MOST_FRAMES)
+        count = frames or int(by_motion)
         place = ways / total * count if total > 0.0 else np.zeros(len(ways))
         place = np.minimum(place, np.nextafter(count, 0.0))
     stretch = np.floor(place).astype(np.int64)
@@ -322,18 +318,12 @@ def choose_frames(measures: FrameMeasures, *, frames: int = 0, fps: float = 0.0)
                 chosen[-1] = pick
             continue
         chosen.append(pick)
-    positions = np.array(chosen, np.int64)
-    gaps = [
+    gaps = tuple(
         (float(times_s[before]), float(times_s[after]))
         for before, after in itertools.pairwise(chosen)
         if ways[after] - ways[before] > _FAR and any(before < i < after for i in empty)
-    ]
-    return Choice(positions, int(blurred.sum()), int(still.sum()), tuple(gaps))
-
-
-def automatic_count(way: float) -> int:
-    """Return the number of frames for a way of the picture, in its long sides."""
-    return int(np.clip(round(way / MOTION_STEP), FEWEST_FRAMES, MOST_FRAMES))
+    )
+    return Choice(np.array(chosen, np.int64), int(blurred.sum()), int(still.sum()), gaps)
 
 
 def _show_the_same(ways: np.ndarray, blurred: np.ndarray) -> np.ndarray:
@@ -384,16 +374,13 @@ def _run(folder: Path) -> None:
             f"All {choice.blurred} frames of {path.name} are blurred.",
             "Film again, more slowly and in more light.",
         )
-    written, facts = _write(path, folder / FRAMES_FOLDER, measures, choice, task["threads"])
+    written, size_px = _write(path, folder / FRAMES_FOLDER, measures, choice, task["threads"])
     first["damaged"] += len(choice.positions) - len(written)
-    write_json(
-        folder / CHOSEN_NAME,
-        {
-            **first, **facts, "frames": written,
-            "read": len(measures.indices), "blurred": choice.blurred, "still": choice.still,
-            "gaps_s": [list(gap) for gap in choice.gaps_s],
-        },
-    )  # fmt: skip
+    chosen = {
+        **first, "size_px": size_px, "frames": written, "read": len(measures.indices),
+        "blurred": choice.blurred, "still": choice.still, "gaps_s": choice.gaps_s,
+    }  # fmt: skip
+    write_json(folder / CHOSEN_NAME, chosen)
 
 
 def _check_rate(path: Path, measures: FrameMeasures, task: dict[str, Any]) -> None:
@@ -417,14 +404,13 @@ def _measure(path: Path, threads: int) -> tuple[FrameMeasures, dict[str, Any]]:
     found: list[np.ndarray] = []
     meter, ticker = MotionMeter(), _Ticker(0.0, _MEASURED, "looking at frame")
     with open_video(path, threads) as video:
-        expected = _expected(video)
         for decoded in frames_of(video):
             grey = grey_of(decoded.frame, SHARPNESS_SIDE_PX)
             indices.append(decoded.index)
             times_s.append(decoded.time_s)
             ways.append(meter.add(_small(grey)))
             found.append(details(grey))
-            ticker.tick(len(indices), expected)
+            ticker.tick(len(indices), video.facts.expected_frames)
         if not indices:
             raise DatasetError(
                 f"No frame of {path.name} can be decoded: the file is cut or damaged.",
@@ -443,10 +429,10 @@ def _measure(path: Path, threads: int) -> tuple[FrameMeasures, dict[str, Any]]:
 
 def _write(
     path: Path, folder: Path, measures: FrameMeasures, choice: Choice, threads: int
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Decode again and write the chosen frames; return their entries, and facts."""
+) -> tuple[list[dict[str, Any]], list[int]]:
+    """Decode again and write the chosen frames; return their entries and their size."""
     folder.mkdir()
-    wanted = {int(measures.indices[p]): float(measures.times_s[p]) for p in choice.positions}
+    wanted = set(measures.indices[choice.positions].tolist())
     written: list[dict[str, Any]] = []
     ticker = _Ticker(_MEASURED, 1.0, "writing frames, at frame")
     last = max(wanted)
@@ -466,7 +452,7 @@ def _write(
         raise DatasetError(
             f"{path.name} has changed while it was read.", "Start again once it is complete."
         )
-    return written, {"size_px": size}
+    return written, size
 
 
 def _small(grey: np.ndarray) -> np.ndarray:
@@ -477,11 +463,6 @@ def _small(grey: np.ndarray) -> np.ndarray:
     height, width = (side // factor for side in grey.shape)
     cut = grey[: height * factor, : width * factor]
     return cut.reshape(height, factor, width, factor).mean((1, 3))
-
-
-def _expected(video: OpenVideo) -> int:
-    facts = video.facts
-    return facts.frames or round(facts.duration_s * facts.fps)
 
 
 class _Ticker:
@@ -574,14 +555,10 @@ def extract_frames(
             "Film again: walk around the object, slowly and in enough light.",
         )
     facts = {
-        "kind": "video",
-        "photos_in_order": "frames of a video",
-        "video_frames_read": chosen["read"],
-        "video_frames_blurred": chosen["blurred"],
-        "video_frames_still": chosen["still"],
-        "video_frames_damaged": chosen["damaged"],
+        "kind": "video", "photos_in_order": "frames of a video",
+        **{f"video_frames_{k}": chosen[k] for k in ("read", "blurred", "still", "damaged")},
         "video_frames_kept": len(names),
-    }
+    }  # fmt: skip
     return VideoFrames(target, names, facts, tuple(_warnings(video, chosen)))
 
 

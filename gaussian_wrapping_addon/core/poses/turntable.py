@@ -14,7 +14,7 @@ from scipy.ndimage import maximum_filter
 
 from ..compiled import kernel
 from ..parallel import even_bounds, run_chunks
-from ..photos.photo_file import read_photo
+from ..photos.photo_file import large_parts, read_photo
 from ..readers.lenses import import_pycolmap
 from .checks import MIN_GROUP, pair_motion, standing_groups
 
@@ -173,12 +173,7 @@ def whole_parts(differs: np.ndarray) -> np.ndarray:
     # Pad, so that what the border cuts is closed like the rest.
     padded = np.pad(ndimage.binary_opening(differs, np.ones((2, 2))), radius, mode="edge")
     closed = ndimage.binary_closing(padded, disc)[radius:-radius, radius:-radius]
-    label, parts = ndimage.label(closed)
-    if parts == 0:
-        return np.asarray(closed)
-    areas = np.bincount(label.ravel())
-    areas[0] = 0
-    return (areas >= SMALLEST_SHARE * areas.max())[label] & closed
+    return large_parts(np.asarray(closed), SMALLEST_SHARE)
 
 
 def without_holes(mask: np.ndarray, often: np.ndarray) -> np.ndarray:
@@ -314,24 +309,20 @@ def drop_still_features(database: Path, masks: Mapping[str, np.ndarray]) -> None
     """Remove the features outside of the masks, and all matches, which number features."""
     pycolmap = import_pycolmap()
     with pycolmap.Database.open(database) as db:
-        features = {
-            image.name: (
-                image.image_id, db.read_keypoints(image.image_id),
-                db.read_descriptors(image.image_id),
-            )
+        features = [
+            (image, db.read_keypoints(image.image_id), db.read_descriptors(image.image_id))
             for image in db.read_all_images()
-        }  # fmt: skip
-        for clear in (
-            db.clear_two_view_geometries, db.clear_matches, db.clear_descriptors,
-            db.clear_keypoints,
-        ):  # fmt: skip
-            clear()
-        for name, (image_id, keypoints, descriptors) in features.items():
-            if name in masks:
-                kept = _inside(keypoints, _grown(masks[name]))
+        ]
+        db.clear_two_view_geometries()
+        db.clear_matches()
+        db.clear_descriptors()
+        db.clear_keypoints()
+        for image, keypoints, descriptors in features:
+            if image.name in masks:
+                kept = _inside(keypoints, _grown(masks[image.name]))
                 keypoints, descriptors.data = keypoints[kept], descriptors.data[kept]
-            db.write_keypoints(image_id, keypoints)
-            db.write_descriptors(image_id, descriptors)
+            db.write_keypoints(image.image_id, keypoints)
+            db.write_descriptors(image.image_id, descriptors)
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:
