@@ -184,7 +184,7 @@ def _combined(
     for part in (control, gps, markers):
         details |= {} if part is None else part.details
     scales = {
-        CONTROL_POINTS: control and (control.metric_from_world.scale, control.fit.scale_error),
+        CONTROL_POINTS: control and (control.fit.target_from_source.scale, control.fit.scale_error),
         GPS: gps and (gps.enu_from_world.scale, gps.scale_error),
         MARKERS: markers and (markers.metres_per_unit, markers.error),
     }
@@ -192,7 +192,7 @@ def _combined(
     _warn_of_contradictions(known, warnings)
     sources = tuple(known)
     if control is not None:
-        placed, error = control.metric_from_world, control.fit.scale_error
+        placed, error = control.fit.target_from_source, control.fit.scale_error
         return RealUnits(sources, placed, True, True, error, control.origin, details)
     if gps is not None and (own_frame or markers is None):
         error = gps.scale_error

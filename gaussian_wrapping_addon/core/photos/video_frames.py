@@ -297,8 +297,7 @@ def choose_frames(measures: FrameMeasures, *, frames: int = 0, fps: float = 0.0)
         place = (times_s - times_s[0]) * fps
     else:
         total = float(ways[-1])
-        by_motion = np.clip(round(total / MOTION_STEP), FEWEST_FRAMES, MOST_FRAMES)
-        count = frames or int(by_motion)
+        count = frames or automatic_count(total)
         place = ways / total * count if total > 0.0 else np.zeros(len(ways))
         place = np.minimum(place, np.nextafter(count, 0.0))
     stretch = np.floor(place).astype(np.int64)
@@ -324,6 +323,11 @@ def choose_frames(measures: FrameMeasures, *, frames: int = 0, fps: float = 0.0)
         if ways[after] - ways[before] > _FAR and any(before < i < after for i in empty)
     )
     return Choice(np.array(chosen, np.int64), int(blurred.sum()), int(still.sum()), gaps)
+
+
+def automatic_count(way: float) -> int:
+    """Return the number of frames for a way of the picture, in its long sides."""
+    return int(np.clip(round(way / MOTION_STEP), FEWEST_FRAMES, MOST_FRAMES))
 
 
 def _show_the_same(ways: np.ndarray, blurred: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DatasetError, ParseError
-from ..scene.camera import Camera, Similarity
+from ..scene.camera import Camera
 from ..scene.placement import umeyama
 from .georeference import (
     GeoPoint,
@@ -24,6 +24,7 @@ from .georeference import (
     refined_similarity,
     robust_similarity,
     rounded,
+    utm_epsg,
 )
 
 # -- Triangulate a point that several posed photos show, some of them perhaps wrongly -------------
@@ -171,17 +172,12 @@ class CoordinateSystem:
     """0: not UTM."""
     north: bool = True
 
-    @property
-    def is_local(self) -> bool:
-        """Whether coordinates are metres in a frame of their own, z up."""
-        return self.name == LOCAL
-
     def to_metric(self, places: np.ndarray) -> tuple[np.ndarray, GeoPoint | None]:
         """Return (n, 3) metric coordinates and the place of their origin, None if local.
 
         Geographic and UTM coordinates become metres east, north and up of the median place.
         """
-        if self.is_local:
+        if self.name == LOCAL:
             return places, None
         if self.utm_zone:
             geographic = geographic_from_utm(places, self.utm_zone, self.north)
@@ -271,7 +267,7 @@ def _system(text: str, path: Path, line: int) -> CoordinateSystem:
         if code in (4326, 4979):
             return CoordinateSystem(f"EPSG:{code}")
         if 1 <= code % 100 <= 60 and code // 100 in (326, 327):
-            return CoordinateSystem(f"EPSG:{code}", code % 100, code // 100 == 326)
+            return _utm(code % 100, code // 100 == 326)
         raise ParseError(path, f"line {line}", f"EPSG:{code} is not known here.", _HINT)
     if words.startswith("+proj="):
         if re.match(r"\+proj=(longlat|latlong|lonlat)\b", words):
@@ -286,7 +282,7 @@ def _system(text: str, path: Path, line: int) -> CoordinateSystem:
 
 
 def _utm(zone: int, north: bool) -> CoordinateSystem:
-    return CoordinateSystem(f"EPSG:{(32600 if north else 32700) + zone}", zone, north)
+    return CoordinateSystem(f"EPSG:{utm_epsg(zone, north)}", zone, north)
 
 
 def _observation(
@@ -319,21 +315,14 @@ def _point(
     photos: dict[str, int] = {}
     for place, photo, _, line in entries:
         if np.abs(place - first).max() > SAME_PLACE * max(1.0, float(np.abs(first).max())):
-            raise ParseError(
-                path, f"line {line}", f"{name} has other coordinates than in line {entries[0][3]}."
-            )
+            text = f"{name} has other coordinates than in line {entries[0][3]}."
+            raise ParseError(path, f"line {line}", text)
         if photo in photos:
-            raise ParseError(
-                path, f"line {line}", f"{name} is in {photo} already, in line {photos[photo]}."
-            )
+            text = f"{name} is in {photo} already, in line {photos[photo]}."
+            raise ParseError(path, f"line {line}", text)
         photos[photo] = line
-    return ControlPoint(
-        name,
-        first,
-        tuple(photos),
-        np.array([pixel for _, _, pixel, _ in entries]),
-        tuple(photos.values()),
-    )
+    pixels = np.array([pixel for _, _, pixel, _ in entries])
+    return ControlPoint(name, first, tuple(photos), pixels, tuple(photos.values()))
 
 
 # -- Similarity from the cameras' frame to control points: triangulate, fit, name what is wrong
@@ -357,10 +346,10 @@ MAX_TILT_DEG = 5.0
 class ControlFit:
     """Cameras fitted to control points."""
 
-    metric_from_world: Similarity
     origin: GeoPoint | None
     """None: the points' coordinates are local."""
     fit: RobustFit
+    """Whose target is the metric frame."""
     details: dict[str, Any]
 
 
@@ -404,11 +393,9 @@ def fit_control_points(
     names, known, found, errors_px, skipped = [], [], [], [], []
     for point in seen:
         place = triangulate(
-            [cameras[i] for i in point.cameras],
-            point.pixels,
-            threshold_px=PIXEL_THRESHOLD_PX,
+            [cameras[i] for i in point.cameras], point.pixels, threshold_px=PIXEL_THRESHOLD_PX,
             noise_px=PIXEL_NOISE_PX,
-        )
+        )  # fmt: skip
         if place is None:
             skipped.append(point.name)
             continue
@@ -440,25 +427,18 @@ def fit_control_points(
             f"{fit.tilt_error_deg:.2g} degrees.",
             "Add a point well to the side.",
         )
+    told = zip(names, fit.residuals.tolist(), errors_px, fit.used.tolist(), strict=True)
     points = [
-        {
-            "name": name,
-            "residual_m": rounded(float(fit.residuals[i])),
-            "error_px": rounded(errors_px[i]),
-            "used": bool(fit.used[i]),
-        }
-        for i, name in enumerate(names)
+        {"name": n, "residual_m": rounded(apart), "error_px": rounded(error_px), "used": used}
+        for n, apart, error_px, used in told
     ]
     details = {
         "control_points": {
-            "system": content.system.name,
-            "used": int(fit.used.sum()),
+            "system": content.system.name, "used": int(fit.used.sum()),
             "left_out": [n for n, good in zip(names, fit.used, strict=True) if not good],
-            "not_seen": skipped,
-            "median_m": rounded(fit.median),
+            "not_seen": skipped, "median_m": rounded(float(np.median(fit.residuals))),
             "max_m": rounded(float(fit.residuals.max())),
-            "tilt_error_deg": rounded(fit.tilt_error_deg),
-            "points": points,
+            "tilt_error_deg": rounded(fit.tilt_error_deg), "points": points,
         }
-    }
-    return ControlFit(fit.target_from_source, origin, fit, details)
+    }  # fmt: skip
+    return ControlFit(origin, fit, details)

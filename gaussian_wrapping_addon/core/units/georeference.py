@@ -43,14 +43,6 @@ class GeoPoint:
     longitude_deg: float
     altitude_m: float
 
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
-        return {
-            "latitude_deg": self.latitude_deg,
-            "longitude_deg": self.longitude_deg,
-            "altitude_m": self.altitude_m,
-        }
-
 
 def ecef_from_geographic(places: np.ndarray) -> np.ndarray:
     """Return earth-centred, earth-fixed coordinates.
@@ -63,14 +55,8 @@ def ecef_from_geographic(places: np.ndarray) -> np.ndarray:
     height = places[:, 2]
     normal = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_2 * np.sin(latitude) ** 2)
     across = (normal + height) * np.cos(latitude)
-    return np.stack(
-        [
-            across * np.cos(longitude),
-            across * np.sin(longitude),
-            (normal * (1.0 - ECCENTRICITY_2) + height) * np.sin(latitude),
-        ],
-        1,
-    )
+    x, y = across * np.cos(longitude), across * np.sin(longitude)
+    return np.stack([x, y, (normal * (1.0 - ECCENTRICITY_2) + height) * np.sin(latitude)], 1)
 
 
 def geographic_from_ecef(points: np.ndarray) -> np.ndarray:
@@ -96,20 +82,20 @@ def geographic_from_ecef(points: np.ndarray) -> np.ndarray:
 def enu_axes(origin: GeoPoint) -> np.ndarray:
     """Return the (3, 3) rotation whose rows are east, north and up at a place, in ECEF axes."""
     latitude, longitude = math.radians(origin.latitude_deg), math.radians(origin.longitude_deg)
-    sl, cl, so, co = (
-        math.sin(latitude), math.cos(latitude), math.sin(longitude), math.cos(longitude),
-    )  # fmt: skip
+    sl, cl, so, co = (f(angle) for angle in (latitude, longitude) for f in (math.sin, math.cos))
     return np.array([[-so, co, 0.0], [-sl * co, -sl * so, cl], [cl * co, cl * so, sl]])
 
 
 def enu_from_geographic(places: np.ndarray, origin: GeoPoint) -> np.ndarray:
     """Return (n, 3) metres east, north and up of ``origin`` of (n, 3) geographic places."""
-    return (ecef_from_geographic(places) - _ecef(origin)) @ enu_axes(origin).T
+    shift = ecef_from_geographic(places) - ecef_from_geographic(_row(origin))
+    return shift @ enu_axes(origin).T
 
 
 def geographic_from_enu(points: np.ndarray, origin: GeoPoint) -> np.ndarray:
     """Return (n, 3) latitude, longitude (degrees) and height of (n, 3) points about ``origin``."""
-    return geographic_from_ecef(np.asarray(points, np.float64) @ enu_axes(origin) + _ecef(origin))
+    points = np.asarray(points, np.float64) @ enu_axes(origin)
+    return geographic_from_ecef(points + ecef_from_geographic(_row(origin)))
 
 
 def utm_zone(latitude_deg: float, longitude_deg: float) -> int | None:
@@ -147,14 +133,9 @@ def utm_from_geographic(places: np.ndarray, zone: int, north: bool) -> np.ndarra
     for j, a in enumerate(alpha, 1):
         northing += a * np.sin(2 * j * xi) * np.cosh(2 * j * eta)
         easting += a * np.cos(2 * j * xi) * np.sinh(2 * j * eta)
-    return np.stack(
-        [
-            UTM_FALSE_EASTING_M + UTM_SCALE * radius * easting,
-            UTM_SCALE * radius * northing + (0.0 if north else UTM_FALSE_NORTHING_M),
-            places[:, 2],
-        ],
-        1,
-    )
+    easting = UTM_FALSE_EASTING_M + UTM_SCALE * radius * easting
+    northing = UTM_SCALE * radius * northing + (0.0 if north else UTM_FALSE_NORTHING_M)
+    return np.stack([easting, northing, places[:, 2]], 1)
 
 
 def geographic_from_utm(points: np.ndarray, zone: int, north: bool) -> np.ndarray:
@@ -184,19 +165,15 @@ def utm_of(origin: GeoPoint) -> dict[str, Any] | None:
     if zone is None:
         return None
     north = origin.latitude_deg >= 0.0
-    place = [[origin.latitude_deg, origin.longitude_deg, origin.altitude_m]]
-    easting, northing, _ = utm_from_geographic(np.array(place), zone, north)[0]
+    easting, northing, _ = utm_from_geographic(_row(origin), zone, north)[0]
     return {
-        "zone": f"{zone}{'N' if north else 'S'}",
-        "epsg": utm_epsg(zone, north),
-        "easting_m": float(easting),
-        "northing_m": float(northing),
-    }
+        "zone": f"{zone}{'N' if north else 'S'}", "epsg": utm_epsg(zone, north),
+        "easting_m": float(easting), "northing_m": float(northing),
+    }  # fmt: skip
 
 
-def _ecef(origin: GeoPoint) -> np.ndarray:
-    place = [[origin.latitude_deg, origin.longitude_deg, origin.altitude_m]]
-    return ecef_from_geographic(np.array(place))[0]
+def _row(place: GeoPoint) -> np.ndarray:
+    return np.array([[place.latitude_deg, place.longitude_deg, place.altitude_m]])
 
 
 def _meridian_deg(zone: int) -> float:
@@ -262,11 +239,6 @@ class RobustFit:
     lever: float
     """The same from the line through them that they lie closest to."""
 
-    @property
-    def median(self) -> float:
-        """Median residual of all pairs, units of the target."""
-        return float(np.median(self.residuals))
-
 
 def robust_similarity(
     source: np.ndarray, target: np.ndarray, *, largest_error: float, noise: float
@@ -310,17 +282,16 @@ def refined_similarity(
 
     Parameters as of :func:`robust_similarity`; ``used`` (n,) bool is where to begin.
     """
-    for _ in range(_FIT_ROUNDS):
+    for round_ in range(_FIT_ROUNDS + 1):
         fit = fit_similarity(source[used], target[used], True)
         residuals = np.linalg.norm(fit.points(source) - target, axis=1)
-        sigma = _sigma(residuals[used], noise)
+        # Of one coordinate.
+        freedom = max(3 * int(used.sum()) - _PARAMETERS, 1)
+        sigma = max(math.sqrt(float((residuals[used] ** 2).sum()) / freedom), noise)
         within = residuals <= INLIER_SIGMAS * math.sqrt(3.0) * sigma
-        if (within == used).all() or within.sum() < 3:
+        if (within == used).all() or within.sum() < 3 or round_ == _FIT_ROUNDS:
             break
         used = within
-    fit = fit_similarity(source[used], target[used], True)
-    residuals = np.linalg.norm(fit.points(source) - target, axis=1)
-    sigma = _sigma(residuals[used], noise)
     local = fit.points(source[used])
     local = local - local.mean(0)
     extents = np.linalg.eigvalsh(local.T @ local)  # ascending
@@ -331,12 +302,6 @@ def refined_similarity(
     tilt = math.degrees(sigma / lever) if lever > 0.0 else math.inf
     root = math.sqrt(len(local))
     return RobustFit(fit, used, residuals, sigma, sigma / reach, tilt, reach / root, lever / root)
-
-
-def _sigma(residuals: np.ndarray, noise: float) -> float:
-    """Return the standard deviation of one coordinate, from (n,) distances."""
-    freedom = max(3 * len(residuals) - _PARAMETERS, 1)
-    return max(math.sqrt(float((residuals**2).sum()) / freedom), noise)
 
 
 # -- The record of how a scene got its metres, as it goes with results and exports ----------------
@@ -385,20 +350,15 @@ class RealUnits:
         elif self.z_up:
             frame = "local coordinates of the control points"
         return {
-            "version": VERSION,
-            "sources": list(self.sources),
-            "unit": "metre",
-            "frame": frame,
-            "z_up": self.z_up,
-            "applied": self.applied,
-            "origin": None if self.origin is None else self.origin.to_json(),
+            "version": VERSION, "sources": list(self.sources), "unit": "metre", "frame": frame,
+            "z_up": self.z_up, "applied": self.applied,
+            "origin": None if self.origin is None else dataclasses.asdict(self.origin),
             "crs": None if self.origin is None else GEOGRAPHIC_CRS,
             "utm": None if self.origin is None else utm_of(self.origin),
             "metric_from_world": (world if self.applied else metric).to_json(),
             "world_from_input": (metric if self.applied else world).to_json(),
-            "scale_error": self.scale_error,
-            **self.details,
-        }
+            "scale_error": self.scale_error, **self.details,
+        }  # fmt: skip
 
 
 def metric_from_world(record: Any) -> Similarity | None:
@@ -441,9 +401,9 @@ def listed(names: list[str]) -> list[str]:
     return sorted(names)[:MOST_LISTED]
 
 
-def rounded(value: float, digits: int = 4) -> float | None:
-    """Return a measured number with few significant digits, None where it is not finite."""
-    return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+def rounded(value: float) -> float | None:
+    """Return a measured number with four significant digits, None where it is not finite."""
+    return float(f"{value:.4g}") if math.isfinite(value) else None
 
 
 # -- Place solved cameras on the earth by the GPS positions of their photos -----------------------
@@ -542,20 +502,16 @@ def georeference(
     far = np.linalg.norm(enu, axis=1) > MAX_EXTENT_M
     kept = [c for c, out in zip(used, far, strict=True) if not out]
     if len(kept) < MIN_POSITIONS:
-        raise DatasetError(
-            "The GPS positions are spread over more than 50 km.", "Remove photos of other places."
-        )
+        text = "The GPS positions are spread over more than 50 km."
+        raise DatasetError(text, "Remove photos of other places.")
     centers, target = np.array([c.center for c in kept]), enu[~far]
     largest = max([LARGEST_ERROR_M, *(3.0 * p.error_m for p in gps if p.error_m is not None)])
     fit = robust_similarity(
         centers, target, largest_error=min(largest, 4 * LARGEST_ERROR_M), noise=GPS_NOISE_M
     )
-    missing = _doubt(fit, needs)
-    if missing:
-        raise DatasetError(
-            missing,
-            "Take photos from places further apart, not all on one line; or measure a distance.",
-        )
+    if missing := _doubt(fit, needs):
+        hint = "Take photos from places further apart, not all on one line; or measure a distance."
+        raise DatasetError(missing, hint)
     wrong = [c.name for c, good in zip(kept, fit.used, strict=True) if not good]
     wrong += [c.name for c, out in zip(used, far, strict=True) if out]
     dops = [p.dop for p in gps if p.dop is not None]
@@ -563,17 +519,15 @@ def georeference(
     levels = {p.altitude_reference for p in gps}
     details = {
         "gps": {
-            "photos": len(cameras),
-            "photos_with_position": len(used),
-            "used": int(fit.used.sum()),
-            "left_out": listed(wrong),
+            "photos": len(cameras), "photos_with_position": len(used),
+            "used": int(fit.used.sum()), "left_out": listed(wrong),
             **_residuals(fit.target_from_source, centers, target, fit.used),
             "tilt_error_deg": rounded(fit.tilt_error_deg),
             "altitude_reference": levels.pop() if len(levels) == 1 else "mixed",
             "dop_median": rounded(float(np.median(dops))) if dops else None,
             "stated_error_median_m": rounded(float(np.median(errors))) if errors else None,
         }
-    }
+    }  # fmt: skip
     return Georeference(
         origin, fit.target_from_source, fit.scale_error, centers, target, fit.used, details,
         _doubt(fit, GOOD),
@@ -596,9 +550,8 @@ def _origin(places: np.ndarray) -> GeoPoint:
     first = places[0, 1]
     longitude = first + np.median((places[:, 1] - first + 180.0) % 360.0 - 180.0)
     longitude = (longitude + 180.0) % 360.0 - 180.0
-    return GeoPoint(
-        float(np.median(places[:, 0])), float(longitude), float(np.median(places[:, 2]))
-    )
+    latitude, altitude = np.median(places[:, 0]), np.median(places[:, 2])
+    return GeoPoint(float(latitude), float(longitude), float(altitude))
 
 
 def _doubt(fit: RobustFit, needs: Needs) -> str:

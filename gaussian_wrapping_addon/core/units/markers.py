@@ -171,7 +171,9 @@ def main(folder: Path) -> None:
     found: list[list[dict[str, Any]]] = []
     photos = task["photos"]
     for i, path in enumerate(photos):
-        grey = _grey(read_photo(Path(path)).color)
+        red, green, blue = np.moveaxis(read_photo(Path(path)).color.astype(np.uint16), 2, 0)
+        luma = (77 * red + 150 * green + 29 * blue) >> 8
+        grey = np.ascontiguousarray(luma.astype(np.uint8))
         corners, numbers, _ = detector.detectMarkers(grey)
         found.append(_markers(grey, corners, numbers, modules))
         emit(fraction=(i + 1) / len(photos), message=f"markers of photo {i + 1} of {len(photos)}")
@@ -184,26 +186,14 @@ def _number(cv2: Any, name: str) -> int:
     return next(getattr(cv2.aruco, n) for n in dir(cv2.aruco) if n.lower() == wanted)
 
 
-def _grey(color: np.ndarray) -> np.ndarray:
-    """Return (h, w) uint8 luma of (h, w, 3) uint8."""
-    red, green, blue = (color[..., k].astype(np.uint16) for k in range(3))
-    return np.ascontiguousarray(((77 * red + 150 * green + 29 * blue) >> 8).astype(np.uint8))
-
-
 def _markers(grey: np.ndarray, corners: Any, numbers: Any, modules: int) -> list[dict[str, Any]]:
     out = []
     for number, quad in zip(np.ravel(numbers if numbers is not None else []), corners, strict=True):
         # OpenCV's first pixel has its centre at (0, 0).
         rough = np.asarray(quad, np.float64).reshape(4, 2) + 0.5
         exact = refined_corners(grey, rough, modules)
-        refined = exact is not None
-        out.append(
-            {
-                "number": int(number),
-                "corners_px": (exact if exact is not None else rough).tolist(),
-                "refined": refined,
-            }
-        )
+        corners_px = (rough if exact is None else exact).tolist()
+        out.append({"number": int(number), "corners_px": corners_px, "refined": exact is not None})
     return out[:MAX_MARKERS_A_PHOTO]
 
 
@@ -258,10 +248,9 @@ def find_markers(
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     task = {
-        "dictionary": spec.dictionary,
-        "threads": max(threads, 1),
+        "dictionary": spec.dictionary, "threads": max(threads, 1),
         "photos": [str(path) for path in photos],
-    }
+    }  # fmt: skip
     try:
         write_json(folder / TASK, task)
         run_helper(_HELPER, folder, progress)
@@ -296,22 +285,15 @@ def scale_from_markers(
     )
     if not seen:
         raise DatasetError(f"No {spec.dictionary} marker was found in the photos.", hint)
-    sizes, errors, numbers, bad = [], [], [], []
-    observations = 0
-    for number, views in sorted(seen.items()):
-        size = _measured_side(cameras, views)
-        if size is None:
-            bad.append(number)
-            continue
-        sizes.append(size[0])
-        errors.append(size[1])
-        numbers.append(number)
-        observations += size[2]
-    if not sizes:
+    sizes = {n: _measured_side(cameras, views) for n, views in sorted(seen.items())}
+    bad = [n for n, size in sizes.items() if size is None]
+    known = {n: size for n, size in sizes.items() if size is not None}
+    if not known:
         raise DatasetError(
             f"{len(seen)} markers were found, but no two photos agree about one of them.", hint
         )
-    side, error = np.array(sizes), np.array(errors)
+    observations = sum(size[2] for size in known.values())
+    side, error = (np.array([size[k] for size in known.values()]) for k in (0, 1))
     middle = float(np.median(side))
     apart = np.abs(side / middle - 1.0)
     good = apart <= np.maximum(MAX_SIZE_ERROR, 3.0 * error / middle)
@@ -320,7 +302,7 @@ def scale_from_markers(
             f"The markers differ in size by {100 * float(np.ptp(side)) / middle:.2g} %.",
             "Print all of them in the same size.",
         )
-    other = [n for n, ok in zip(numbers, good, strict=True) if not ok]
+    other = [n for n, ok in zip(known, good, strict=True) if not ok]
     weights = 1.0 / error[good] ** 2
     # Least squares of known = scale * measured.
     scale = spec.side_m * float((weights * side[good]).sum() / (weights * side[good] ** 2).sum())
@@ -334,17 +316,14 @@ def scale_from_markers(
     relative = max(formal, scatter)
     details = {
         "markers": {
-            "dictionary": spec.dictionary,
-            "side_m": spec.side_m,
-            "found": len(seen),
-            "used": count,
-            "observations": observations,
+            "dictionary": spec.dictionary, "side_m": spec.side_m, "found": len(seen),
+            "used": count, "observations": observations,
             "not_measured": [str(n) for n in bad][:50],
             "left_out": listed([str(n) for n in other]),
             "scale_error": rounded(relative),
             "largest_deviation": rounded(float(np.abs(ratios - 1.0).max())),
         }
-    }
+    }  # fmt: skip
     return MarkerScale(scale, relative, details)
 
 
