@@ -23,13 +23,11 @@ def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray | None:
         return None
     q = q / largest  # the squares of a huge quaternion would overflow
     w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
 
 
 def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
@@ -39,14 +37,12 @@ def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
     precision near half turns.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
-    matrix = np.array(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ]
-    )
+    matrix = np.array([
+        [a + e + i, h - f, c - g, d - b],
+        [h - f, a - e - i, b + d, c + g],
+        [c - g, b + d, e - a - i, f + h],
+        [d - b, c + g, f + h, i - a - e],
+    ])  # fmt: skip
     quaternion = np.linalg.eigh(matrix)[1][:, -1]
     return quaternion if quaternion[0] >= 0 else -quaternion
 
@@ -194,10 +190,8 @@ class Camera:
         local = self.to_camera(points)
         depth = local[:, 2]
         safe = np.where(np.abs(depth) > 1e-300, depth, 1e-300)
-        pixels = np.stack(
-            [self.fx * local[:, 0] / safe + self.cx, self.fy * local[:, 1] / safe + self.cy], 1
-        )
-        return pixels, depth
+        x, y = self.fx * local[:, 0] / safe + self.cx, self.fy * local[:, 1] / safe + self.cy
+        return np.stack([x, y], 1), depth
 
     def shown(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Look (n, 3) world points up in the image.
@@ -216,8 +210,7 @@ class Camera:
         u = (np.arange(self.width) + 0.5 - self.cx) / self.fx
         v = (np.arange(self.height) + 0.5 - self.cy) / self.fy
         out = np.ones((self.height, self.width, 3))
-        out[..., 0] = u[None, :]
-        out[..., 1] = v[:, None]
+        out[..., 0], out[..., 1] = u[None, :], v[:, None]
         return out
 
     def rays_at(self, pixels: np.ndarray) -> np.ndarray:

@@ -129,27 +129,20 @@ def find_scene_frame(
         keep = near_cameras(centers)
         vast = bool(keep.any()) and np.abs(centers[keep]).max() > MAX_COORDINATE
     if vast:
-        raise DatasetError(
-            f"The cameras lie farther than {MAX_COORDINATE:g} units from the origin.",
-            "Solve the cameras again.",
-        )
+        text = f"The cameras lie farther than {MAX_COORDINATE:g} units from the origin."
+        raise DatasetError(text, "Solve the cameras again.")
     if int(keep.sum()) < MIN_IMAGES:
-        raise DatasetError(
-            f"Only {int(keep.sum())} cameras are near each other; {MIN_IMAGES} are needed.",
-            "Solve the cameras again.",
-        )
+        text = f"Only {int(keep.sum())} cameras are near each other; {MIN_IMAGES} are needed."
+        raise DatasetError(text, "Solve the cameras again.")
     kept = centers[keep]
     middle = np.median(kept, axis=0)
     offsets = kept - middle  # subtract first: coordinates may be huge
     mean = middle + offsets.mean(0)
     offsets = kept - mean
     reach = float(np.linalg.norm(offsets, axis=1).max())
-    size = float(np.abs(centers[keep]).max())
-    if reach <= _COINCIDENT * max(size, 1e-300):
-        raise DatasetError(
-            "All photos were taken from one place, so that no depth can be measured.",
-            "Walk around the object while taking photos.",
-        )
+    if reach <= _COINCIDENT * max(float(np.abs(kept).max()), 1e-300):
+        text = "All photos were taken from one place, so that no depth can be measured."
+        raise DatasetError(text, "Walk around the object while taking photos.")
     if z_up:
         up, rule = np.array([0.0, 0.0, 1.0]), KNOWN_UP
     else:
@@ -158,12 +151,9 @@ def find_scene_frame(
     first = rotations[keep][0]
     rotation = snapped_rotation(_rotation_to_z(up, rotations[keep]) @ first.T, FRAME_STEP) @ first
     spread = np.linalg.svd(offsets, compute_uv=False)
-    return SceneFrame(
-        Similarity(RADIUS_MARGIN * reach / SCENE_RADIUS, rotation.T, mean).inverse(),
-        keep,
-        rule,
-        bool(spread[1] < 1e-3 * spread[0]),
-    )
+    world_from_scene = Similarity(RADIUS_MARGIN * reach / SCENE_RADIUS, rotation.T, mean)
+    collinear = bool(spread[1] < 1e-3 * spread[0])
+    return SceneFrame(world_from_scene.inverse(), keep, rule, collinear)
 
 
 def near_cameras(centers: np.ndarray) -> np.ndarray:
@@ -204,10 +194,8 @@ def up_direction(rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray
         return _signed(level, guess), "level cameras"
     if len(offsets) >= 8:
         normal, values = _least_aligned(offsets)
-        flat = (
-            values[0] < _MAX_PLANE_THICKNESS**2 * values[1]
-            and values[1] > _MIN_SPREAD_RATIO * values[2]
-        )
+        flat = values[0] < _MAX_PLANE_THICKNESS**2 * values[1]
+        flat = flat and values[1] > _MIN_SPREAD_RATIO * values[2]
         if flat and abs(normal @ guess) > _MIN_AGREEMENT_COS:
             return _signed(normal, guess), "plane camera path"
     return guess, MEAN_UP
@@ -368,11 +356,8 @@ def _upright_share(rotations: np.ndarray, up: np.ndarray, limit_deg: float) -> f
 def _quarter_turn_share(rotations: np.ndarray, up: np.ndarray) -> float:
     """Return the share of all cameras near a quarter turn, excluding those looking along ``up``."""
     roll, seen = _roll_and_projection(rotations, up)
-    return float(
-        (
-            (_angle_to_quarter_turn(roll) < np.radians(QUARTER_DEG)) & (seen > _MIN_PROJECTED_UP)
-        ).mean()
-    )
+    near = _angle_to_quarter_turn(roll) < np.radians(QUARTER_DEG)
+    return float((near & (seen > _MIN_PROJECTED_UP)).mean())
 
 
 def _candidates(rotations: np.ndarray) -> np.ndarray:
@@ -469,9 +454,8 @@ def find_ground_plane(
         normal = axes[:, 0] if axes[:, 0] @ up >= 0.0 else -axes[:, 0]
         offset = float(mean @ normal)
     near = np.abs(points @ normal - offset) <= band
-    if not near.any() or weights[near].sum() < CLEAR_SHARE * weights.sum():
-        return None
-    if normal @ up < np.cos(np.radians(LEVEL_DEG)):
+    is_clear = near.any() and weights[near].sum() >= CLEAR_SHARE * weights.sum()
+    if not is_clear or normal @ up < np.cos(np.radians(LEVEL_DEG)):
         return None
     mean = np.average(points[near], axis=0, weights=weights[near])
     return Plane(middle + mean, normal)
@@ -529,17 +513,16 @@ class FileFrame:
     ) -> dict[str, Any]:
         """Return the entries of a sidecar: all transforms from the file's frame, in float64."""
         scene_from_file = self.file_from_scene().inverse()
-        up = "+Y" if EXPORT_FORMATS[self.format].y_up else "+Z"
+        y_up = EXPORT_FORMATS[self.format].y_up
         return {
-            "up": up,
-            "front": "+Z" if up == "+Y" else "-Y",
+            "up": "+Y" if y_up else "+Z", "front": "+Z" if y_up else "-Y",
             "offset": np.asarray(self.offset, np.float64).tolist(),
             "world_from_file": world_from_scene.after(scene_from_file).to_json(),
             "blender_from_file": blender_from_scene.after(scene_from_file).to_json(),
             "scene_from_file": scene_from_file.to_json(),
             "world_from_scene": world_from_scene.to_json(),
             "blender_from_scene": blender_from_scene.to_json(),
-        }
+        }  # fmt: skip
 
 
 def file_offset(world: np.ndarray) -> np.ndarray:

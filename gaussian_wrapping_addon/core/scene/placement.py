@@ -50,10 +50,7 @@ def umeyama(source: np.ndarray, target: np.ndarray, *, with_scale: bool) -> Simi
     ``with_scale``: also fit the scale; otherwise it is 1.
     Raises DatasetError: fewer than three pairs, values that are not finite, or collinear points.
     """
-    source, target = _pairs(source, target)
-    for points, name in ((source, "source"), (target, "target")):
-        require_plane(points, name)
-    return fit_similarity(source, target, with_scale)
+    return fit_similarity(*_pairs(source, target), with_scale)
 
 
 def _pairs(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -64,12 +61,12 @@ def _pairs(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarr
             "Give two (n, 3) arrays of the same length.",
         )
     if len(source) < 3:
-        raise DatasetError(
-            f"{len(source)} pairs of points do not determine an alignment.",
-            "At least 3 are needed.",
-        )
+        text = f"{len(source)} pairs of points do not determine an alignment."
+        raise DatasetError(text, "At least 3 are needed.")
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise DatasetError("The points to align are not all finite.", "Remove NaN and infinities.")
+    for points, name in ((source, "source"), (target, "target")):
+        require_plane(points, name)
     return source, target
 
 
@@ -118,8 +115,6 @@ def umeyama_ransac(
     inliers.
     """
     source, target = _pairs(source, target)
-    for points, name in ((source, "source"), (target, "target")):
-        require_plane(points, name)
     source_mean, target_mean = source.mean(0), target.mean(0)
     a, b = source - source_mean, target - target_mean
     rng = np.random.default_rng(seed)
@@ -142,10 +137,9 @@ def umeyama_ransac(
             elif clean > 0.0:
                 needed = np.log(1.0 - RANSAC_CONFIDENCE) / np.log1p(-clean)
     if best_count < 3:
-        raise DatasetError(
-            f"No alignment brings three of {len(a)} pairs within {threshold:g}.",
-            "The pairs do not correspond, or the threshold is far too small.",
-        )
+        text = f"No alignment brings three of {len(a)} pairs within {threshold:g}."
+        hint = "The pairs do not correspond, or the threshold is far too small."
+        raise DatasetError(text, hint)
     for _ in range(RANSAC_POLISH):
         require_plane(a[best], "agreeing source")
         fit = fit_similarity(a[best], b[best], with_scale)
@@ -154,11 +148,8 @@ def umeyama_ransac(
         if within.sum() < 3 or (within == best).all():
             break
         best = within
-    transform = Similarity(
-        fit.scale,
-        fit.rotation,
-        fit.translation + target_mean - fit.scale * (fit.rotation @ source_mean),
-    )
+    shift = fit.translation + target_mean - fit.scale * (fit.rotation @ source_mean)
+    transform = Similarity(fit.scale, fit.rotation, shift)
     inliers = distances <= threshold
     rmse = float(np.sqrt((distances[inliers] ** 2).mean())) if inliers.any() else float("inf")
     return RansacResult(transform, inliers, rmse)
@@ -225,9 +216,8 @@ def scale_step(points: np.ndarray, length: float) -> Similarity:
     """
     points = _finite(points)
     if len(points) != 2:
-        raise UsageError(
-            f"{_count(len(points))} picked.", "Pick two points whose distance you know."
-        )
+        hint = "Pick two points whose distance you know."
+        raise UsageError(f"{_count(len(points))} picked.", hint)
     if not (math.isfinite(length) and length > 0.0):
         raise UsageError(f"{length:g} is not a distance.", "Enter a length greater than zero.")
     distance = float(np.linalg.norm(points[1] - points[0]))
@@ -245,18 +235,16 @@ def plane_through(points: np.ndarray, above: np.ndarray) -> Plane:
     """
     points = _finite(points)
     if len(points) < 3:
-        raise UsageError(
-            f"{_count(len(points))} picked.", "Pick three points or more on the ground."
-        )
+        hint = "Pick three points or more on the ground."
+        raise UsageError(f"{_count(len(points))} picked.", hint)
     center = points.mean(0)
     offsets = points - center
     _, extents, axes = np.linalg.svd(offsets, full_matrices=False)  # (3,), (3, 3)
     if extents[0] <= COINCIDENT * float(np.abs(points).max()):
         raise UsageError("The points coincide.", "Pick three points that are far apart.")
     if extents[1] <= COLLINEAR * extents[0]:
-        raise UsageError(
-            "The points lie on one line.", "Pick a third point well to the side of the line."
-        )
+        hint = "Pick a third point well to the side of the line."
+        raise UsageError("The points lie on one line.", hint)
     normal = np.cross(axes[0], axes[1])
     side = float(np.median((np.asarray(above, np.float64) - center) @ normal)) if len(above) else 0
     if abs(side) <= COINCIDENT * extents[0]:
@@ -354,16 +342,14 @@ def write_placement(
     Raises UsageError: the file cannot be written.
     """
     values = {
-        "version": VERSION,
-        "blender_from_scene": blender_from_scene.to_json(),
+        "version": VERSION, "blender_from_scene": blender_from_scene.to_json(),
         "world_from_scene": world_from_scene.to_json(),
-    }
+    }  # fmt: skip
     try:
         write_json(path, values)
     except OSError as error:
-        raise UsageError(
-            f"{path} cannot be written: {error.strerror}.", "Check the folder's permissions."
-        ) from None
+        text = f"{path} cannot be written: {error.strerror}."
+        raise UsageError(text, "Check the folder's permissions.") from None
 
 
 def read_placement(path: Path, world_from_scene: Similarity) -> Similarity | None:
