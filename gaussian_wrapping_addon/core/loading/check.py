@@ -280,14 +280,11 @@ def _check_video(path: Path, worker: str, findings: Findings) -> None:
     # In front of the kind: "20 s of video, cameras to be solved".
     findings.insert(0, Finding("fact", text, short=f"{length} of video"))
     if 0 < video.frames < MIN_IMAGES:
-        raise DatasetError(
-            f"{path.name} has {video.frames} frames; at least {MIN_IMAGES} are needed.",
-            "Film longer.",
-        )
+        text = f"{path.name} has {video.frames} frames; at least {MIN_IMAGES} are needed."
+        raise DatasetError(text, "Film longer.")
     if min(video.width, video.height) < MIN_PHOTO_SIDE_PX:
-        raise DatasetError(
-            f"{path.name} has {video.width} x {video.height} pixels.", "Film larger pictures."
-        )
+        text = f"{path.name} has {video.width} x {video.height} pixels."
+        raise DatasetError(text, "Film larger pictures.")
     if max(video.width, video.height) < _MIN_GOOD_SIDE_PX:
         findings.warn(f"The frames are smaller than {_MIN_GOOD_SIDE_PX} pixels.")
     findings.take(kind_warnings(path, video.is_hdr, video.is_interlaced))
@@ -331,10 +328,9 @@ def _check_poses(kind: SourceKind, findings: Findings) -> None:
     matches = {p.name: index.find(p.name) for p in model.photos}
     missing = [name for name, match in matches.items() if match is None]
     if len(missing) == len(matches):
-        raise DatasetError(
-            f"None of the {len(matches)} photos that the {kind.kind} names was found.",
-            f"Looked for {missing[0]} in {', '.join(str(r) for r in kind.photo_roots)}.",
-        )
+        text = f"None of the {len(matches)} photos that the {kind.kind} names was found."
+        hint = f"Looked for {missing[0]} in {', '.join(str(r) for r in kind.photo_roots)}."
+        raise DatasetError(text, hint)
     if missing:
         count = f"{len(missing)} of {len(matches)}"
         findings.warn(f"{count} photos were not found, such as {missing[0]}.")
@@ -401,10 +397,8 @@ def _check_files(
         small += max(width, height) < _MIN_GOOD_SIDE_PX
     good = len(photos) - len(bad)
     if bad and len(bad) > _MAX_UNREADABLE_SHARE * len(photos):
-        raise DatasetError(
-            f"{len(bad)} of {len(photos)} photos cannot be read. First: {bad[0].message}",
-            bad[0].hint,
-        )
+        text = f"{len(bad)} of {len(photos)} photos cannot be read. First: {bad[0].message}"
+        raise DatasetError(text, bad[0].hint)
     check_photo_count(good)
     if bad:
         text = f"{len(bad)} photos cannot be read and are not used. First: {bad[0].message}"
@@ -431,7 +425,6 @@ def check_photo_count(count: int, left_out: Sequence[ReportWarning] = ()) -> Non
         photos = "photo is" if count == 1 else "photos are"
         reasons = "".join(f" {warning.text}" for warning in left_out)
         hints = [warning.hint for warning in left_out if warning.hint]
-        raise DatasetError(
-            f"Only {count} {photos} usable; at least {MIN_IMAGES} are needed.{reasons}",
-            " ".join(hints) or "Add photos of the same thing from other places.",
-        )
+        text = f"Only {count} {photos} usable; at least {MIN_IMAGES} are needed.{reasons}"
+        hint = " ".join(hints) or "Add photos of the same thing from other places."
+        raise DatasetError(text, hint)

@@ -281,10 +281,8 @@ def load_scene(
 def _refuse_places_of_panoramas(units: UnitsRequest) -> None:
     """Raise where places are asked for that the views cut from panoramas do not have."""
     if units.georeference == "on" or units.control_points:
-        raise UsageError(
-            "GPS and control points are not read for 360 degree photos.",
-            "Leave these options out; markers, or a measured length afterwards, give the scale.",
-        )
+        hint = "Leave these options out; markers, or a measured length afterwards, give the scale."
+        raise UsageError("GPS and control points are not read for 360 degree photos.", hint)
 
 
 def _frame(

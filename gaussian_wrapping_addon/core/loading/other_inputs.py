@@ -92,10 +92,9 @@ def with_views_of_panoramas(
         found.append(Panorama(photo.name, match.path, mask))
         owners.append(photo)
     if not found:
-        raise DatasetError(
-            f"None of the {len(posed)} panoramas that the {model.kind} names was found.",
-            f"Looked for {missing[0]} in {', '.join(str(root) for root in kind.photo_roots)}.",
-        )
+        text = f"None of the {len(posed)} panoramas that the {model.kind} names was found."
+        hint = f"Looked for {missing[0]} in {', '.join(str(root) for root in kind.photo_roots)}."
+        raise DatasetError(text, hint)
     cut, bad = cut_panoramas(found, work_folder, progress, reading, threads=threads)
     check_unreadable_share(bad, len(found))
     photos = [photo for photo in model.photos if not photo.is_panorama]

@@ -116,10 +116,8 @@ def prepare_views(
         found.append((posed, match.path))
     if not found:
         searched = ", ".join(str(root) for root in kind.photo_roots)
-        raise DatasetError(
-            f"None of the {len(model.photos)} photos that the {model.kind} names was found.",
-            f"Looked for {notes.missing[0]} in {searched}.",
-        )
+        text = f"None of the {len(model.photos)} photos that the {model.kind} names was found."
+        raise DatasetError(text, f"Looked for {notes.missing[0]} in {searched}.")
     require_extras([path for _, path in found])
     notes.photos = frozenset(real_path(path) for path in used)
     (work_folder / "images").mkdir(parents=True, exist_ok=True)

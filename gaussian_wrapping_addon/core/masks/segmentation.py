@@ -114,9 +114,8 @@ class SegmentationModel:
                 str(path), options, providers=["CPUExecutionProvider"]
             )
         except Exception as error:  # its exceptions share no base of their own
-            raise DatasetError(
-                f"{path.name} cannot be read as an ONNX model ({_first_line(error)}).", _WANTED
-            ) from None
+            text = f"{path.name} cannot be read as an ONNX model ({_first_line(error)})."
+            raise DatasetError(text, _WANTED) from None
         self._name = path.name
         self._mean, self._deviation = (np.array(v, np.float32) for v in RANGES[color_range])
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()

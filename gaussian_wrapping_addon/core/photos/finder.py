@@ -63,9 +63,8 @@ def _walk(root: Path) -> tuple[list[Path], list[Path]]:
         found += [here / name for name in photos if name not in second]
         left_out += [here / name for name in second]
         if len(found) > limits.MAX_IMAGES:
-            raise DatasetError(
-                f"{root.name} holds more than {limits.MAX_IMAGES} photos.", "Choose a subfolder."
-            )
+            text = f"{root.name} holds more than {limits.MAX_IMAGES} photos."
+            raise DatasetError(text, "Choose a subfolder.")
 
     def name_of(path: Path) -> str:
         return path.relative_to(root).as_posix()

@@ -278,9 +278,8 @@ def read_photo_header(path: Path) -> PhotoHeader | None:
             else:
                 return None
     except PermissionError as error:
-        raise DatasetError(
-            f"{path.name} cannot be read: {error.strerror}.", "Check its permissions."
-        ) from None
+        text = f"{path.name} cannot be read: {error.strerror}."
+        raise DatasetError(text, "Check its permissions.") from None
     except (OSError, ValueError, struct.error, SyntaxError, OverflowError) as error:
         reason = str(error) or type(error).__name__
         raise DatasetError(f"{path.name} is not a readable photo ({reason}).", _ANOTHER) from None
@@ -291,10 +290,8 @@ def read_photo_header(path: Path) -> PhotoHeader | None:
             "Scale it down.",
         )
     if header.width * header.height > pixels:
-        raise DatasetError(
-            f"{path.name} has {header.width} x {header.height} pixels; the limit is {pixels}.",
-            "Scale it down.",
-        )
+        text = f"{path.name} has {header.width} x {header.height} pixels; the limit is {pixels}."
+        raise DatasetError(text, "Scale it down.")
     return header
 
 

@@ -70,9 +70,8 @@ def container_of(path: Path) -> str:
         with open_regular(path, follow_links=True) as stream:
             head = stream.read(_HEAD_BYTES)
     except OSError as error:
-        raise DatasetError(
-            f"{path.name} cannot be read: {error.strerror}.", "Check the path and its permissions."
-        ) from None
+        text = f"{path.name} cannot be read: {error.strerror}."
+        raise DatasetError(text, "Check the path and its permissions.") from None
     if not head:
         raise DatasetError(f"{path.name} is empty.", _COPY_AGAIN)
     if head[4:8] in _QUICKTIME_BOXES:
@@ -125,9 +124,8 @@ def probe_video(path: Path, python: str) -> ProbedVideo:
     except OSError as error:
         raise not_started(python, error) from None
     except subprocess.TimeoutExpired:
-        raise DatasetError(
-            f"{path.name} was not opened within {PROBE_DEADLINE_S:.0f} s.", _AGAIN
-        ) from None
+        text = f"{path.name} was not opened within {PROBE_DEADLINE_S:.0f} s."
+        raise DatasetError(text, _AGAIN) from None
     for line in output.splitlines():
         try:
             values: Any = json.loads(line)
@@ -141,10 +139,8 @@ def probe_video(path: Path, python: str) -> ProbedVideo:
         except TypeError:
             continue
     said = errors.strip().splitlines()
-    raise DatasetError(
-        f"{path.name} cannot be opened: the decoder ended ({said[-1] if said else 'no output'}).",
-        _AGAIN,
-    )
+    text = f"{path.name} cannot be opened: the decoder ended ({said[-1] if said else 'no output'})."
+    raise DatasetError(text, _AGAIN)
 
 
 def main(arguments: list[str]) -> int:
@@ -171,9 +167,8 @@ def probed(path: Path) -> ProbedVideo:
     with open_video(path) as video:
         first = next(frames_of(video), None)
         if first is None:
-            raise DatasetError(
-                f"No frame of {path.name} can be decoded: the file is cut or damaged.", _AGAIN
-            )
+            text = f"No frame of {path.name} can be decoded: the file is cut or damaged."
+            raise DatasetError(text, _AGAIN)
         facts = video.facts
         width, height = upright_size(first.frame, facts.pixel_ratio)
         return ProbedVideo(
@@ -269,9 +264,8 @@ def open_video(path: Path, threads: int = 0) -> Iterator[OpenVideo]:
                 raise DatasetError(f"{path.name} holds no pictures.", _AGAIN)
             stream = container.streams.video[0]
             if stream.codec_context is None:
-                raise DatasetError(
-                    f"{path.name}: its codec is not known here.", "Export it as MP4 with H.264."
-                )
+                text = f"{path.name}: its codec is not known here."
+                raise DatasetError(text, "Export it as MP4 with H.264.")
             if threads:
                 stream.codec_context.thread_count = threads
             stream.thread_type = "AUTO"
@@ -356,10 +350,8 @@ def frames_of(video: OpenVideo) -> Iterator[DecodedFrame]:
             continue
         for frame in decoded:
             if index >= limits.MAX_VIDEO_FRAMES:
-                raise DatasetError(
-                    f"{video.name} holds more than {limits.MAX_VIDEO_FRAMES} frames.",
-                    "Cut the part that shows the object.",
-                )
+                text = f"{video.name} holds more than {limits.MAX_VIDEO_FRAMES} frames."
+                raise DatasetError(text, "Cut the part that shows the object.")
             same_size = (frame.width, frame.height) == (video.facts.width, video.facts.height)
             if frame.is_corrupt or not same_size:
                 video.bad_packets += 1

@@ -374,10 +374,8 @@ def _run(folder: Path) -> None:
     _check_rate(path, measures, task)
     choice = choose_frames(measures, frames=task["frames"], fps=task["fps"])
     if not len(choice.positions):
-        raise DatasetError(
-            f"All {choice.blurred} frames of {path.name} are blurred.",
-            "Film again, more slowly and in more light.",
-        )
+        text = f"All {choice.blurred} frames of {path.name} are blurred."
+        raise DatasetError(text, "Film again, more slowly and in more light.")
     written, size_px = _write(path, folder / FRAMES_FOLDER, measures, choice, task["threads"])
     first["damaged"] += len(choice.positions) - len(written)
     chosen = {
@@ -416,10 +414,8 @@ def _measure(path: Path, threads: int) -> tuple[FrameMeasures, dict[str, Any]]:
             found.append(details(grey))
             ticker.tick(len(indices), video.facts.expected_frames)
         if not indices:
-            raise DatasetError(
-                f"No frame of {path.name} can be decoded: the file is cut or damaged.",
-                "Copy it from the camera again, or export it as MP4.",
-            )
+            text = f"No frame of {path.name} can be decoded: the file is cut or damaged."
+            raise DatasetError(text, "Copy it from the camera again, or export it as MP4.")
         stated = video.facts.frames
         missing = max(video.bad_packets, stated - len(indices) if stated else 0)
         facts = {
@@ -453,9 +449,8 @@ def _write(
             if decoded.index >= last:
                 break
     if not written:
-        raise DatasetError(
-            f"{path.name} has changed while it was read.", "Start again once it is complete."
-        )
+        text = f"{path.name} has changed while it was read."
+        raise DatasetError(text, "Start again once it is complete.")
     return written, size
 
 

@@ -112,10 +112,8 @@ def check_panorama(header: PhotoHeader, file_name: str) -> None:
     """Raise :class:`DatasetError` where a photo has not the shape of a whole panorama."""
     width, height = header.upright_size
     if not _is_twice_as_wide((width, height)):
-        raise DatasetError(
-            f"{file_name} is {width} x {height} pixels; a panorama is twice as wide as high.",
-            "Export the photos as whole equirectangular panoramas.",
-        )
+        text = f"{file_name} is {width} x {height} pixels; a panorama is twice as wide as high."
+        raise DatasetError(text, "Export the photos as whole equirectangular panoramas.")
 
 
 def _is_twice_as_wide(size: tuple[int, int]) -> bool:
@@ -285,10 +283,8 @@ def solve_panoramas(
     """
     widths = sorted({view.width for view in cut})
     if len(widths) != 1:
-        raise DatasetError(
-            f"The panoramas are {', '.join(f'{w} x {w // 2}' for w in widths[:3])} pixels large.",
-            "Give panoramas of one size.",
-        )
+        text = f"The panoramas are {', '.join(f'{w} x {w // 2}' for w in widths[:3])} pixels large."
+        raise DatasetError(text, "Give panoramas of one size.")
     folder = fresh_folder(work_folder)
     full = view_lens(widths[0])
     side = min(full.width, _MAX_SIFT_PX)

@@ -185,9 +185,8 @@ def solve_poses(
         positions.append(read_gps_exif(path) if len(photos) > EXHAUSTIVE_LIMIT else None)
         progress.update(0.08 * (i + 1) / len(photos), f"reading photo {i + 1} of {len(photos)}")
     if len(prepared) < MIN_IMAGES:
-        raise DatasetError(
-            f"Only {len(prepared)} photos can be read; {MIN_IMAGES} are needed.", "Add photos."
-        )
+        text = f"Only {len(prepared)} photos can be read; {MIN_IMAGES} are needed."
+        raise DatasetError(text, "Add photos.")
     groups: dict[tuple[Any, ...], list[_SolverPhoto]] = {}
     for photo in prepared:
         key = (photo.full_width, photo.full_height, *photo.lens_key)
@@ -233,10 +232,9 @@ def _with_source_names(
         photos.append(dataclasses.replace(posed, name=name, lens=lens))
     photos.sort(key=lambda p: p.name)
     if len(photos) < MIN_IMAGES:
-        raise DatasetError(
-            f"Only {len(photos)} of {offered} photos could be placed; {MIN_IMAGES} are needed.",
-            "Take more photos with more overlap, from a textured object that does not move.",
-        )
+        text = f"Only {len(photos)} of {offered} photos could be placed; {MIN_IMAGES} are needed."
+        hint = "Take more photos with more overlap, from a textured object that does not move."
+        raise DatasetError(text, hint)
     warnings = list(model.warnings)
     registered = {p.name for p in photos}
     unregistered = [
@@ -321,10 +319,8 @@ def run_solver(
 def check_unreadable_share(bad: Sequence[str], offered: int) -> None:
     """Raise :class:`DatasetError` once more than a fifth of the photos cannot be read."""
     if len(bad) > MAX_UNREADABLE_SHARE * offered:
-        raise DatasetError(
-            f"{len(bad)} of {offered} photos cannot be read. First: {bad[0]}",
-            "Restore the photos, or remove the bad ones.",
-        )
+        text = f"{len(bad)} of {offered} photos cannot be read. First: {bad[0]}"
+        raise DatasetError(text, "Restore the photos, or remove the bad ones.")
 
 
 def _write_solver_photo(

@@ -409,10 +409,9 @@ def _solve(folder: Path, task: dict[str, Any]) -> None:
 
     best = solve(database)
     if best is None:
-        raise DatasetError(
-            f"No two of the {total} photos could be placed relative to each other.",
-            "Take more photos with more overlap, from a textured object that does not move.",
-        )
+        text = f"No two of the {total} photos could be placed relative to each other."
+        hint = "Take more photos with more overlap, from a textured object that does not move."
+        raise DatasetError(text, hint)
     verdict = check_solution(database, best)
     is_mended = False
     if verdict.is_doubtful:

@@ -74,10 +74,8 @@ def read_colmap(source: Path) -> SourceModel:
     """
     models = find_models(source)
     if not models:
-        raise DatasetError(
-            f"{source.name} holds no COLMAP model.",
-            "Expected: cameras, images and points3D (.bin or .txt) in sparse/0, sparse or here.",
-        )
+        hint = "Expected: cameras, images and points3D (.bin or .txt) in sparse/0, sparse or here."
+        raise DatasetError(f"{source.name} holds no COLMAP model.", hint)
     warnings: list[ReportWarning] = []
     chosen = models[0]
     if len(models) > 1:
@@ -125,10 +123,9 @@ def read_model(model: ModelFiles) -> SourceModel:
     warnings = [*warnings, *more]
     photos = _usable_photos(model.folder, images, cameras, warnings)
     if not photos:
-        raise DatasetError(
-            f"None of the {len(images)} images of {model.path('images').name} is usable.",
-            " ".join([*(warning.text for warning in warnings[-1:]), "Solve the cameras again."]),
-        )
+        text = f"None of the {len(images)} images of {model.path('images').name} is usable."
+        hint = " ".join([*(warning.text for warning in warnings[-1:]), "Solve the cameras again."])
+        raise DatasetError(text, hint)
     points_path = model.path("points3D")
     if points_path.is_file():
         raw, more = reader.read_points(points_path)

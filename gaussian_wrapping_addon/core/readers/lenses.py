@@ -127,9 +127,8 @@ def fit_lens(
     Raises DatasetError: the photo's aspect ratio differs from its camera's.
     """
     if posed.is_panorama:
-        raise DatasetError(
-            f"{file_name} is a panorama, which has no lens.", "Give photos of pinhole cameras here."
-        )
+        text = f"{file_name} is a panorama, which has no lens."
+        raise DatasetError(text, "Give photos of pinhole cameras here.")
     stored, upright = (header.width, header.height), header.upright_size
     if posed.relative is not None:
         width, height = stored if prefers_stored else upright

@@ -215,10 +215,8 @@ def _cameras(shots: Path) -> list[tuple[float, LensCamera]]:
         if path.is_file():
             break
     else:
-        raise DatasetError(
-            f"{CAMERAS}, which holds the lenses of {shots.name}, is missing.",
-            f"Put it beside {shots.name} or into the folder above.",
-        )
+        text = f"{CAMERAS}, which holds the lenses of {shots.name}, is missing."
+        raise DatasetError(text, f"Put it beside {shots.name} or into the folder above.")
     values = read_json(path, follow_links=True)
     if not isinstance(values, dict) or not values:
         raise ParseError(path, "top level", "an object of cameras was expected.", AGAIN)

@@ -102,10 +102,8 @@ def is_splat_path(path: Path) -> bool:
     """
     suffix = path.suffix.lower()
     if suffix in OTHER_FORMATS:
-        raise DatasetError(
-            f"{path.name} is a splat in {OTHER_FORMATS[suffix]} format, which is not supported.",
-            _UNPACK,
-        )
+        text = f"{path.name} is a splat in {OTHER_FORMATS[suffix]} format, which is not supported."
+        raise DatasetError(text, _UNPACK)
     return suffix == ".ply"
 
 

@@ -72,10 +72,8 @@ def find_program_cameras(source: Path) -> ProgramCameras | None:
             found = _files(source / name, form)
             if len(found) > 1:
                 listed = ", ".join(path.name for path in found[:3])
-                raise DatasetError(
-                    f"{source.name} holds {len(found)} files of kind {form.kind}: {listed}.",
-                    "Give one of these files instead of the folder.",
-                )
+                text = f"{source.name} holds {len(found)} files of kind {form.kind}: {listed}."
+                raise DatasetError(text, "Give one of these files instead of the folder.")
             if found:
                 return ProgramCameras(form.kind, found[0], _photo_folders(found[0].parent))
     return _xmp(source)

@@ -319,8 +319,7 @@ class PhotoList:
             text = f"{len(names)} photos were left out for {reason}: {listed}."
             self.warn("images-left-out", text, LEFT_OUT_HINT)
         if not self.photos:
-            raise DatasetError(
-                f"None of the {self.offered} photos of {self.path.name} is usable.",
-                " ".join([*(warning.text for warning in self.warnings[:3]), AGAIN]),
-            )
+            text = f"None of the {self.offered} photos of {self.path.name} is usable."
+            hint = " ".join([*(warning.text for warning in self.warnings[:3]), AGAIN])
+            raise DatasetError(text, hint)
         return tuple(self.photos)

@@ -95,10 +95,8 @@ def read_transforms(path: Path) -> SourceModel:
         text = f"{scaled} matrices held a scale, which was removed."
         warnings.append(ReportWarning("scale-removed", text))
     if not photos:
-        raise DatasetError(
-            f"None of the {len(frames)} frames of {path.name} is usable.",
-            " ".join([*(warning.text for warning in warnings), _AGAIN]),
-        )
+        text = f"None of the {len(frames)} frames of {path.name} is usable."
+        raise DatasetError(text, " ".join([*(warning.text for warning in warnings), _AGAIN]))
     points, colors = _start_points(path, values.get("ply_file_path"), warnings)
     facts: dict[str, Any] = {
         "frames": len(frames),

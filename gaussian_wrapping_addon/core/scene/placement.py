@@ -56,10 +56,8 @@ def umeyama(source: np.ndarray, target: np.ndarray, *, with_scale: bool) -> Simi
 def _pairs(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
-        raise DatasetError(
-            f"Points of shapes {source.shape} and {target.shape} do not match.",
-            "Give two (n, 3) arrays of the same length.",
-        )
+        text = f"Points of shapes {source.shape} and {target.shape} do not match."
+        raise DatasetError(text, "Give two (n, 3) arrays of the same length.")
     if len(source) < 3:
         text = f"{len(source)} pairs of points do not determine an alignment."
         raise DatasetError(text, "At least 3 are needed.")
@@ -77,10 +75,8 @@ def require_plane(points: np.ndarray, name: str) -> None:
     rounding = 8 * np.finfo(np.float64).eps * np.abs(points).max()
     if extents[1] <= max(COLLINEAR_SHARE * extents[0], rounding):
         what = "in one place" if extents[0] <= rounding else "on one line"
-        raise DatasetError(
-            f"The {len(points)} {name} points lie {what}, so the rotation is undetermined.",
-            "Use cameras or points that span at least a plane.",
-        )
+        text = f"The {len(points)} {name} points lie {what}, so the rotation is undetermined."
+        raise DatasetError(text, "Use cameras or points that span at least a plane.")
 
 
 def fit_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool) -> Similarity:
@@ -310,9 +306,8 @@ def check_scale(placement: Similarity) -> None:
     Raises UsageError: the scale lies outside of :data:`SMALLEST_SCALE` to :data:`LARGEST_SCALE`.
     """
     if not SMALLEST_SCALE <= placement.scale <= LARGEST_SCALE:
-        raise UsageError(
-            f"The scene would be scaled by {placement.scale:.3g}.", "Check the distance entered."
-        )
+        text = f"The scene would be scaled by {placement.scale:.3g}."
+        raise UsageError(text, "Check the distance entered.")
 
 
 def _count(number: int) -> str:

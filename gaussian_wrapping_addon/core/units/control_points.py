@@ -220,10 +220,9 @@ def read_control_file(path: Path) -> ControlFile:
         with path.open("rb") as stream:
             raw = stream.read(MAX_FILE_BYTES + 1)
     except OSError as error:
-        raise DatasetError(
-            f"Control points {path} cannot be read: {error.strerror or error}.",
-            "Put the file back and resume the job, or start anew without control points.",
-        ) from None
+        text = f"Control points {path} cannot be read: {error.strerror or error}."
+        hint = "Put the file back and resume the job, or start anew without control points."
+        raise DatasetError(text, hint) from None
     if len(raw) > MAX_FILE_BYTES:
         raise DatasetError(f"{path} is larger than {MAX_FILE_BYTES >> 20} MiB.", _HINT)
     try:

@@ -539,10 +539,9 @@ def check_positions(known: Sequence[GpsPosition], photos: int) -> None:
     used = sum(position.altitude_m is not None for position in known)
     if used < MIN_POSITIONS:
         what = "GPS altitude" if len(known) >= MIN_POSITIONS else "GPS position"
-        raise DatasetError(
-            f"{used} of {photos} photos have a {what}; {MIN_POSITIONS} are needed.",
-            "Use photos as they come from the camera, with its location switched on.",
-        )
+        text = f"{used} of {photos} photos have a {what}; {MIN_POSITIONS} are needed."
+        hint = "Use photos as they come from the camera, with its location switched on."
+        raise DatasetError(text, hint)
 
 
 def _origin(places: np.ndarray) -> GeoPoint:

@@ -289,19 +289,16 @@ def scale_from_markers(
     bad = [n for n, size in sizes.items() if size is None]
     known = {n: size for n, size in sizes.items() if size is not None}
     if not known:
-        raise DatasetError(
-            f"{len(seen)} markers were found, but no two photos agree about one of them.", hint
-        )
+        text = f"{len(seen)} markers were found, but no two photos agree about one of them."
+        raise DatasetError(text, hint)
     observations = sum(size[2] for size in known.values())
     side, error = (np.array([size[k] for size in known.values()]) for k in (0, 1))
     middle = float(np.median(side))
     apart = np.abs(side / middle - 1.0)
     good = apart <= np.maximum(MAX_SIZE_ERROR, 3.0 * error / middle)
     if not good.any():
-        raise DatasetError(
-            f"The markers differ in size by {100 * float(np.ptp(side)) / middle:.2g} %.",
-            "Print all of them in the same size.",
-        )
+        text = f"The markers differ in size by {100 * float(np.ptp(side)) / middle:.2g} %."
+        raise DatasetError(text, "Print all of them in the same size.")
     other = [n for n, ok in zip(known, good, strict=True) if not ok]
     weights = 1.0 / error[good] ** 2
     # Least squares of known = scale * measured.
