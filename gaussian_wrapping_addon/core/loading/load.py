@@ -53,9 +53,7 @@ _HINT = "Photos with more texture help, or a COLMAP model with its points."
 
 
 def make_start_points(
-    cameras: Sequence[Camera],
-    photos: Sequence[Path],
-    masks: Sequence[Path | None],
+    views: Sequence[View],
     work_folder: Path,
     progress: Progress,
     warnings: list[ReportWarning],
@@ -72,7 +70,7 @@ def make_start_points(
     """
     try:
         points, colors = triangulate_points(
-            cameras, photos, masks, work_folder, progress, seed=seed, threads=threads
+            views, work_folder, progress, seed=seed, threads=threads
         )
     except MemoryShortageError:
         raise  # with enough memory the same photos would give points
@@ -88,7 +86,7 @@ def make_start_points(
         "training slower and less exact."
     )
     warnings.append(ReportWarning("random-start-points", text, _HINT))
-    points = random_points(cameras, seed=seed)
+    points = random_points([view.camera for view in views], seed=seed)
     return points, np.full(points.shape, 128, np.uint8), "random"
 
 
@@ -257,25 +255,26 @@ def load_scene(
     if note:
         facts["georeference_note"] = note
     views, scene_from_world, facts["up_from"] = _frame(views, warnings, z_up)
-    cameras = [snapped_camera(camera_of(view).moved(scene_from_world)) for view in views]
+    in_scene = tuple(
+        View(
+            snapped_camera(camera_of(view).moved(scene_from_world)), view.photo_path, view.mask_path
+        )
+        for view in views
+    )
     if (apart := nothing_in_common(model)) is not None:
         warnings.append(apart)
     points, colors = points_in_scene(given_points, model.point_colors, scene_from_world, warnings)
     if len(points) < MIN_POINTS:
+        span = progress.span(0.3, 1.0)
         points, colors, facts["start_points"] = make_start_points(
-            cameras, [view.photo_path for view in views], [view.mask_path for view in views],
-            work_folder, progress.span(0.3, 1.0), warnings, seed=seed, threads=threads,
-        )  # fmt: skip
+            in_scene, work_folder, span, warnings, seed=seed, threads=threads
+        )
     facts["views"], facts["points"] = len(views), len(points)
-    facts["photo_sizes"] = sorted({f"{c.width} x {c.height}" for c in cameras})[:4]
+    sizes = {f"{view.camera.width} x {view.camera.height}" for view in in_scene}
+    facts["photo_sizes"] = sorted(sizes)[:4]
     progress.update(1.0, f"{len(views)} photos and {len(points)} points are ready")
-    in_scene = tuple(
-        View(camera, view.photo_path, view.mask_path)
-        for camera, view in zip(cameras, views, strict=True)
-    )
-    return Scene(
-        in_scene, points, colors, scene_from_world.inverse(), tuple(warnings), facts
-    )  # fmt: skip
+    world_from_scene = scene_from_world.inverse()
+    return Scene(in_scene, points, colors, world_from_scene, tuple(warnings), facts)
 
 
 def _refuse_places_of_panoramas(units: UnitsRequest) -> None:

@@ -18,7 +18,7 @@ from ..files import read_json, write_json
 from ..limits import HELPER_DEADLINE_S, MIN_IMAGES
 from ..machine import helper_memory_limit_bytes
 from ..parallel import default_threads
-from ..photos.exif import GpsPosition, read_gps_exif, read_lens_exif
+from ..photos.exif import GpsPosition, LensExif, read_gps_exif, read_lens_exif
 from ..photos.finder import find_mask
 from ..photos.photo_file import (
     AS_WRITTEN,
@@ -34,7 +34,7 @@ from ..photos.photo_file import (
 from ..progress import UNREADABLE_HINT, Progress, ReportWarning
 from ..readers.colmap import ModelFiles, read_model
 from ..readers.source_model import PHOTOS, PosedPhoto, SourceModel
-from ..scene.camera import Camera
+from ..scene.scene import View
 from ..worker.helper_process import run_helper
 from .checks import MIN_GROUP, TURNING_FOLDER, TURNTABLE_NAME, photos_in_parts, with_findings
 from .matching import EXHAUSTIVE_LIMIT, pairs_by_pose
@@ -115,6 +115,7 @@ TURNTABLE_FOLDER = "turntable"
 """Masks of what turns, of the photos' full size."""
 _HELPER = "poses.solver_helper"
 """Module of the process that solves."""
+_UNKNOWN_LENS = LensExif((), None)
 _SECONDS_A_PHOTO = 60.0
 """Longest time that solving may take: more than ten times what 400 photos took on two cores."""
 
@@ -125,6 +126,8 @@ class _SolverPhoto:
 
     name: str
     """Name under ``images/`` of the task folder."""
+    source_name: str
+    """Name in the input."""
     width: int
     height: int
     full_width: int
@@ -167,7 +170,6 @@ def solve_poses(
     """
     folder = fresh_folder(work_folder)
     prepared: list[_SolverPhoto] = []
-    names: list[str] = []
     bad: list[str] = []
     positions: list[GpsPosition | None] = []
     for i, path in enumerate(photos):
@@ -180,8 +182,11 @@ def solve_poses(
             check_unreadable_share(bad, len(photos))
             continue
         mask = find_mask(mask_roots, name, [root])
-        prepared.append(_write_solver_photo(folder, i, decoded, full_size, path, mask, reading))
-        names.append(name)
+        visible = _visible(decoded, mask, reading)
+        lens = read_lens_exif(path, *full_size)
+        prepared.append(
+            _write_solver_photo(folder, i, decoded.color, visible, full_size, lens, name)
+        )
         positions.append(read_gps_exif(path) if len(photos) > EXHAUSTIVE_LIMIT else None)
         progress.update(0.08 * (i + 1) / len(photos), f"reading photo {i + 1} of {len(photos)}")
     if len(prepared) < MIN_IMAGES:
@@ -205,16 +210,15 @@ def solve_poses(
     sizes = {p.name: (p.full_width, p.full_height) for p in prepared}
     target = work_folder / TURNTABLE_FOLDER
     model = with_turntable(model, folder, sizes, target, wanted=turntable == "on")
-    model = with_findings(model, folder, {p.name: n for p, n in zip(prepared, names, strict=True)})
+    model = with_findings(model, folder, {p.name: p.source_name for p in prepared})
     in_parts = photos_in_parts(folder)
     save_model(folder, work_folder)
-    return _with_source_names(model, prepared, names, bad, len(photos), in_parts)
+    return _with_source_names(model, prepared, bad, len(photos), in_parts)
 
 
 def _with_source_names(
     model: SourceModel,
     prepared: list[_SolverPhoto],
-    names: list[str],
     bad: list[str],
     offered: int,
     in_parts: Collection[str],
@@ -223,28 +227,24 @@ def _with_source_names(
 
     Of photos that are not placed, those ``in_parts`` have a warning already.
     """
-    of_name = {p.name: (p, name) for p, name in zip(prepared, names, strict=True)}
+    of_name = {p.name: p for p in prepared}
     photos: list[PosedPhoto] = []
     for posed in model.photos:
-        photo, name = of_name[posed.name]
+        photo = of_name[posed.name]
         assert posed.lens is not None
         lens = posed.lens.resized(photo.full_width, photo.full_height)
-        photos.append(dataclasses.replace(posed, name=name, lens=lens))
+        photos.append(dataclasses.replace(posed, name=photo.source_name, lens=lens))
     photos.sort(key=lambda p: p.name)
     if len(photos) < MIN_IMAGES:
         text = f"Only {len(photos)} of {offered} photos could be placed; {MIN_IMAGES} are needed."
         hint = "Take more photos with more overlap, from a textured object that does not move."
         raise DatasetError(text, hint)
     warnings = list(model.warnings)
-    registered = {p.name for p in photos}
-    unregistered = [
-        name
-        for photo, name in zip(prepared, names, strict=True)
-        if name not in registered and photo.name not in in_parts
-    ]
+    explained = {p.name for p in model.photos}.union(in_parts)
+    unregistered = [p.source_name for p in prepared if p.name not in explained]
     if unregistered:
         listed = ", ".join(unregistered[:5]) + (" ..." if len(unregistered) > 5 else "")
-        count = f"{len(unregistered)} of {len(names)}"
+        count = f"{len(unregistered)} of {len(prepared)}"
         text = f"{count} photos could not be placed and are not used: {listed}."
         hint = "Take more photos with more overlap there, or remove blurred ones."
         warnings.append(ReportWarning("photos-not-placed", text, hint))
@@ -263,14 +263,7 @@ def _with_source_names(
 
 
 def triangulate_points(
-    cameras: Sequence[Camera],
-    photos: Sequence[Path],
-    masks: Sequence[Path | None],
-    work_folder: Path,
-    progress: Progress,
-    *,
-    seed: int = 0,
-    threads: int = 0,
+    views: Sequence[View], work_folder: Path, progress: Progress, *, seed: int, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Triangulate features of photos with known, fixed pinhole cameras.
 
@@ -279,16 +272,18 @@ def triangulate_points(
     """
     folder = fresh_folder(work_folder)
     entries = []
-    for i, (camera, path) in enumerate(zip(cameras, photos, strict=True)):
-        size = (camera.width, camera.height)
-        prepared = _write_solver_photo(folder, i, read_photo(path), size, None, masks[i])
+    cameras = [view.camera for view in views]
+    for i, (view, camera) in enumerate(zip(views, cameras, strict=True)):
+        decoded, size = read_photo(view.photo_path), (camera.width, camera.height)
+        visible = _visible(decoded, view.mask_path, AS_WRITTEN)
+        prepared = _write_solver_photo(folder, i, decoded.color, visible, size)
         small = camera.resized(prepared.width, prepared.height)
         entries.append({
             "name": prepared.name, "width": small.width, "height": small.height,
             "params": [small.fx, small.fy, small.cx, small.cy],
             "cam_from_world": np.asarray(small.cam_from_world).tolist(),
         })  # fmt: skip
-        progress.update(0.08 * (i + 1) / len(photos), f"reading photo {i + 1} of {len(photos)}")
+        progress.update(0.08 * (i + 1) / len(views), f"reading photo {i + 1} of {len(views)}")
     pairs = pairs_by_pose(
         np.array([c.center for c in cameras]), np.array([c.forward for c in cameras])
     )
@@ -323,16 +318,23 @@ def check_unreadable_share(bad: Sequence[str], offered: int) -> None:
         raise DatasetError(text, "Restore the photos, or remove the bad ones.")
 
 
+def _visible(decoded: DecodedPhoto, mask: Path | None, reading: MaskReading) -> np.ndarray | None:
+    """Return what the mask of a photo, or else its transparency, shows of it, uint8."""
+    if mask is None:
+        return decoded.alpha
+    return np.where(reading.kept(read_mask(mask)), 255, 0).astype(np.uint8)
+
+
 def _write_solver_photo(
     folder: Path,
     index: int,
-    decoded: DecodedPhoto,
+    color: np.ndarray,
+    visible: np.ndarray | None,
     full_size: tuple[int, int],
-    source: Path | None,
-    mask: Path | None,
-    reading: MaskReading = AS_WRITTEN,
+    lens: LensExif = _UNKNOWN_LENS,
+    source_name: str = "",
 ) -> _SolverPhoto:
-    """Write one upright photo of limited size; the lens is read from the EXIF of ``source``.
+    """Write one upright photo, and what is ``visible`` of it (uint8), in limited size.
 
     ``full_size`` is (width, height) of the whole photo, which may be decoded at less.
     """
@@ -340,17 +342,9 @@ def _write_solver_photo(
     factor = min(1.0, MAX_SIFT_PX / max(full_width, full_height))
     size = (max(1, round(full_width * factor)), max(1, round(full_height * factor)))
     name = f"{index:06d}.jpg"
-    visible = decoded.alpha
-    if mask is not None:
-        visible = np.where(reading.kept(read_mask(mask)), 255, 0).astype(np.uint8)
-    write_reduced(folder, name, decoded.color, visible, size)
-    key: tuple[str, ...] = ()
-    focal_px = None
-    if source is not None:
-        lens = read_lens_exif(source, full_width, full_height)
-        key = lens.key
-        focal_px = None if lens.focal_px is None else lens.focal_px * factor
-    return _SolverPhoto(name, size[0], size[1], full_width, full_height, key, focal_px)
+    write_reduced(folder, name, color, visible, size)
+    focal_px = None if lens.focal_px is None else lens.focal_px * factor
+    return _SolverPhoto(name, source_name, *size, full_width, full_height, lens.key, focal_px)
 
 
 def write_reduced(
