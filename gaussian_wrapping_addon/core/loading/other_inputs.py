@@ -135,12 +135,11 @@ def solve_views_of_panoramas(
         panoramas, work_folder, progress.span(0.0, _CUTTING), reading, threads=threads
     )
     check_unreadable_share(bad, len(panoramas))
-    folder = work_folder / CUT_FOLDER
     model = solve_panoramas(
-        cut, folder, work_folder, progress.span(_CUTTING, 1.0), seed=seed, threads=threads
+        cut, work_folder, progress.span(_CUTTING, 1.0), seed=seed, threads=threads
     )
     model = dataclasses.replace(model, warnings=(*model.warnings, *_warnings(bad, [])))
-    return model, dataclasses.replace(kind, cut_folder=folder)
+    return model, dataclasses.replace(kind, cut_folder=work_folder / CUT_FOLDER)
 
 
 def _warnings(bad: Sequence[str], missing: Sequence[str]) -> list[ReportWarning]:

@@ -312,7 +312,8 @@ class PhotoStore:
             memory_bytes = photo_budget_bytes(available_memory_bytes())
         self._views = scene.views
         self._kept = KeptPhotos(memory_bytes)
-        self._decoded: DecodedFile | None = None
+        self.decoded: DecodedFile | None = None
+        """Set by :func:`decoded_in`."""
         self._base = [_base_camera(view.camera, max_image_px) for view in scene.views]
 
     def __len__(self) -> int:
@@ -384,29 +385,16 @@ class PhotoStore:
                 "Put the photo back, or start the job anew.",
             )
 
-    @contextmanager
-    def decoded_in(self, folder: Path) -> Iterator[None]:
-        """Keep decoded on disk, in this context, what does not fit into memory.
-
-        ``folder``: as for :class:`~.store.DecodedFile`.
-        """
-        before, self._decoded = self._decoded, DecodedFile(folder)
-        try:
-            yield
-        finally:
-            self._decoded.close()
-            self._decoded = before
-
     def _array(self, key: Key, make: Callable[[], np.ndarray]) -> np.ndarray:
         found = self._kept.get(key)
         if found is not None:
             return found
         array = self._made(key, make)  # without a lock: decoding is slow
         array, left_out = self._kept.put(key, array)
-        if self._decoded is not None:
+        if self.decoded is not None:
             for other, dropped in left_out:
                 if other == key or other[2] == 1:  # other levels are made of that of divisor 1
-                    self._decoded.add(other, dropped)
+                    self.decoded.add(other, dropped)
         return array
 
     def _base_array(
@@ -421,12 +409,12 @@ class PhotoStore:
         if found is not None:
             return found
         array = self._made(key, lambda: make(index, 1))
-        if not self._kept.put_aside(key, array) and self._decoded is not None:
-            self._decoded.add(key, array)
+        if not self._kept.put_aside(key, array) and self.decoded is not None:
+            self.decoded.add(key, array)
         return array
 
     def _made(self, key: Key, make: Callable[[], np.ndarray]) -> np.ndarray:
-        array = None if self._decoded is None else self._decoded.get(key)
+        array = None if self.decoded is None else self.decoded.get(key)
         if array is None:
             array = make()
         array.setflags(write=False)
@@ -435,12 +423,20 @@ class PhotoStore:
 
 @contextmanager
 def decoded_in(photos: PhotoSource, folder: Path) -> Iterator[None]:
-    """Keep photos decoded in a folder, in this context, where they are read from files at all."""
-    if isinstance(photos, PhotoStore):
-        with photos.decoded_in(folder):
-            yield
-    else:
+    """Keep decoded in a folder, in this context, what photos of files do not fit into memory.
+
+    ``folder``: as for :class:`~.store.DecodedFile`.
+    """
+    if not isinstance(photos, PhotoStore):
         yield
+        return
+    before, now = photos.decoded, DecodedFile(folder)
+    photos.decoded = now
+    try:
+        yield
+    finally:
+        now.close()
+        photos.decoded = before
 
 
 def _base_camera(camera: Camera, max_image_px: int) -> Camera:

@@ -305,18 +305,14 @@ _MATCHING_BLOCK_PAIRS = 1500
 
 
 def extract(
-    folder: Path,
-    database: Path,
-    names_of_camera: dict[int, list[str]],
-    threads: int,
-    max_features: int,
+    folder: Path, database: Path, names_of_camera: dict[int, list[str]], threads: int, most: int
 ) -> None:
-    """Find features of photos of each camera, in order, with progress."""
+    """Find features of photos of each camera, at most so many a photo, in order, with progress."""
     pycolmap = import_pycolmap()
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.use_gpu = False
-    options.sift.max_num_features = max_features
+    options.sift.max_num_features = most
     reader = pycolmap.ImageReaderOptions()
     if any((folder / "masks").iterdir()):
         reader.mask_path = folder / "masks"

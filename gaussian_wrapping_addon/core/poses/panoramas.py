@@ -264,20 +264,14 @@ def panorama_pairs(count: int) -> list[tuple[int, int]]:
 
 
 def solve_panoramas(
-    cut: Sequence[CutView],
-    cut_folder: Path,
-    work_folder: Path,
-    progress: Progress,
-    *,
-    seed: int = 0,
-    threads: int = 0,
+    cut: Sequence[CutView], work_folder: Path, progress: Progress, *, seed: int, threads: int
 ) -> SourceModel:
     """Solve cameras and sparse points of the views of panoramas without poses.
 
     Views of a panorama share its place and keep the directions that they were cut in; their lens
     is known. Nothing of either is adjusted.
 
-    ``cut``: all of panoramas of one size. ``cut_folder``: holds the views.
+    ``cut``: all of panoramas of one size, as :func:`cut_panoramas` has written them.
     Raises DatasetError: the panoramas differ in size, or fewer than ``MIN_IMAGES`` of them can be
     placed.
     """
@@ -293,7 +287,7 @@ def solve_panoramas(
     for i, view in enumerate(cut):
         name = f"{view.view:02d}/{numbers.index(view.panorama):06d}.jpg"
         visible = None if view.mask is None else read_mask(view.mask)
-        color = read_photo(cut_folder / view.name).color
+        color = read_photo(work_folder / CUT_FOLDER / view.name).color
         write_reduced(folder, name, color, visible, (side, side))
         names[name] = view
         progress.update(0.08 * (i + 1) / len(cut), f"reading view {i + 1} of {len(cut)}")

@@ -213,20 +213,17 @@ def solve_poses(
     model = with_findings(model, folder, {p.name: p.source_name for p in prepared})
     in_parts = photos_in_parts(folder)
     save_model(folder, work_folder)
-    return _with_source_names(model, prepared, bad, len(photos), in_parts)
+    return _with_source_names(model, prepared, bad, in_parts)
 
 
 def _with_source_names(
-    model: SourceModel,
-    prepared: list[_SolverPhoto],
-    bad: list[str],
-    offered: int,
-    in_parts: Collection[str],
+    model: SourceModel, prepared: list[_SolverPhoto], bad: list[str], in_parts: Collection[str]
 ) -> SourceModel:
     """Restore original names and full-size intrinsics of the solved photos.
 
     Of photos that are not placed, those ``in_parts`` have a warning already.
     """
+    offered = len(prepared) + len(bad)
     of_name = {p.name: p for p in prepared}
     photos: list[PosedPhoto] = []
     for posed in model.photos:

@@ -95,8 +95,7 @@ def read_metashape(path: Path) -> SourceModel:
             whole = sensor.get("type") == _PANORAMA
             lenses[sensor_id] = None if whole else _lens(path, sensor)
         pose = _pose(path, place, camera, chosen.world_from_group)
-        lens = lenses[sensor_id]
-        photos.add(names[label], lens, pose, is_panorama=lens is None)
+        photos.add(names[label], lenses[sensor_id], pose)
     usable = photos.finished()
     facts = {
         "group": chosen.label,

@@ -91,7 +91,7 @@ def read_opensfm(path: Path) -> SourceModel:
         turned = rotation_of(numbers(path, f"{here}.rotation", shot.get("rotation"), 3))
         shift = numbers(path, f"{here}.translation", shot.get("translation"), 3)
         pose = np.concatenate([turned, shift[:, None]], 1)
-        photos.add(names[name], lenses[key], pose, is_panorama=lenses[key] is None)
+        photos.add(names[name], lenses[key], pose)
     usable = photos.finished()
     table, here = _table(path, place, entry, "points"), f"{place}.points"
     named = ((f"{here}[{key[:80]!r}]", point) for key, point in table.items())

@@ -285,10 +285,11 @@ class PhotoList:
         lens: LensCamera | None,
         cam_from_world: np.ndarray,
         relative: RelativeLens | None = None,
-        *,
-        is_panorama: bool = False,
     ) -> None:
-        """Take a photo over, unless its name is unsafe or was used before."""
+        """Take a photo over, unless its name is unsafe or was used before.
+
+        One without a lens of either kind is a panorama.
+        """
         if not is_safe_name(self.path.parent, name):
             self.leave_out(name, "a name that is empty, too long or leads outside the folder")
         elif name in self._names:
@@ -296,9 +297,7 @@ class PhotoList:
         else:
             self.offered += 1
             self._names.add(name)
-            self.photos.append(
-                PosedPhoto(name, lens, cam_from_world, relative=relative, is_panorama=is_panorama)
-            )
+            self.photos.append(PosedPhoto(name, lens, cam_from_world, relative=relative))
 
     def leave_out(self, name: str, reason: str) -> None:
         """Count a photo that is not used."""

@@ -231,8 +231,11 @@ class PosedPhoto:
     """Sparse points that were found in it, where the input tells."""
     relative: RelativeLens | None = None
     """Intrinsics of a photo of any size."""
-    is_panorama: bool = False
-    """Whether the photo is equirectangular: it has no lens, and is cut into views when loaded."""
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether the photo is equirectangular: it has no lens, and is cut into views."""
+        return self.lens is None and self.angle_x is None and self.relative is None
 
 
 @dataclass(frozen=True)

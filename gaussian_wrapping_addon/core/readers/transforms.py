@@ -81,7 +81,7 @@ def read_transforms(path: Path) -> SourceModel:
         mask = frame.get("mask_path")
         if mask is not None:
             mask = _name(path, f"{place}.mask_path", mask)
-        photos.append(PosedPhoto(name, lens, pose, mask, angle_x, is_panorama=is_panorama))
+        photos.append(PosedPhoto(name, lens, pose, mask, angle_x))
     if unsafe:
         text = (
             f"{len(unsafe)} frames were left out because their file_path is too long or leads "
