@@ -129,9 +129,8 @@ def count_observing_views(cameras: Sequence[Camera], points: np.ndarray) -> np.n
     """Count the cameras whose image contains each of (n, 3) points, (n,) int."""
     seen = np.zeros(len(points), np.int64)
     for camera in cameras:
-        pixels, depth = camera.project(points)
-        inside = (pixels >= 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
-        seen += inside & (depth > NEAR_Z)
+        indices, _, _, depth = camera.shown(points)
+        seen[indices[depth > NEAR_Z]] += 1
     return seen
 
 

@@ -25,8 +25,8 @@ from ..settings.job import marker_spec
 from ..units.control_points import (
     ControlFile,
     ControlFit,
+    Observations,
     fit_control_points,
-    observations,
     read_control_file,
 )
 from ..units.georeference import (
@@ -231,11 +231,11 @@ def _control(
 ) -> ControlFit:
     index = PhotoIndex(kind.photo_roots)
     of_path = {view.source_path: i for i, view in enumerate(views)}
-    pixels: dict[tuple[str, int], tuple[int, np.ndarray]] = {}
+    seen: list[Observations] = []
     for point in content.points:
-        for i, (photo, pixel, line) in enumerate(
-            zip(point.photos, point.pixels, point.lines, strict=True)
-        ):
+        numbers: list[int] = []
+        places: list[np.ndarray] = []
+        for photo, pixel, line in zip(point.photos, point.pixels, point.lines, strict=True):
             match = index.find(photo)
             if match is None:
                 raise ParseError(
@@ -251,8 +251,11 @@ def _control(
                     file, f"line {line}", f"the pixel lies outside of {photo[:80]}.",
                     "Give pixels of the upright photo, from its upper left corner.",
                 )  # fmt: skip
-            pixels[point.name, i] = number, place
-    fit = fit_control_points(content, cameras, observations(content, pixels))
+            numbers.append(number)
+            places.append(place)
+        pixels = np.array(places).reshape(-1, 2)
+        seen.append(Observations(point.name, point.position, tuple(numbers), pixels))
+    fit = fit_control_points(content, cameras, seen)
     found = fit.details["control_points"]
     if found["left_out"]:
         text = f"{len(found['left_out'])} control points disagree with the others: " + ", ".join(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,15 +95,10 @@ def standing_groups(count: int, motions: Sequence[PairMotion]) -> list[list[int]
     a match.
     Numbers ascend; photos of no such group are in none.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    still = [motion for motion in motions if motion.is_still]
+    still = [(motion.first, motion.second) for motion in motions if motion.is_still]
     if not still:
         return []
-    ends = [motion.first for motion in still], [motion.second for motion in still]
-    graph = coo_matrix((np.ones(len(still)), ends), (count, count))
-    label = connected_components(graph, directed=False)[1]
+    label = connected_parts(count, still)
     partners, matched, moved = (np.zeros(count, int) for _ in range(3))
     for motion in motions:
         pair = [motion.first, motion.second]
@@ -120,6 +115,16 @@ def standing_groups(count: int, motions: Sequence[PairMotion]) -> list[list[int]
         if len(group) >= MIN_GROUP and np.median(moved[group]) >= MIN_TURNING_MATCHES:
             groups.append(group.tolist())
     return groups if sum(map(len, groups)) >= MIN_PHOTOS_SHARE * count else []
+
+
+def connected_parts(count: int, links: Iterable[tuple[int, int]]) -> np.ndarray:
+    """Return for each of ``count`` photos the number of its part, (count,): what links connect."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    first, second = np.array([*links], int).reshape(-1, 2).T
+    graph = coo_matrix((np.ones(len(first)), (first, second)), (count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 def are_turning(most_inliers: Sequence[int]) -> bool:
@@ -282,21 +287,11 @@ class Verdict:
 
     def parts(self, names: Sequence[str]) -> list[list[str]]:
         """Return photos in parts that no agreeing pair links, the largest part first."""
-        part = {name: name for name in names}
-
-        def root(name: str) -> str:
-            while part[name] != name:
-                part[name] = part[part[name]]
-                name = part[name]
-            return name
-
-        for pair in self.pairs:
-            if pair.agrees:
-                one, other = sorted((root(pair.first), root(pair.second)))
-                part[other] = one
-        groups: dict[str, list[str]] = defaultdict(list)
-        for name in names:
-            groups[root(name)].append(name)
+        number = {name: k for k, name in enumerate(names)}
+        links = [(number[pair.first], number[pair.second]) for pair in self.pairs if pair.agrees]
+        groups: dict[int, list[str]] = defaultdict(list)
+        for name, part in zip(names, connected_parts(len(names), links).tolist(), strict=True):
+            groups[part].append(name)
         return sorted(groups.values(), key=lambda group: (-len(group), group[0]))
 
     def to_json(self, names: Sequence[str]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 from ..photos.exif import GpsPosition
 from ..readers.lenses import import_pycolmap
 from ..worker.helper_process import emit
+from .checks import connected_parts
 
 # -- Distances between photos by their GPS positions ----------------------------------------------
 
@@ -172,9 +173,6 @@ def second_round(
     ``resemblance``: (count, count) array, decides between equals, and for photos without any
         neighbour.
     """
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
     linked = np.zeros((count, count), bool)
     for (i, j), matches in verified.items():
         if matches >= VERIFIED_MATCHES:
@@ -184,7 +182,7 @@ def second_round(
         done[i, j] = done[j, i] = True
     # Neighbours in common, then resemblance, which lies in [-1, 1].
     common = linked.astype(np.float32) @ linked.astype(np.float32)
-    apart = connected_components(csr_matrix(linked), directed=False)[1]
+    apart = connected_parts(count, np.argwhere(linked))
     largest = np.bincount(apart).argmax()
     pairs: set[tuple[int, int]] = set()
     for i in range(count):

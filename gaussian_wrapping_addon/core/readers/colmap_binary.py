@@ -151,8 +151,7 @@ def add_camera(
     cameras: dict[int, LensCamera], camera_id: int, camera: LensCamera, path: Path, place: str
 ) -> None:
     """Add a camera to ``cameras``; raise :class:`ParseError` if it is invalid."""
-    problem = camera.problem()
-    if problem:
+    if problem := camera.problem():
         raise ParseError(path, place, f"{problem}.", "Solve the cameras again.")
     if cameras.get(camera_id, camera) != camera:
         raise ParseError(path, place, f"camera {camera_id} is defined twice.", AGAIN)

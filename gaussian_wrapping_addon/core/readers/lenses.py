@@ -133,8 +133,7 @@ def fit_lens(
     if posed.relative is not None:
         width, height = stored if prefers_stored else upright
         lens = posed.relative.of_size(width, height)
-        problem = lens.problem()
-        if problem:
+        if problem := lens.problem():
             text = f"The camera of {file_name}: {problem}."
             raise DatasetError(text, "Export the cameras again.")
         return lens, not prefers_stored, False

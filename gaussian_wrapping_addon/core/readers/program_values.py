@@ -90,8 +90,7 @@ def rotation(path: Path, place: str, matrix: np.ndarray) -> np.ndarray:
 
 def checked_lens(path: Path, place: str, lens: LensCamera) -> LensCamera:
     """Return the lens, or raise :class:`ParseError` with what makes it unusable."""
-    problem = lens.problem()
-    if problem:
+    if problem := lens.problem():
         raise ParseError(path, place, f"{problem}.", AGAIN)
     return lens
 

@@ -118,21 +118,6 @@ def _name(path: Path, place: str, value: Any) -> str:
     return name
 
 
-def _number(path: Path, place: str, values: dict[str, Any], key: str) -> float | None:
-    value = values.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ParseError(path, f"{place}.{key}", "a number was expected.", _AGAIN)
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise ParseError(path, f"{place}.{key}", "the number is not finite.", _AGAIN)
-    return number
-
-
 def _pose(path: Path, place: str, value: Any) -> tuple[np.ndarray, bool]:
     """Return (3, 4) cam_from_world with COLMAP axes, and whether a scale was removed."""
     try:
@@ -167,7 +152,18 @@ def _intrinsics(
     """Return the lens, or ``None`` and the angle if the photo's size is needed to complete it."""
 
     def number(key: str) -> float | None:
-        return _number(path, place, values, key)
+        value = values.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ParseError(path, f"{place}.{key}", "a number was expected.", _AGAIN)
+        try:
+            found = float(value)
+        except OverflowError:
+            found = math.inf
+        if not math.isfinite(found):
+            raise ParseError(path, f"{place}.{key}", "the number is not finite.", _AGAIN)
+        return found
 
     stated = str(values.get("camera_model", ""))
     if stated and stated not in _LENSES:
@@ -214,8 +210,7 @@ def _intrinsics(
     if not (1 <= width <= limits.MAX_IMAGE_SIDE_PX and 1 <= height <= limits.MAX_IMAGE_SIDE_PX):
         raise ParseError(path, place, f"image size {width:g} x {height:g} is out of range.", _AGAIN)
     lens = LensCamera(model, round(width), round(height), params)
-    problem = lens.problem()
-    if problem:
+    if problem := lens.problem():
         raise ParseError(path, place, f"{problem}.", _AGAIN)
     return lens, None
 

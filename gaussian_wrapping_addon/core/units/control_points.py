@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -362,23 +362,6 @@ class Observations:
     cameras: tuple[int, ...]
     pixels: np.ndarray
     """(n, 2) in the pinhole images of these cameras."""
-
-
-def observations(
-    content: ControlFile, pixels: Mapping[tuple[str, int], tuple[int, np.ndarray]]
-) -> list[Observations]:
-    """Gather the observations of each point.
-
-    ``pixels``: camera and pinhole pixel of each observation whose photo was placed, by the point's
-        name and the index of the observation.
-    """
-    out = []
-    for point in content.points:
-        keys = [(point.name, i) for i in range(len(point.photos))]
-        found = [pixels[key] for key in keys if key in pixels]
-        places = np.array([pixel for _, pixel in found]).reshape(-1, 2)
-        out.append(Observations(point.name, point.position, tuple(c for c, _ in found), places))
-    return out
 
 
 def fit_control_points(
