@@ -33,9 +33,7 @@ from .video import (
     upright_color,
 )
 
-# -- How far the picture has moved between two frames: parts of small grey pictures are followed
-#
-# docs/method.md, section 14.1.
+# -- How far the picture has moved between two frames (docs/method.md, section 14.1) --------------
 
 MOTION_SIDE_PX = 160
 """Long side of the pictures that motion is measured in."""
@@ -155,9 +153,7 @@ def _block_sums(values: np.ndarray, cut: Sequence[slice], block: int) -> np.ndar
     return inside.reshape(height // block, block, width // block, block).sum((1, 3))
 
 
-# -- Sharpness of frames: fine detail in each direction, and which frames lack it -----------------
-#
-# docs/method.md, section 14.2.
+# -- Sharpness of frames: fine detail in each direction (docs/method.md, section 14.2) ------------
 
 SHARPNESS_SIDE_PX = 960
 """Long side of the pictures that sharpness is measured in."""
@@ -237,9 +233,7 @@ def _noise_variance(grey: np.ndarray) -> float:
     return (1.4826 * median / 6.0) ** 2  # of a normal distribution; the mask has the norm 6
 
 
-# -- Choose the frames of a video: the sharpest of each stretch of motion -------------------------
-#
-# docs/method.md, section 14.3.
+# -- Choose frames: the sharpest of each stretch of motion (docs/method.md, section 14.3) ---------
 
 MOTION_STEP = 0.08
 """Way of the picture from one chosen frame to the next, in its long sides."""
@@ -342,8 +336,7 @@ def _show_the_same(ways: np.ndarray, blurred: np.ndarray) -> np.ndarray:
     return same
 
 
-# -- Helper process of :mod:`.video_frames`: decodes a video twice, measures frames and writes the
-#    chosen
+# -- Helper process: decodes a video twice, measures frames and writes the chosen -----------------
 #
 # Reads ``task.json`` of its folder; writes ``frames/`` and, last, ``chosen.json``.
 

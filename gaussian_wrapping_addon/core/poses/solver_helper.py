@@ -38,8 +38,6 @@ from .turntable import (
 )
 
 # -- Place the photos of a solver's database: one after the other, or all at once -----------------
-#
-# Runs in the helper process of :mod:`.solver`.
 
 MIN_MODEL = 3
 """Photos of the smallest part that is kept."""
@@ -233,12 +231,10 @@ def _center(pose: np.ndarray) -> np.ndarray:
     return -pose[:, :3].T @ pose[:, 3]
 
 
-# -- Solve doubtful cameras again from the pairs that are most alike (docs/method.md, section
-#    15.3)
+# -- Solve doubtful cameras again from the most alike pairs (docs/method.md, section 15.3) --------
 #
-# Runs in the helper process of :mod:`.solver`. Where things repeat, photos match that show
-# different things. They have less in common than true neighbours: beside what repeats, each shows
-# things that the other does not.
+# Where things repeat, photos match that show different things. They have less in common than true
+# neighbours: beside what repeats, each shows things that the other does not.
 
 MOST_ALIKE = 3
 """Pairs of each photo by which two solutions are compared."""
@@ -341,7 +337,7 @@ def near_in_tree(alike: Alike) -> set[tuple[int, int]]:
     return {pair for pair in alike if steps[index[pair[0]], index[pair[1]]] <= TREE_STEPS}
 
 
-# -- Helper process of :mod:`.solver`: feature extraction, matching, mapping, triangulation
+# -- The helper process: feature extraction, matching, mapping, triangulation ---------------------
 #
 # Reads ``task.json``, ``images/`` and ``masks/`` of its folder, writes ``model/`` (COLMAP
 # binary), and ``turntable.json``, ``turning/`` and ``solution.json`` where it solves.

@@ -158,8 +158,7 @@ def lens_of(path: Path, place: str, camera: dict[str, Any]) -> LensCamera:
     return checked_lens(path, place, lens)
 
 
-# -- Read ``shots.geojson`` with ``cameras.json`` of OpenDroneMap: what its archive of results
-#    holds
+# -- Read ``shots.geojson`` with ``cameras.json``, as OpenDroneMap's archive of results has them --
 #
 # A shot's ``translation`` is the camera's centre in the map's metres, ``rotation`` (axis times
 # angle) leads from there to the camera. Lenses are in ``cameras.json``; a shot names its lens by
