@@ -293,8 +293,7 @@ def _check_video(path: Path, worker: str, findings: Findings) -> None:
 def _check_photos(kind: SourceKind, findings: Findings, panoramas: str) -> None:
     root = photo_root(kind.folder)
     photos = list_photos(root)
-    names = [path.relative_to(root).as_posix() for path in photos]
-    _check_files(kind, photos, names, findings)
+    _check_files(kind, photos, [path.relative_to(root).as_posix() for path in photos], findings)
     findings.take(second_copies_warning(root))
     findings.tell("The input has no camera poses; they will be solved from the photos.")
     by_shape = shape_warning(photos, panoramas)
@@ -391,8 +390,7 @@ def _check_files(
         if posed is not None and posed[path].is_panorama:
             check_panorama(header, path.name)
         elif posed is not None:
-            prefers_stored = counts_stored_pixels(kind.kind)
-            fit_lens(posed[path], header, path.name, prefers_stored=prefers_stored)
+            fit_lens(posed[path], header, path.name, prefers_stored=counts_stored_pixels(kind.kind))
         sizes[f"{width} x {height}"] += 1
         small += max(width, height) < _MIN_GOOD_SIDE_PX
     good = len(photos) - len(bad)

@@ -272,8 +272,7 @@ def load_scene(
     sizes = {f"{view.camera.width} x {view.camera.height}" for view in in_scene}
     facts["photo_sizes"] = sorted(sizes)[:4]
     progress.update(1.0, f"{len(views)} photos and {len(points)} points are ready")
-    world_from_scene = scene_from_world.inverse()
-    return Scene(in_scene, points, colors, world_from_scene, tuple(warnings), facts)
+    return Scene(in_scene, points, colors, scene_from_world.inverse(), tuple(warnings), facts)
 
 
 def _refuse_places_of_panoramas(units: UnitsRequest) -> None:

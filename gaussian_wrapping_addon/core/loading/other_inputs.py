@@ -99,8 +99,7 @@ def with_views_of_panoramas(
     check_unreadable_share(bad, len(found))
     photos = [photo for photo in model.photos if not photo.is_panorama]
     for view in cut:
-        pose = owners[view.panorama].cam_from_world
-        turned = VIEWS[view.view].cam_from_panorama @ pose
+        turned = VIEWS[view.view].cam_from_panorama @ owners[view.panorama].cam_from_world
         photos.append(PosedPhoto(view.name, view_lens(view.width), turned, mask_path=view.mask))
     warnings = [*model.warnings, *_warnings(bad, missing)]
     if masks_missing:

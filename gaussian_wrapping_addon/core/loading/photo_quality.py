@@ -75,8 +75,7 @@ def reduced_grey(path: Path) -> np.ndarray:
     Raises DatasetError, MissingExtraError: as :func:`~.photo_file.read_photo`.
     """
     header = photo_header(path)
-    long_px = max(header.width, header.height)
-    if long_px >= 2 * MEASURED_PX and photo_kind(path) != RAW:
+    if max(header.width, header.height) >= 2 * MEASURED_PX and photo_kind(path) != RAW:
         with without_warnings():
             pixels = _drafted(path)
         if pixels is not None:

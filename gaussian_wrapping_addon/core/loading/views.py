@@ -303,5 +303,4 @@ def _resized_mask(mask: np.ndarray, shape: tuple[int, ...], path: Path) -> np.nd
             f"{path.name} is {mask.shape[1]} x {mask.shape[0]} pixels, its photo "
             f"{shape[1]} x {shape[0]}."
         )
-    resized = Image.fromarray(mask).resize((shape[1], shape[0]), Image.Resampling.NEAREST)
-    return np.asarray(resized)
+    return np.asarray(Image.fromarray(mask).resize((shape[1], shape[0]), Image.Resampling.NEAREST))

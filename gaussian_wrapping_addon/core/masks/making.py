@@ -110,8 +110,7 @@ def silhouettes(
         options = RenderOptions(
             depth=False, sh_degree=0, threads=threads, near_z=_near_z(camera, bounds)
         )
-        color = renderer.render(arrays, camera, options).color
-        yield np.clip(color[..., 0], 0.0, 1.0)
+        yield np.clip(renderer.render(arrays, camera, options).color[..., 0], 0.0, 1.0)
 
 
 def _near_z(camera: Camera, bounds: np.ndarray | None) -> float:

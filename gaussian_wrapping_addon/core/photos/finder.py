@@ -171,8 +171,7 @@ class PhotoIndex:
             path = resolve_photo(root, name)
             if path is not None and os.path.isfile(path):
                 return Match(path, "exact")
-        clean = str(PurePosixPath(name.replace("\\", "/")))
-        keys = _keys(clean)
+        keys = _keys(str(PurePosixPath(name.replace("\\", "/"))))
         # A name without extension may still hold a dot: "img.0001".
         keys.insert(1, ("extension", keys[0][1]))
         for how, key in keys:
@@ -218,8 +217,7 @@ def find_mask(mask_roots: list[Path], name: str, beside: Sequence[Path] = ()) ->
             continue
         mask = _masks_beside(str(photo.parent), os.stat(photo.parent).st_mtime_ns).get(photo.name)
         if mask is not None:
-            here = PurePosixPath(name.replace("\\", "/")).parent
-            path = resolve_photo(root, str(here / mask))
+            path = resolve_photo(root, str(PurePosixPath(name.replace("\\", "/")).parent / mask))
             if path is not None and os.path.isfile(path):
                 return path
     return None

@@ -190,8 +190,7 @@ def _to_arrays(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
     """Return (h, w, 3) uint8 colour and (h, w) uint8 alpha or ``None``."""
     mode = image.mode
     if mode in ("I;16", "I;16L", "I;16B", "I", "F"):
-        grey = _grey_to_eight_bits(np.asarray(image))
-        return np.repeat(grey[..., None], 3, 2), None
+        return np.repeat(_grey_to_eight_bits(np.asarray(image))[..., None], 3, 2), None
     if mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
         pixels = np.asarray(image.convert("RGBA"))
         color, alpha = (np.ascontiguousarray(part) for part in (pixels[..., :3], pixels[..., 3]))

@@ -78,8 +78,7 @@ def photo_memory(photos: int, pixels: float, *, masked: bool, free_bytes: int) -
     ``pixels``: of a photo at the largest of them. ``free_bytes``: free memory of the machine; 0 if
     unknown.
     """
-    channels = 4 if masked else 3
-    all_bytes = round(photos * pixels * channels * (1 + 1 / 4 + 1 / 16))
+    all_bytes = round(photos * pixels * (4 if masked else 3) * (1 + 1 / 4 + 1 / 16))
     return PhotoMemory(photos, all_bytes, photo_budget_bytes(free_bytes))
 
 

@@ -388,8 +388,7 @@ def upright_color(frame: VideoFrame, pixel_ratio: float = 1.0) -> np.ndarray:
 def upright_size(frame: VideoFrame, pixel_ratio: float) -> tuple[int, int]:
     """Return width and height of :func:`upright_color`."""
     width = max(MIN_SIDE_PX, round(frame.width * pixel_ratio))
-    is_turned = _display_matrix(frame)[1] != 0
-    return (frame.height, width) if is_turned else (width, frame.height)
+    return (frame.height, width) if _display_matrix(frame)[1] else (width, frame.height)
 
 
 def _plane(frame: VideoFrame, channels: int) -> np.ndarray:

@@ -109,8 +109,7 @@ def standing_groups(count: int, motions: Sequence[PairMotion]) -> list[list[int]
         moved[pair] = np.maximum(moved[pair], motion.moved)
     groups = []
     for number in np.unique(label):
-        of_group = label == number
-        group = np.flatnonzero(of_group & (partners >= MIN_PARTNERS_SHARE * matched))
+        group = np.flatnonzero((label == number) & (partners >= MIN_PARTNERS_SHARE * matched))
         # Nothing that turns: the same photo many times, or a camera that waits.
         if len(group) >= MIN_GROUP and np.median(moved[group]) >= MIN_TURNING_MATCHES:
             groups.append(group.tolist())

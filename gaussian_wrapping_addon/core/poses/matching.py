@@ -243,8 +243,7 @@ def vocabulary(count: int, read: ReadDescriptors, *, seed: int) -> np.ndarray:
     samples = []
     for number in range(count):
         found = _unit(read(number)[-DESCRIBING:])
-        picked = chance.permutation(len(found))[:each]
-        samples.append(found[np.sort(picked)])
+        samples.append(found[np.sort(chance.permutation(len(found))[:each])])
     sample = np.concatenate(samples) if samples else np.zeros((0, 128), np.float32)
     words = sample[np.sort(chance.permutation(len(sample))[:WORDS])]
     for _ in range(_ROUNDS if len(words) else 0):
@@ -277,8 +276,7 @@ def photo_vectors(count: int, read: ReadDescriptors, words: np.ndarray) -> np.nd
     has_any = np.any(vectors != 0.0, axis=1)
     if has_any.any():
         vectors[has_any] -= vectors[has_any].mean(0)
-        lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-        vectors /= np.maximum(lengths, 1e-12)
+        vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
     return vectors
 
 

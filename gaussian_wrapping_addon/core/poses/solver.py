@@ -194,13 +194,11 @@ def solve_poses(
         raise DatasetError(text, "Add photos.")
     groups: dict[tuple[Any, ...], list[_SolverPhoto]] = {}
     for photo in prepared:
-        key = (photo.full_width, photo.full_height, *photo.lens_key)
-        groups.setdefault(key, []).append(photo)
+        groups.setdefault((photo.full_width, photo.full_height, *photo.lens_key), []).append(photo)
     told = []
     for group in groups.values():
         size = {"width": group[0].width, "height": group[0].height}
-        names_of_group = [p.name for p in group]
-        told.append({**size, "focal_px": group[0].focal_px, "names": names_of_group})
+        told.append({**size, "focal_px": group[0].focal_px, "names": [p.name for p in group]})
     task = {
         "mode": "solve", "seed": seed, "threads": threads or default_threads(),
         "turntable": turntable, "groups": told, "in_order": in_order,

@@ -222,8 +222,7 @@ def _moved_onto(
     shift = target.mean(0) - scale * source.mean(0)
     moved = {}
     for number, pose in theirs.items():
-        center = scale * rotation @ _center(pose) + shift
-        moved[number] = pose_at(pose[:, :3] @ rotation.T, center)
+        moved[number] = pose_at(pose[:, :3] @ rotation.T, scale * rotation @ _center(pose) + shift)
     return moved
 
 
@@ -331,8 +330,7 @@ def near_in_tree(alike: Alike) -> set[tuple[int, int]]:
     ends = [index[a] for a, _ in alike], [index[b] for _, b in alike]
     # Zero would mean no edge.
     apart = np.array([1.0 + 1e-9 - value for value in alike.values()])
-    shape = (len(numbers), len(numbers))
-    tree = minimum_spanning_tree(csr_matrix((apart, ends), shape=shape))
+    tree = minimum_spanning_tree(csr_matrix((apart, ends), shape=(len(numbers), len(numbers))))
     steps = shortest_path(tree, directed=False, unweighted=True)
     return {pair for pair in alike if steps[index[pair[0]], index[pair[1]]] <= TREE_STEPS}
 
@@ -534,8 +532,7 @@ def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) ->
     if groups:
         emit(fraction=MATCH_END, message="separating what turns from what stands still")
         verify_again(database, task, is_turntable=True)
-        turn = are_turning(most_inliers(database, names, pairs))
-        if task["turntable"] == "auto" and not turn:
+        if task["turntable"] == "auto" and not are_turning(most_inliers(database, names, pairs)):
             verify_again(database, task, is_turntable=False)
             groups, names = [], []
     found: dict[str, Any] = {"photos": len(names), "is_masked": False}
@@ -565,8 +562,7 @@ def _triangulate(folder: Path, task: dict[str, Any]) -> None:
     names_of_camera: dict[int, list[str]] = {}
     with pycolmap.Database.open(database) as db:
         for (width, height, *params), names in photos_of_lens.items():
-            size = (int(width), int(height))
-            names_of_camera[_added_camera(db, "PINHOLE", size, params)] = names
+            names_of_camera[_added_camera(db, "PINHOLE", (int(width), int(height)), params)] = names
     extract(folder, database, names_of_camera, task["threads"], _MAX_FEATURES_POSED)
     match(folder, database, task)
     pose_of_name = {p["name"]: np.array(p["cam_from_world"]) for p in task["photos"]}

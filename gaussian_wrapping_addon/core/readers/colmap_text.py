@@ -131,8 +131,7 @@ def _image(path: Path, line: int, text: str) -> RawImage:
     image_id = _whole(path, line, words[0], "image number")
     camera_id = _whole(path, line, words[8], "camera number")
     quaternion, translation = np.array(values[:4]), np.array(values[4:])
-    name = words[9].rstrip()
-    return RawImage(image_id, quaternion, translation, camera_id, name, f"line {line}")
+    return RawImage(image_id, quaternion, translation, camera_id, words[9].rstrip(), f"line {line}")
 
 
 def read_points(path: Path) -> tuple[RawPoints, list[ReportWarning]]:

@@ -163,8 +163,7 @@ def fit_lens(
 
 def same_proportions(size: tuple[int, int], lens: LensCamera) -> bool:
     """Whether ``size`` is the camera's size times a factor, up to rounding to whole pixels."""
-    tolerance = lens.width + lens.height
-    return abs(size[0] * lens.height - size[1] * lens.width) < tolerance
+    return abs(size[0] * lens.height - size[1] * lens.width) < lens.width + lens.height
 
 
 # -- Undistort photos: pinhole intrinsics of a lens model and the sampling map into the photo -----
@@ -219,8 +218,7 @@ def sampling_map(camera: LensCamera, pinhole: LensCamera) -> np.ndarray:
         rays = np.ones((end - begin, pinhole.width, 3))
         rays[..., 0] = x
         rays[..., 1] = ((np.arange(begin, end) + 0.5 - cy) / fy)[:, None]
-        pixels = project(camera, rays.reshape(-1, 3)).reshape(end - begin, pinhole.width, 2)
-        out[begin:end] = pixels
+        out[begin:end] = project(camera, rays.reshape(-1, 3)).reshape(end - begin, pinhole.width, 2)
     if not np.isfinite(out).all():
         raise _unusable(camera)
     return out
@@ -232,8 +230,7 @@ def pinhole_pixels(camera: LensCamera, pinhole: LensCamera, pixels: np.ndarray) 
     if camera.is_pinhole:
         return pixels
     fx, fy, cx, cy = pinhole.params
-    slopes = np.asarray(_native(camera).cam_from_img(pixels), np.float64)
-    return slopes * (fx, fy) + (cx, cy)
+    return np.asarray(_native(camera).cam_from_img(pixels), np.float64) * (fx, fy) + (cx, cy)
 
 
 def project(camera: LensCamera, points: np.ndarray) -> np.ndarray:
@@ -290,8 +287,7 @@ def _slopes(camera: LensCamera, pixels: np.ndarray) -> np.ndarray:
         found = np.asarray(lens.cam_from_img(trial), np.float64)
         good = np.isfinite(found).all(1) & (np.abs(found).max(1) <= _MAX_SLOPE)
         rays = np.concatenate([np.where(good[:, None], found, 0.0), np.ones((len(found), 1))], 1)
-        back = project(camera, rays)
-        good &= np.abs(back - trial).max(1) <= _ROUND_TRIP_PX
+        good &= np.abs(project(camera, rays) - trial).max(1) <= _ROUND_TRIP_PX
         slopes[open_rows & good] = found[open_rows & good]
         open_rows &= ~good
         if not open_rows.any():

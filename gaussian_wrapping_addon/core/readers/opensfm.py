@@ -90,8 +90,7 @@ def read_opensfm(path: Path) -> SourceModel:
             lenses[key] = lens
         turned = rotation_of(numbers(path, f"{here}.rotation", shot.get("rotation"), 3))
         shift = numbers(path, f"{here}.translation", shot.get("translation"), 3)
-        pose = np.concatenate([turned, shift[:, None]], 1)
-        photos.add(names[name], lenses[key], pose)
+        photos.add(names[name], lenses[key], np.concatenate([turned, shift[:, None]], 1))
     usable = photos.finished()
     table, here = _table(path, place, entry, "points"), f"{place}.points"
     named = ((f"{here}[{key[:80]!r}]", point) for key, point in table.items())

@@ -133,8 +133,7 @@ def read_splat_header(path: Path) -> SplatHeader:
             path, "header", f"not a splat but {what}: property "
             f"{', '.join(missing[:3])} is missing.", EXPECTED,
         )  # fmt: skip
-    axes = 3 if "scale_2" in names else 2
-    header = SplatHeader(ply, _degree(path, names), axes, colors)
+    header = SplatHeader(ply, _degree(path, names), 3 if "scale_2" in names else 2, colors)
     if header.count == 0:
         raise DatasetError(f"{path.name} holds no Gaussians.", "Export the splat again.")
     return header

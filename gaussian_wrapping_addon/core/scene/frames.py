@@ -152,8 +152,7 @@ def find_scene_frame(
     rotation = snapped_rotation(_rotation_to_z(up, rotations[keep]) @ first.T, FRAME_STEP) @ first
     spread = np.linalg.svd(offsets, compute_uv=False)
     world_from_scene = Similarity(RADIUS_MARGIN * reach / SCENE_RADIUS, rotation.T, mean)
-    collinear = bool(spread[1] < 1e-3 * spread[0])
-    return SceneFrame(world_from_scene.inverse(), keep, rule, collinear)
+    return SceneFrame(world_from_scene.inverse(), keep, rule, bool(spread[1] < 1e-3 * spread[0]))
 
 
 def near_cameras(centers: np.ndarray) -> np.ndarray:
@@ -182,8 +181,7 @@ def up_direction(rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray
     Returns ``up``: (3,) float64, unit length, world frame; ``rule``: ``"level cameras"``, ``"plane
     camera path"`` or ``"mean camera up"``.
     """
-    ups = -rotations[:, 1, :]  # (n, 3): y points down
-    guess = _robust_mean(ups)
+    guess = _robust_mean(-rotations[:, 1, :])  # (n, 3): y points down
     rights = rotations[:, 0, :]  # (n, 3)
     level, values = _least_aligned(rights)
     tilt = float(np.median(np.abs(rights @ level)))
@@ -247,8 +245,7 @@ def _rotation_to_z(up: np.ndarray, rotations: np.ndarray) -> np.ndarray:
         first = rotations[0, 2, :] if abs(rotations[0, 2, :] @ up) < 0.99 else -rotations[0, 1, :]
         ahead = first - up * (up @ first)
     ahead = ahead / np.linalg.norm(ahead)
-    right = np.cross(ahead, up)
-    return np.stack([right, ahead, up])
+    return np.stack([np.cross(ahead, up), ahead, up])
 
 
 # -- Estimate the up direction from cameras that may be rolled by quarter turns -------------------
@@ -468,8 +465,7 @@ def _fullest_band(heights: np.ndarray, weights: np.ndarray, width: float) -> flo
     order = np.argsort(heights, kind="stable")
     heights, total = heights[order], np.concatenate([[0.0], np.cumsum(weights[order])])
     last = np.searchsorted(heights, heights + width, side="right")  # (k,)
-    first = int(np.argmax(total[last] - total[:-1]))
-    return float(heights[first] + 0.5 * width)
+    return float(heights[int(np.argmax(total[last] - total[:-1]))] + 0.5 * width)
 
 
 # -- Coordinate frame of an exported file: target frame, axes and offset --------------------------
@@ -505,8 +501,7 @@ class FileFrame:
 
     def file_from_scene(self) -> Similarity:
         """Return the transform from the scene frame to the file's coordinates."""
-        turned = Similarity(1.0, self.turn, -(self.turn @ self.offset))
-        return turned.after(self.target_from_scene)
+        return Similarity(1.0, self.turn, -(self.turn @ self.offset)).after(self.target_from_scene)
 
     def to_json(
         self, world_from_scene: Similarity, blender_from_scene: Similarity

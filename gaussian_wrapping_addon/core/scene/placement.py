@@ -70,8 +70,7 @@ def _pairs(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def require_plane(points: np.ndarray, name: str) -> None:
     local = points - points.mean(0)
-    variances = np.linalg.eigvalsh(local.T @ local / len(local))[::-1]
-    extents = np.sqrt(np.maximum(variances, 0.0))
+    extents = np.sqrt(np.maximum(np.linalg.eigvalsh(local.T @ local / len(local))[::-1], 0.0))
     rounding = 8 * np.finfo(np.float64).eps * np.abs(points).max()
     if extents[1] <= max(COLLINEAR_SHARE * extents[0], rounding):
         what = "in one place" if extents[0] <= rounding else "on one line"
@@ -234,8 +233,7 @@ def plane_through(points: np.ndarray, above: np.ndarray) -> Plane:
         hint = "Pick three points or more on the ground."
         raise UsageError(f"{_count(len(points))} picked.", hint)
     center = points.mean(0)
-    offsets = points - center
-    _, extents, axes = np.linalg.svd(offsets, full_matrices=False)  # (3,), (3, 3)
+    _, extents, axes = np.linalg.svd(points - center, full_matrices=False)  # (3,), (3, 3)
     if extents[0] <= COINCIDENT * float(np.abs(points).max()):
         raise UsageError("The points coincide.", "Pick three points that are far apart.")
     if extents[1] <= COLLINEAR * extents[0]:

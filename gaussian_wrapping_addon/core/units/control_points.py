@@ -69,8 +69,7 @@ def triangulate(
     best: tuple[int, float, np.ndarray, np.ndarray] | None = None
     pairs = list(itertools.combinations(range(len(cameras)), 2))
     for i, j in pairs[:: max(1, math.ceil(len(pairs) / MAX_PAIRS))]:
-        sine = np.linalg.norm(np.cross(rays[i], rays[j]))
-        if sine < math.sin(math.radians(MIN_ANGLE_DEG)):
+        if np.linalg.norm(np.cross(rays[i], rays[j])) < math.sin(math.radians(MIN_ANGLE_DEG)):
             continue
         point = _nearest(centers[[i, j]], rays[[i, j]])
         distances = _distances(cameras, pixels, point)
@@ -139,8 +138,7 @@ def _least_squares(
         squared = float((errors**2).sum())
         if np.linalg.norm(step) <= 1e-12 * (1.0 + np.linalg.norm(point)):
             break
-    freedom = max(2 * len(chosen) - 3, 1)
-    variance = max(squared / freedom, noise_px**2)
+    variance = max(squared / max(2 * len(chosen) - 3, 1), noise_px**2)
     return point, variance * np.linalg.inv(normal)
 
 

@@ -88,8 +88,7 @@ def enu_axes(origin: GeoPoint) -> np.ndarray:
 
 def enu_from_geographic(places: np.ndarray, origin: GeoPoint) -> np.ndarray:
     """Return (n, 3) metres east, north and up of ``origin`` of (n, 3) geographic places."""
-    shift = ecef_from_geographic(places) - ecef_from_geographic(_row(origin))
-    return shift @ enu_axes(origin).T
+    return (ecef_from_geographic(places) - ecef_from_geographic(_row(origin))) @ enu_axes(origin).T
 
 
 def geographic_from_enu(points: np.ndarray, origin: GeoPoint) -> np.ndarray:

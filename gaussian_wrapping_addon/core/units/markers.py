@@ -59,8 +59,7 @@ def refined_corners(grey: np.ndarray, corners: np.ndarray, modules: int) -> np.n
     clear.
     """
     corners = np.asarray(corners, np.float64)
-    sides = np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=1)
-    module = float(sides.min()) / modules
+    module = float(np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=1).min()) / modules
     if module < MIN_MODULE_PX:
         return None
     half = min(_MODULE_SHARE * module, _MAX_HALF_WIDTH_PX)
@@ -105,8 +104,7 @@ def _edge_line(
         return None
     # Slopes of noise count as well: only those near the steepest place belong to the edge.
     offset = (rise * between).sum(1) / np.maximum(total, 1e-9)
-    points = (base + offset[:, None] * normal)[good]
-    return _line(points)
+    return _line((base + offset[:, None] * normal)[good])
 
 
 def _sampled(grey: np.ndarray, places: np.ndarray) -> np.ndarray | None:
@@ -172,8 +170,7 @@ def main(folder: Path) -> None:
     photos = task["photos"]
     for i, path in enumerate(photos):
         red, green, blue = np.moveaxis(read_photo(Path(path)).color.astype(np.uint16), 2, 0)
-        luma = (77 * red + 150 * green + 29 * blue) >> 8
-        grey = np.ascontiguousarray(luma.astype(np.uint8))
+        grey = np.ascontiguousarray(((77 * red + 150 * green + 29 * blue) >> 8).astype(np.uint8))
         corners, numbers, _ = detector.detectMarkers(grey)
         found.append(_markers(grey, corners, numbers, modules))
         emit(fraction=(i + 1) / len(photos), message=f"markers of photo {i + 1} of {len(photos)}")
@@ -353,5 +350,4 @@ def _measured_side(
     # The side is linear in the corners along the fitted square's arms; they sum to |arm|^2 = 2.
     arms = fit.directions(_SQUARE)
     variance = sum(float(a @ c @ a) for a, c in zip(arms, covariances, strict=True))
-    total = float((_SQUARE**2).sum())
-    return fit.scale, math.sqrt(variance) / total, agreeing
+    return fit.scale, math.sqrt(variance) / float((_SQUARE**2).sum()), agreeing
