@@ -33,87 +33,95 @@ _LARGEST = 1e15
 """Of a number in a file: the squares of larger ones leave no digits for a camera."""
 
 
-def number(path: Path, place: str, value: Any) -> float:
-    """Return a finite number, also where the file writes it as text. Raises ParseError."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise ParseError(path, place, "a number was expected.", AGAIN)
-    try:
-        result = float(value)
-    except (ValueError, OverflowError):
-        raise ParseError(path, place, "a number was expected.", AGAIN) from None
-    if not math.isfinite(result) or abs(result) > _LARGEST:
-        raise ParseError(path, place, "the number is not finite, or too large.", AGAIN)
-    return result
+@dataclass(frozen=True)
+class CameraFile:
+    """A file of another program, with checked values of it; errors name their place there."""
 
+    path: Path
 
-def numbers(path: Path, place: str, values: Any, count: int) -> np.ndarray:
-    """Return (count,) float64 of a list of numbers, or of a text with blanks between them.
+    def wrong(self, place: str, text: str, hint: str = AGAIN) -> ParseError:
+        """Return the error for what is wrong at a place."""
+        return ParseError(self.path, place, text, hint)
 
-    Raises ParseError.
-    """
-    if isinstance(values, str):
-        values = values.split()
-    if not isinstance(values, Sequence) or len(values) != count:
-        raise ParseError(path, place, f"{count} numbers were expected.", AGAIN)
-    return np.array([number(path, f"{place}[{i}]", value) for i, value in enumerate(values)])
+    def number(self, place: str, value: Any) -> float:
+        """Return a finite number, also where the file writes it as text. Raises ParseError."""
+        if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+            raise self.wrong(place, "a number was expected.")
+        try:
+            result = float(value)
+        except (ValueError, OverflowError):
+            raise self.wrong(place, "a number was expected.") from None
+        if not math.isfinite(result) or abs(result) > _LARGEST:
+            raise self.wrong(place, "the number is not finite, or too large.")
+        return result
 
+    def numbers(self, place: str, values: Any, count: int) -> np.ndarray:
+        """Return (count,) float64 of a list of numbers, or of a text with blanks between them.
 
-def whole(path: Path, place: str, value: Any) -> int:
-    """Return a whole number of at most 10 digits. Raises ParseError."""
-    result = number(path, place, value)
-    if result != round(result) or abs(result) > 1e10:
-        raise ParseError(path, place, "a whole number was expected.", AGAIN)
-    return round(result)
+        Raises ParseError.
+        """
+        if isinstance(values, str):
+            values = values.split()
+        if not isinstance(values, Sequence) or len(values) != count:
+            raise self.wrong(place, f"{count} numbers were expected.")
+        return np.array([self.number(f"{place}[{i}]", value) for i, value in enumerate(values)])
 
+    def _whole(self, place: str, value: Any) -> int:
+        """Return a whole number of at most 10 digits. Raises ParseError."""
+        result = self.number(place, value)
+        if result != round(result) or abs(result) > 1e10:
+            raise self.wrong(place, "a whole number was expected.")
+        return round(result)
 
-def image_size(path: Path, place: str, width: Any, height: Any) -> tuple[int, int]:
-    """Return a photo's width and height in pixels. Raises ParseError."""
-    size = whole(path, f"{place}.width", width), whole(path, f"{place}.height", height)
-    if not all(0 < side <= limits.MAX_IMAGE_SIDE_PX for side in size):
-        raise ParseError(path, place, f"image size {size[0]} x {size[1]} is out of range.", AGAIN)
-    return size
+    def image_size(self, place: str, width: Any, height: Any) -> tuple[int, int]:
+        """Return a photo's width and height in pixels. Raises ParseError."""
+        size = self._whole(f"{place}.width", width), self._whole(f"{place}.height", height)
+        if not all(0 < side <= limits.MAX_IMAGE_SIDE_PX for side in size):
+            raise self.wrong(place, f"image size {size[0]} x {size[1]} is out of range.")
+        return size
 
+    def rotation(self, place: str, matrix: np.ndarray) -> np.ndarray:
+        """Return the rotation nearest to a (3, 3) matrix that is one but for the digits written.
 
-def rotation(path: Path, place: str, matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to a (3, 3) matrix that is one but for the digits written.
+        Raises ParseError: the matrix is not orthonormal, or it mirrors.
+        """
+        u, sizes, vt = np.linalg.svd(matrix)
+        nearest: np.ndarray = u @ vt
+        if np.abs(sizes - 1.0).max() > ROTATION_TOLERANCE:
+            raise self.wrong(place, "the matrix is not a rotation.")
+        if np.linalg.det(nearest) < 0:
+            raise self.wrong(place, "the matrix mirrors; a rotation was expected.")
+        return nearest
 
-    Raises ParseError: the matrix is not orthonormal, or it mirrors.
-    """
-    u, sizes, vt = np.linalg.svd(matrix)
-    nearest: np.ndarray = u @ vt
-    if np.abs(sizes - 1.0).max() > ROTATION_TOLERANCE:
-        raise ParseError(path, place, "the matrix is not a rotation.", AGAIN)
-    if np.linalg.det(nearest) < 0:
-        raise ParseError(path, place, "the matrix mirrors; a rotation was expected.", AGAIN)
-    return nearest
+    def lens(self, place: str, lens: LensCamera) -> LensCamera:
+        """Return the lens, or raise :class:`ParseError` with what makes it unusable."""
+        if problem := lens.problem():
+            raise self.wrong(place, f"{problem}.")
+        return lens
 
+    def points(
+        self, place: str, entries: Iterable[tuple[str, Any]], position: str, count: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return (n, 3) float64 positions and (n, 3) uint8 colours of the file's ``count`` points.
 
-def checked_lens(path: Path, place: str, lens: LensCamera) -> LensCamera:
-    """Return the lens, or raise :class:`ParseError` with what makes it unusable."""
-    if problem := lens.problem():
-        raise ParseError(path, place, f"{problem}.", AGAIN)
-    return lens
+        ``entries``: the place and the object of each, whose position has the name ``position``.
+        """
+        if count > limits.MAX_POINTS:
+            raise self.wrong(place, f"{count} points are too many.")
+        points = np.zeros((count, 3))
+        colors = np.full((count, 3), 128, np.uint8)
+        for i, (here, entry) in enumerate(entries):
+            if not isinstance(entry, dict):
+                raise self.wrong(here, "an object was expected.")
+            points[i] = self.numbers(f"{here}.{position}", entry.get(position), 3)
+            if "color" in entry:
+                color = self.numbers(f"{here}.color", entry["color"], 3)
+                colors[i] = color.clip(0, 255).astype(np.uint8)
+        return points, colors
 
-
-def points_of(
-    path: Path, place: str, entries: Iterable[tuple[str, Any]], position: str, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 3) float64 positions and (n, 3) uint8 colours of the ``count`` points of a file.
-
-    ``entries``: the place and the object of each, whose position has the name ``position``.
-    """
-    if count > limits.MAX_POINTS:
-        raise ParseError(path, place, f"{count} points are too many.", AGAIN)
-    points = np.zeros((count, 3))
-    colors = np.full((count, 3), 128, np.uint8)
-    for i, (here, entry) in enumerate(entries):
-        if not isinstance(entry, dict):
-            raise ParseError(path, here, "an object was expected.", AGAIN)
-        points[i] = numbers(path, f"{here}.{position}", entry.get(position), 3)
-        if "color" in entry:
-            color = numbers(path, f"{here}.color", entry["color"], 3)
-            colors[i] = color.clip(0, 255).astype(np.uint8)
-    return points, colors
+    def unsupported(self, place: str, what: str, hint: str) -> ParseError:
+        """Return the error for a lens or an option that no model here can express."""
+        return self.wrong(place, f"{what[:80]} is not supported.", hint)
 
 
 def begins_with(path: Path, suffix: str, most_bytes: int) -> bytes:
@@ -125,11 +133,6 @@ def begins_with(path: Path, suffix: str, most_bytes: int) -> bytes:
             return stream.read(most_bytes)
     except OSError:
         return b""
-
-
-def unsupported(path: Path, place: str, what: str, hint: str) -> ParseError:
-    """Return the error for a lens or an option that no model here can express."""
-    return ParseError(path, place, f"{what[:80]} is not supported.", hint)
 
 
 # -- Fisheye lenses of other programs as COLMAP's models ------------------------------------------

@@ -13,21 +13,16 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from .. import limits
-from ..errors import ParseError
 from ..files import read_bounded
 from ..photos.finder import list_photos
 from ..scene.camera import pose_at
 from .program_values import (
-    AGAIN,
     OPENGL_FROM_COLMAP,
+    CameraFile,
     PhotoList,
     begins_with,
-    number,
-    numbers,
     read_xml,
     relative_names,
-    rotation,
-    unsupported,
 )
 from .source_model import Brown, RelativeLens, SourceModel
 
@@ -65,28 +60,29 @@ def read_csv(path: Path) -> SourceModel:
 
     Raises ParseError, which names the line and the column; DatasetError: no photo is usable.
     """
+    file = CameraFile(path)
     data = read_bounded(path, _MAX_CSV_BYTES, follow_links=True)
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         place = f"byte {error.start}"
-        raise ParseError(path, place, "not UTF-8 text.", "Save it as UTF-8.") from None
+        raise file.wrong(place, "not UTF-8 text.", "Save it as UTF-8.") from None
     if "\0" in text:
-        raise ParseError(path, "whole file", "not text.", _CHOOSE)
-    rows = _rows(path, text)
-    header = _header(path, rows[0][1] if rows else [])
+        raise file.wrong("whole file", "not text.", _CHOOSE)
+    rows = _rows(file, text)
+    header = _header(file, rows[0][1] if rows else [])
     photos = PhotoList(path)
     photos.check_count("rows", len(rows) - 1)
     names = relative_names(row[header[_FIRST_COLUMN]] for _, row in rows[1:] if row)
     for line, row in rows[1:]:
         if len(row) < len(header):
             text = f"{len(row)} columns instead of {len(header)}."
-            raise ParseError(path, f"line {line}", text, AGAIN)
+            raise file.wrong(f"line {line}", text)
 
         def value(column: str, line: int = line, row: list[str] = row) -> float:
             if column not in header:
                 return 0.0
-            return number(path, f"line {line}, {column}", row[header[column]])
+            return file.number(f"line {line}, {column}", row[header[column]])
 
         world_from_camera = _world_from_opengl(
             *(math.radians(value(angle)) for angle in ("heading", "pitch", "roll"))
@@ -95,7 +91,7 @@ def read_csv(path: Path) -> SourceModel:
         pose = pose_at((world_from_camera @ OPENGL_FROM_COLMAP).T, center)
         focal = value("f") / FILM_WIDTH_MM
         if focal <= 0:
-            raise ParseError(path, f"line {line}, f", "the focal length is not positive.", AGAIN)
+            raise file.wrong(f"line {line}, f", "the focal length is not positive.")
         # The program's t1 and t2 are OpenCV's p2 and p1.
         brown = Brown(*(value(k) for k in ("k1", "k2", "k3", "k4", "t2", "t1")))
         lens = RelativeLens(focal, 1.0, (value("px"), value("py")), brown)
@@ -104,7 +100,7 @@ def read_csv(path: Path) -> SourceModel:
     return SourceModel(KIND, usable, warnings=tuple(photos.warnings), facts={"rows": len(rows) - 1})
 
 
-def _rows(path: Path, text: str) -> list[tuple[int, list[str]]]:
+def _rows(file: CameraFile, text: str) -> list[tuple[int, list[str]]]:
     """Return the rows that are not empty, with their lines."""
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows = []
@@ -113,27 +109,27 @@ def _rows(path: Path, text: str) -> list[tuple[int, list[str]]]:
             if any(cell.strip() for cell in row):
                 rows.append((reader.line_num, [cell.strip() for cell in row]))
             if len(rows) > limits.MAX_IMAGES + 1:
-                raise ParseError(path, "rows", "there are too many.", "Split the project.")
+                raise file.wrong("rows", "there are too many.", "Split the project.")
     except csv.Error as error:
-        raise ParseError(path, f"line {reader.line_num}", f"not CSV: {error}.", AGAIN) from None
+        raise file.wrong(f"line {reader.line_num}", f"not CSV: {error}.") from None
     return rows
 
 
-def _header(path: Path, cells: list[str]) -> dict[str, int]:
+def _header(file: CameraFile, cells: list[str]) -> dict[str, int]:
     """Return the column of each name."""
     names = [cell.lower() for cell in cells]
     names = [_SYNONYMS.get(name, name) for name in names]
     if not names or names[0] != _FIRST_COLUMN:
-        raise ParseError(path, "line 1", "the column #name was expected first.", _CHOOSE)
+        raise file.wrong("line 1", "the column #name was expected first.", _CHOOSE)
     if len(set(names)) < len(names):
-        raise ParseError(path, "line 1", "a column is there twice.", _CHOOSE)
+        raise file.wrong("line 1", "a column is there twice.", _CHOOSE)
     missing = [name for name in _NEEDED if name not in names]
     if missing:
-        raise ParseError(path, "line 1", f"columns are missing: {', '.join(missing)}.", _CHOOSE)
+        raise file.wrong("line 1", f"columns are missing: {', '.join(missing)}.", _CHOOSE)
     known = {_FIRST_COLUMN, *_NEEDED, *_OPTIONAL}
     for name in names:
         if name not in known and name[:1] in ("k", "t", "s") and name[1:2].isdigit():
-            raise unsupported(path, "line 1", f"lens coefficient {name}", _CHOOSE)
+            raise file.unsupported("line 1", f"lens coefficient {name}", _CHOOSE)
     return {name: column for column, name in enumerate(names)}
 
 
@@ -205,17 +201,17 @@ def read_xmp_files(root: Path, files: dict[Path, Path]) -> SourceModel:
     posed: dict[str, list[tuple[str, np.ndarray, RelativeLens]]] = {}
     for photo, path in files.items():
         name = photo.relative_to(root).as_posix()
-        entry = _description(path)
+        file, entry = CameraFile(path), _description(path)
         matrix = None if entry is None else _value(entry, "Rotation")
         center = None if entry is None else _value(entry, "Position")
         if entry is None or matrix is None or center is None:
             photos.leave_out(name, "no pose in their XMP file")
             continue
-        written = numbers(path, "xcr:Rotation", matrix, 9).reshape(3, 3)
-        turned = rotation(path, "xcr:Rotation", written)
-        pose = pose_at(turned, numbers(path, "xcr:Position", center, 3))
+        written = file.numbers("xcr:Rotation", matrix, 9).reshape(3, 3)
+        turned = file.rotation("xcr:Rotation", written)
+        pose = pose_at(turned, file.numbers("xcr:Position", center, 3))
         component = _value(entry, "ComponentId") or ""
-        posed.setdefault(component, []).append((name, pose, _lens(path, entry)))
+        posed.setdefault(component, []).append((name, pose, _lens(file, entry)))
     chosen = max(posed.values(), key=len, default=[])
     for entries in posed.values():
         for name, pose, lens in entries:
@@ -246,27 +242,27 @@ def _value(entry: Element, name: str) -> str | None:
     return value if value is not None else entry.findtext(_NAMESPACE + name)
 
 
-def _lens(path: Path, entry: Element) -> RelativeLens:
+def _lens(file: CameraFile, entry: Element) -> RelativeLens:
     def value(name: str, default: str) -> float:
         text = _value(entry, name)
-        return number(path, f"xcr:{name}", default if text is None else text)
+        return file.number(f"xcr:{name}", default if text is None else text)
 
     if _value(entry, "FocalLength35mm") is None:
-        raise ParseError(path, "xcr:FocalLength35mm", "the focal length is missing.", AGAIN)
+        raise file.wrong("xcr:FocalLength35mm", "the focal length is missing.")
     focal = value("FocalLength35mm", "0") / FILM_WIDTH_MM
     aspect = value("AspectRatio", "1")
     if focal <= 0 or aspect <= 0:
-        raise ParseError(path, "xcr:FocalLength35mm", "a length is not positive.", AGAIN)
+        raise file.wrong("xcr:FocalLength35mm", "a length is not positive.")
     offset = value("PrincipalPointU", "0"), value("PrincipalPointV", "0")
     model = _value(entry, "DistortionModel") or _PLAIN
     text = _value(entry, "DistortionCoeficients") or "0 0 0 0 0 0"
-    k1, k2, k3, k4, t1, t2 = numbers(path, "xcr:DistortionCoeficients", text, 6).tolist()
+    k1, k2, k3, k4, t1, t2 = file.numbers("xcr:DistortionCoeficients", text, 6).tolist()
     if value("Skew", "0"):
         hint = "Choose a distortion model without K+, align again."
-        raise unsupported(path, "xcr:Skew", "a skewed camera", hint)
+        raise file.unsupported("xcr:Skew", "a skewed camera", hint)
     if model == _PLAIN or not any((k1, k2, k3, k4, t1, t2)):
         return RelativeLens(focal, aspect, offset, Brown())
     if model not in _BROWN:
-        raise unsupported(path, "xcr:DistortionModel", f"the lens {model}", _NO_DIVISION)
+        raise file.unsupported("xcr:DistortionModel", f"the lens {model}", _NO_DIVISION)
     # The program's t1 and t2 are OpenCV's p2 and p1.
     return RelativeLens(focal, aspect, offset, Brown(k1, k2, k3, k4, p1=t2, p2=t1))
