@@ -181,11 +181,9 @@ def details(grey: np.ndarray) -> np.ndarray:
 
     ``grey``: (h, w) float32, brightness, 0 to 255.
     """
-    height, width = (side - side % _COARSE for side in grey.shape)
-    cut = grey[:height, :width]
-    coarse = cut.reshape(height // _COARSE, _COARSE, width // _COARSE, _COARSE).mean((1, 3))
+    coarse = _energies(_block_means(grey, _COARSE))
     fine = _energies(grey) - 6.0 * _noise_variance(grey)  # 1 + 4 + 1: of (1, -2, 1) on noise
-    return np.log(np.maximum(np.stack([fine, _energies(coarse)]), _LEAST))
+    return np.log(np.maximum(np.stack([fine, coarse]), _LEAST))
 
 
 def relative_sharpness(details: np.ndarray, times_s: np.ndarray, ways: np.ndarray) -> np.ndarray:
@@ -369,11 +367,11 @@ def _run(folder: Path) -> None:
     if not len(choice.positions):
         text = f"All {choice.blurred} frames of {path.name} are blurred."
         raise DatasetError(text, "Film again, more slowly and in more light.")
-    written, size_px = _write(path, folder / FRAMES_FOLDER, measures, choice, task["threads"])
+    written = _write(path, folder / FRAMES_FOLDER, measures, choice, task["threads"])
     first["damaged"] += len(choice.positions) - len(written)
     chosen = {
-        **first, "size_px": size_px, "frames": written, "read": len(measures.indices),
-        "blurred": choice.blurred, "still": choice.still, "gaps_s": choice.gaps_s,
+        **first, "frames": written, "read": len(measures.indices), "blurred": choice.blurred,
+        "still": choice.still, "gaps_s": choice.gaps_s,
     }  # fmt: skip
     write_json(folder / CHOSEN_NAME, chosen)
 
@@ -412,9 +410,8 @@ def _measure(path: Path, threads: int) -> tuple[FrameMeasures, dict[str, Any]]:
         stated = video.facts.frames
         missing = max(video.bad_packets, stated - len(indices) if stated else 0)
         facts = {
-            "codec": video.facts.codec, "is_hdr": video.facts.is_hdr, "is_cut": video.is_cut,
-            "is_interlaced": video.facts.is_interlaced, "damaged": missing,
-            "fps": video.facts.fps,
+            "is_hdr": video.facts.is_hdr, "is_interlaced": video.facts.is_interlaced,
+            "is_cut": video.is_cut, "damaged": missing,
         }  # fmt: skip
     measures = FrameMeasures(np.array(indices), np.array(times_s), np.array(ways), np.stack(found))
     return measures, facts
@@ -422,29 +419,26 @@ def _measure(path: Path, threads: int) -> tuple[FrameMeasures, dict[str, Any]]:
 
 def _write(
     path: Path, folder: Path, measures: FrameMeasures, choice: Choice, threads: int
-) -> tuple[list[dict[str, Any]], list[int]]:
-    """Decode again and write the chosen frames; return their entries and their size."""
+) -> list[str]:
+    """Decode again and write the chosen frames; return their names."""
     folder.mkdir()
     wanted = set(measures.indices[choice.positions].tolist())
-    written: list[dict[str, Any]] = []
+    written: list[str] = []
     ticker = _Ticker(_MEASURED, 1.0, "writing frames, at frame")
     last = max(wanted)
-    size: list[int] = []
     with open_video(path, threads) as video:
         for decoded in frames_of(video):
             if decoded.index in wanted:
-                color = upright_color(decoded.frame, video.facts.pixel_ratio)
                 name = f"frame-{decoded.index:06d}.jpg"
-                write_photo(folder / name, color)
-                size = [color.shape[1], color.shape[0]]
-                written.append({"name": name, "time_s": round(decoded.time_s, 6)})
+                write_photo(folder / name, upright_color(decoded.frame, video.facts.pixel_ratio))
+                written.append(name)
             ticker.tick(decoded.index + 1, last + 1)
             if decoded.index >= last:
                 break
     if not written:
         text = f"{path.name} has changed while it was read."
         raise DatasetError(text, "Start again once it is complete.")
-    return written, size
+    return written
 
 
 def _small(grey: np.ndarray) -> np.ndarray:
@@ -452,6 +446,11 @@ def _small(grey: np.ndarray) -> np.ndarray:
     factor = max(1, round(max(grey.shape) / MOTION_SIDE_PX))
     while factor > 1 and min(grey.shape) // factor < _MIN_SIDE_PX:
         factor -= 1
+    return _block_means(grey, factor)
+
+
+def _block_means(grey: np.ndarray, factor: int) -> np.ndarray:
+    """Return the means of whole blocks, ``factor`` pixels wide and high."""
     height, width = (side // factor for side in grey.shape)
     cut = grey[: height * factor, : width * factor]
     return cut.reshape(height, factor, width, factor).mean((1, 3))
@@ -465,16 +464,12 @@ class _Ticker:
         self._last_s = 0.0
 
     def tick(self, done: int, expected: int) -> None:
-        now_s = time.monotonic()
-        if now_s - self._last_s < _EMIT_EVERY_S:
+        if time.monotonic() - self._last_s < _EMIT_EVERY_S:
             return
-        self._last_s = now_s
+        self._last_s = time.monotonic()
         share = min(done / expected, 1.0) if expected else 0.5
-        of = f" of {expected}" if expected else ""
-        emit(
-            fraction=self._begin + (self._end - self._begin) * share,
-            message=f"{self._message} {done}{of}",
-        )
+        message = f"{self._message} {done}" + (f" of {expected}" if expected else "")
+        emit(fraction=self._begin + (self._end - self._begin) * share, message=message)
 
 
 # -- Take photos out of a video, in a helper process: FFmpeg may crash or hang on damaged files
@@ -535,7 +530,7 @@ def extract_frames(
     chosen = read_json(task_folder / CHOSEN_NAME)
     os.replace(task_folder / FRAMES_FOLDER, target)
     shutil.rmtree(task_folder)
-    names = tuple(entry["name"] for entry in chosen["frames"])
+    names = tuple(chosen["frames"])
     left_out = (
         f"{chosen['read']} frames were read: {chosen['blurred']} are blurred, {chosen['still']} "
         "show the same as the one before."
