@@ -12,7 +12,6 @@ from gaussian_wrapping_addon.core.errors import MemoryShortageError, WorkerError
 from gaussian_wrapping_addon.core.loading import load
 from gaussian_wrapping_addon.core.progress import Progress, ReportWarning
 from gaussian_wrapping_addon.core.scene.camera import Camera
-from gaussian_wrapping_addon.core.scene.scene import View
 
 
 def points_where(
@@ -26,10 +25,9 @@ def points_where(
     monkeypatch.setattr(load, "triangulate_points", fail)
     pose = np.hstack([np.eye(3), [[0.0], [0.0], [4.0]]])
     cameras = [Camera(f"{k}.png", 80, 60, 80.0, 80.0, 40.0, 30.0, pose) for k in range(3)]
-    views = [View(camera, tmp_path / camera.name) for camera in cameras]
     warnings: list[ReportWarning] = []
     points, colors, origin = load.make_start_points(
-        views, tmp_path, Progress(), warnings, seed=0, threads=1
+        cameras, [], [], tmp_path, Progress(), warnings, seed=0, threads=1
     )
     assert len(points) == len(colors) > 1000
     return origin, warnings
