@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import DatasetError, MemoryShortageError, ResourceError, UsageError, WorkerError
+from ..errors import MemoryShortageError, ResourceError, UsageError, WorkerError
 from ..files import real_path
-from ..limits import MIN_IMAGES, NEAR_Z, SCENE_RADIUS
+from ..limits import NEAR_Z, SCENE_RADIUS
 from ..photos.finder import list_photos, photo_root
 from ..photos.formats import require_extras
 from ..photos.photo_file import AS_WRITTEN, MaskReading
@@ -20,11 +20,13 @@ from ..poses.solver import solve_poses, triangulate_points
 from ..progress import Progress, ReportWarning
 from ..readers.source_model import PHOTOS
 from ..scene.camera import Camera, Similarity
-from ..scene.frames import find_scene_frame, snapped_camera
+from ..scene.frames import snapped_camera
 from ..scene.scene import Scene, View
 from .check import (
     MIN_POINTS,
+    check_photo_count,
     coverage_warnings,
+    frame_of_poses,
     nothing_in_common,
     points_in_scene,
     second_copies_warning,
@@ -41,7 +43,6 @@ from .views import PreparedView, prepare_views
 
 # -- Make start points for inputs without any: triangulated from the photos, else random ----------
 
-
 _logger = logging.getLogger(__name__)
 
 RANDOM_POINTS = 20_000
@@ -52,9 +53,7 @@ _HINT = "Photos with more texture help, or a COLMAP model with its points."
 
 
 def make_start_points(
-    cameras: Sequence[Camera],
-    photos: Sequence[Path],
-    masks: Sequence[Path | None],
+    views: Sequence[View],
     work_folder: Path,
     progress: Progress,
     warnings: list[ReportWarning],
@@ -67,14 +66,11 @@ def make_start_points(
     Triangulation keeps the poses of the input. If it finds too few points (no texture, inaccurate
     poses), points are drawn at random in view of the cameras, and a warning is added.
 
-    Raises
-    ------
-    MemoryShortageError
-        The system gave the triangulation too little memory.
+    Raises MemoryShortageError: the system gave the triangulation too little memory.
     """
     try:
         points, colors = triangulate_points(
-            cameras, photos, masks, work_folder, progress, seed=seed, threads=threads
+            views, work_folder, progress, seed=seed, threads=threads
         )
     except MemoryShortageError:
         raise  # with enough memory the same photos would give points
@@ -90,7 +86,7 @@ def make_start_points(
         "training slower and less exact."
     )
     warnings.append(ReportWarning("random-start-points", text, _HINT))
-    points = random_points(cameras, seed=seed)
+    points = random_points([view.camera for view in views], seed=seed)
     return points, np.full(points.shape, 128, np.uint8), "random"
 
 
@@ -105,10 +101,8 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
     return np.linalg.solve(total, right)
 
 
-def random_points(
-    cameras: Sequence[Camera], *, seed: int, count: int = RANDOM_POINTS
-) -> np.ndarray:
-    """Draw (count, 3) points around the point that the cameras look at.
+def random_points(cameras: Sequence[Camera], *, seed: int) -> np.ndarray:
+    """Draw (``RANDOM_POINTS``, 3) points around the point that the cameras look at.
 
     Points are uniform in a ball whose radius follows the cameras' median distance; those seen by
     at least two cameras are kept.
@@ -120,29 +114,27 @@ def random_points(
     kept: list[np.ndarray] = []
     found = 0
     for _ in range(_ROUNDS):
-        directions = rng.normal(size=(count, 3))
+        directions = rng.normal(size=(RANDOM_POINTS, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        points = focus + directions * radius * rng.uniform(size=(count, 1)) ** (1 / 3)
+        points = focus + directions * radius * rng.uniform(size=(RANDOM_POINTS, 1)) ** (1 / 3)
         good = points[count_observing_views(cameras, points) >= _MIN_SEEN]
         kept.append(good)
         found += len(good)
-        if found >= count:
+        if found >= RANDOM_POINTS:
             break
-    return np.concatenate(kept)[:count]
+    return np.concatenate(kept)[:RANDOM_POINTS]
 
 
 def count_observing_views(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
     """Count the cameras whose image contains each of (n, 3) points, (n,) int."""
     seen = np.zeros(len(points), np.int64)
     for camera in cameras:
-        pixels, depth = camera.project(points)
-        inside = (pixels >= 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
-        seen += inside & (depth > NEAR_Z)
+        indices, _, _, depth = camera.shown(points)
+        seen[indices[depth > NEAR_Z]] += 1
     return seen
 
 
 # -- Load an input path as a :class:`~.scene.Scene`: poses, photos, frame, start points ----------
-
 
 _CAMERAS_ARE_GIVEN = ReportWarning(
     "no-turntable",
@@ -178,40 +170,20 @@ def load_scene(
 ) -> Scene:
     """Load photos and cameras, solving and undistorting where needed.
 
-    Parameters
-    ----------
-    source : Path
-        Folder of photos, COLMAP project (``images/`` and ``sparse/0``), ``transforms.json`` or a
-        folder that contains it. Nothing is written there.
-    work_folder : Path
-        Undistorted photos, masks and the solved cameras are written here.
-    progress : Progress
-    seed : int
-    threads : int
-        0 uses every core.
-    turntable : {"auto", "on", "off"}
-        Of photos without poses; see :func:`~.solver.solve_poses`.
-    equirectangular : {"auto", "on", "off"}
-        Whether photos without poses are panoramas, which are cut into views; ``"auto"``: where
-        all are exactly twice as wide as high and none says another projection.
-    reading : MaskReading
-        How mask files are understood.
-    units : UnitsRequest
-        What is known about size and place. Where it is applied, the scene's world is metric.
-    in_order : bool
-        Photos without poses follow each other by name, as frames of a video do.
-
-    Returns
-    -------
-    Scene
-        In the scene frame; ``warnings`` and ``facts`` list what was read, left out and solved.
-
-    Raises
-    ------
-    DatasetError, ParseError
-        The input cannot be used; names the problem and its location.
-    MissingExtraError
-        Photos need a package that the worker lacks.
+    ``source``: folder of photos, COLMAP project (``images/`` and ``sparse/0``), ``transforms.json``
+        or a folder that contains it. Nothing is written there.
+    ``work_folder``: undistorted photos, masks and the solved cameras are written here.
+    ``threads``: 0 uses every core.
+    ``turntable``: {"auto", "on", "off"}, of photos without poses; see :func:`~.solver.solve_poses`.
+    ``equirectangular``: {"auto", "on", "off"}, whether photos without poses are panoramas, which
+        are cut into views; ``"auto"``: where all are exactly twice as wide as high and none says
+        another projection.
+    ``reading``: how mask files are understood.
+    ``units``: what is known about size and place. Where it is applied, the scene's world is metric.
+    ``in_order``: photos without poses follow each other by name, as frames of a video do.
+    The scene's ``warnings`` and ``facts`` list what was read, left out and solved.
+    Raises DatasetError, ParseError: the input cannot be used; names the problem and its location;
+    MissingExtraError: photos need a package that the worker lacks.
     """
     source = real_path(source)
     work_folder = real_path(work_folder)
@@ -260,15 +232,14 @@ def load_scene(
         prepare_span = progress.span(0.0, 1.0 if len(model.points) >= MIN_POINTS else 0.3)
         if kind.kind == "COLMAP model" and kind.transforms is not None:
             facts["also_present"] = f"{kind.transforms.name} (not used: the COLMAP model is)"
-    warnings.extend(model.warnings)
-    warnings.extend(coverage_warnings(model))
-    facts.update(model.facts)
+    warnings += [*model.warnings, *coverage_warnings(model)]
+    facts |= model.facts
     check_photo_count(len(model.photos))
     views, notes, counts = prepare_views(
         model, kind, work_folder, prepare_span.span(0.0, 0.9), threads=threads, reading=reading
     )
-    warnings.extend(notes)
-    facts.update(counts)
+    warnings += notes
+    facts |= counts
     check_photo_count(len(views), notes)
     real, note = find_real_units(
         units, control, views, kind, work_folder, prepare_span.span(0.9, 1.0), warnings,
@@ -282,87 +253,51 @@ def load_scene(
             given_points, z_up = real.metric_from_world.points(given_points), real.z_up
     if note:
         facts["georeference_note"] = note
-    views, scene_from_world, frame_facts = _frame(views, warnings, z_up)
-    facts.update(frame_facts)
-    cameras = [snapped_camera(camera_of(view).moved(scene_from_world)) for view in views]
+    views, scene_from_world, facts["up_from"] = _frame(views, warnings, z_up)
+    in_scene = tuple(
+        View(
+            snapped_camera(camera_of(view).moved(scene_from_world)), view.photo_path, view.mask_path
+        )
+        for view in views
+    )
     if (apart := nothing_in_common(model)) is not None:
         warnings.append(apart)
     points, colors = points_in_scene(given_points, model.point_colors, scene_from_world, warnings)
     if len(points) < MIN_POINTS:
+        span = progress.span(0.3, 1.0)
         points, colors, facts["start_points"] = make_start_points(
-            cameras,
-            [view.photo_path for view in views],
-            [view.mask_path for view in views],
-            work_folder,
-            progress.span(0.3, 1.0),
-            warnings,
-            seed=seed,
-            threads=threads,
+            in_scene, work_folder, span, warnings, seed=seed, threads=threads
         )
     facts["views"], facts["points"] = len(views), len(points)
-    facts["photo_sizes"] = sorted({f"{c.width} x {c.height}" for c in cameras})[:4]
+    sizes = {f"{view.camera.width} x {view.camera.height}" for view in in_scene}
+    facts["photo_sizes"] = sorted(sizes)[:4]
     progress.update(1.0, f"{len(views)} photos and {len(points)} points are ready")
-    return Scene(
-        tuple(
-            View(camera, view.photo_path, view.mask_path)
-            for camera, view in zip(cameras, views, strict=True)
-        ),
-        points,
-        colors,
-        scene_from_world.inverse(),
-        tuple(warnings),
-        facts,
-    )
-
-
-def check_photo_count(count: int, left_out: Sequence[ReportWarning] = ()) -> None:
-    """Raise :class:`DatasetError` where fewer than ``MIN_IMAGES`` photos are usable.
-
-    ``left_out`` tells why others are not; its texts and next steps become part of the message.
-    """
-    if count < MIN_IMAGES:
-        photos = "photo is" if count == 1 else "photos are"
-        reasons = "".join(f" {warning.text}" for warning in left_out)
-        hints = [warning.hint for warning in left_out if warning.hint]
-        raise DatasetError(
-            f"Only {count} {photos} usable; at least {MIN_IMAGES} are needed.{reasons}",
-            " ".join(hints) or "Add photos of the same thing from other places.",
-        )
+    return Scene(in_scene, points, colors, scene_from_world.inverse(), tuple(warnings), facts)
 
 
 def _refuse_places_of_panoramas(units: UnitsRequest) -> None:
     """Raise where places are asked for that the views cut from panoramas do not have."""
     if units.georeference == "on" or units.control_points:
-        raise UsageError(
-            "GPS and control points are not read for 360 degree photos.",
-            "Leave these options out; markers, or a measured length afterwards, give the scale.",
-        )
+        hint = "Leave these options out; markers, or a measured length afterwards, give the scale."
+        raise UsageError("GPS and control points are not read for 360 degree photos.", hint)
 
 
 def _frame(
     views: list[PreparedView], warnings: list[ReportWarning], z_up: bool
-) -> tuple[list[PreparedView], Similarity, dict[str, Any]]:
-    """Compute the scene frame and remove outlier cameras far from all others."""
-    rotations = np.array([view.cam_from_world[:, :3] for view in views])  # (n, 3, 3)
-    translations = np.array([view.cam_from_world[:, 3] for view in views])  # (n, 3)
-    centers = -np.einsum("nji,nj->ni", rotations, translations)
-    frame = find_scene_frame(rotations, centers, z_up=z_up)
+) -> tuple[list[PreparedView], Similarity, str]:
+    """Remove outlier cameras far from all others; return also the scene frame and its up rule."""
+    frame = frame_of_poses([view.cam_from_world for view in views], z_up=z_up)
     far = [view.name for view, keep in zip(views, frame.keep, strict=True) if not keep]
     if far:
         text = (
             f"{len(far)} cameras are far away from all others and were left out: "
             f"{', '.join(far[:3])}."
         )
-        warnings.append(
-            ReportWarning("cameras-far-away", text, "Check the poses of these cameras.")
-        )
+        hint = "Check the poses of these cameras."
+        warnings.append(ReportWarning("cameras-far-away", text, hint))
     if frame.collinear:
-        warnings.append(
-            ReportWarning(
-                "cameras-on-a-line",
-                "All cameras lie on one line; depth and the up direction are inaccurate.",
-                "Take photos from other heights and directions too.",
-            )
-        )
+        text = "All cameras lie on one line; depth and the up direction are inaccurate."
+        hint = "Take photos from other heights and directions too."
+        warnings.append(ReportWarning("cameras-on-a-line", text, hint))
     kept = [view for view, keep in zip(views, frame.keep, strict=True) if keep]
-    return kept, frame.scene_from_world, {"up_from": frame.up_rule}
+    return kept, frame.scene_from_world, frame.up_rule

@@ -19,7 +19,6 @@ from ..poses.panoramas import (
     BY_SHAPE,
     CUT_FOLDER,
     VIEWS,
-    CutView,
     Panorama,
     cut_panoramas,
     panorama_evidence,
@@ -29,12 +28,11 @@ from ..poses.panoramas import (
 from ..poses.solver import check_unreadable_share
 from ..progress import UNREADABLE_HINT, Progress, ReportWarning
 from ..readers.source_model import PosedPhoto, SourceModel
-from ..scene.camera import Camera, Similarity
+from ..scene.camera import Camera, Similarity, pose_at
 from ..scene.frames import RADIUS_MARGIN
 from .source_kind import SourceKind
 
 # -- Panoramas of an input replaced by their pinhole views, posed or to be solved -----------------
-
 
 _CUTTING = 0.3
 """Share of the progress that cutting takes where cameras are solved afterwards."""
@@ -68,17 +66,8 @@ def with_views_of_panoramas(
 ) -> tuple[SourceModel, SourceKind]:
     """Cut the panoramas of a model with poses; other photos stay.
 
-    Returns
-    -------
-    model : SourceModel
-        Every panorama replaced by its views.
-    kind : SourceKind
-        That finds them.
-
-    Raises
-    ------
-    DatasetError
-        No panorama was found, or one is not twice as wide as high.
+    Returns the model with every panorama replaced by its views, and the kind that finds these.
+    Raises DatasetError: no panorama was found, or one is not twice as wide as high.
     """
     index = PhotoIndex(kind.photo_roots)
     posed = [photo for photo in model.photos if photo.is_panorama]
@@ -96,24 +85,21 @@ def with_views_of_panoramas(
         if photo.mask_name is None:
             mask = find_mask(kind.mask_roots, photo.name, kind.photo_roots)
         else:
-            mask = resolve_photo(kind.folder, photo.mask_name)
-            if mask is not None and not mask.is_file():
-                mask = None
+            named = resolve_photo(kind.folder, photo.mask_name)
+            mask = named if named is not None and named.is_file() else None
             if mask is None:
                 masks_missing.append(photo.mask_name)
         found.append(Panorama(photo.name, match.path, mask))
         owners.append(photo)
     if not found:
-        raise DatasetError(
-            f"None of the {len(posed)} panoramas that the {model.kind} names was found.",
-            f"Looked for {missing[0]} in {', '.join(str(root) for root in kind.photo_roots)}.",
-        )
+        text = f"None of the {len(posed)} panoramas that the {model.kind} names was found."
+        hint = f"Looked for {missing[0]} in {', '.join(str(root) for root in kind.photo_roots)}."
+        raise DatasetError(text, hint)
     cut, bad = cut_panoramas(found, work_folder, progress, reading, threads=threads)
     check_unreadable_share(bad, len(found))
     photos = [photo for photo in model.photos if not photo.is_panorama]
     for view in cut:
-        pose = owners[view.panorama].cam_from_world
-        turned = VIEWS[view.view].cam_from_panorama @ pose
+        turned = VIEWS[view.view].cam_from_panorama @ owners[view.panorama].cam_from_world
         photos.append(PosedPhoto(view.name, view_lens(view.width), turned, mask_path=view.mask))
     warnings = [*model.warnings, *_warnings(bad, missing)]
     if masks_missing:
@@ -136,10 +122,7 @@ def solve_views_of_panoramas(
 ) -> tuple[SourceModel, SourceKind]:
     """Cut photos without cameras, and solve the poses of the panoramas.
 
-    Raises
-    ------
-    DatasetError
-        A photo is not twice as wide as high, or too few panoramas can be placed.
+    Raises DatasetError: a photo is not twice as wide as high, or too few panoramas can be placed.
     """
     root = photo_root(kind.folder)
     names = [path.relative_to(root).as_posix() for path in photos]
@@ -147,17 +130,15 @@ def solve_views_of_panoramas(
         Panorama(name, path, find_mask(kind.mask_roots, name, [root]))
         for name, path in zip(names, photos, strict=True)
     ]
-    cut: list[CutView]
     cut, bad = cut_panoramas(
         panoramas, work_folder, progress.span(0.0, _CUTTING), reading, threads=threads
     )
     check_unreadable_share(bad, len(panoramas))
-    folder = work_folder / CUT_FOLDER
     model = solve_panoramas(
-        cut, folder, work_folder, progress.span(_CUTTING, 1.0), seed=seed, threads=threads
+        cut, work_folder, progress.span(_CUTTING, 1.0), seed=seed, threads=threads
     )
     model = dataclasses.replace(model, warnings=(*model.warnings, *_warnings(bad, [])))
-    return model, dataclasses.replace(kind, cut_folder=folder)
+    return model, dataclasses.replace(kind, cut_folder=work_folder / CUT_FOLDER)
 
 
 def _warnings(bad: Sequence[str], missing: Sequence[str]) -> list[ReportWarning]:
@@ -172,7 +153,6 @@ def _warnings(bad: Sequence[str], missing: Sequence[str]) -> list[ReportWarning]
 
 
 # -- Place virtual cameras around a splat that comes without photos -------------------------------
-
 
 PHOTO_SIDE_PX = 800
 FIELD_OF_VIEW_DEG = 50.0
@@ -216,24 +196,14 @@ class SplatExtent:
 def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
     """Return the robust centre and radius of the opaque Gaussians.
 
-    Parameters
-    ----------
-    means : (n, 3)
-        Finite.
-    opacities : (n,)
-        Effective opacities in [0, 1], used as weights.
-
-    Raises
-    ------
-    DatasetError
-        All Gaussians are transparent or coincide, or they are scattered without bounds.
+    ``means``: (n, 3), finite. ``opacities``: (n,), effective opacities in [0, 1], used as weights.
+    Raises DatasetError: all Gaussians are transparent or coincide, or they are scattered without
+    bounds.
     """
     opaque = opacities >= MIN_OPACITY
     if not opaque.any():
-        raise DatasetError(
-            "All Gaussians of the splat are transparent.",
-            "Check that opacities are stored as logits.",
-        )
+        hint = "Check that opacities are stored as logits."
+        raise DatasetError("All Gaussians of the splat are transparent.", hint)
     points = np.asarray(means, np.float64)[opaque]
     weights = np.asarray(opacities, np.float64)[opaque]
     center = np.array([_quantile(points[:, k], weights, 0.5) for k in range(3)])
@@ -244,9 +214,8 @@ def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
     if not whole > 0.0:
         raise DatasetError("All Gaussians of the splat coincide.", "Export it again.")
     if not middle < MAX_RADIUS:
-        raise DatasetError(
-            "The Gaussians of the splat are scattered too far for one scene.", "Export it again."
-        )
+        text = "The Gaussians of the splat are scattered too far for one scene."
+        raise DatasetError(text, "Export it again.")
     has_surroundings = middle > 0.0 and whole > SURROUNDINGS_RATIO * middle
     radius = SURROUNDINGS_RATIO * middle if has_surroundings else whole
     return SplatExtent(center, float(radius), bool(has_surroundings))
@@ -267,27 +236,13 @@ def cameras_on_spheres(extent: SplatExtent) -> list[Camera]:
     for count, distance in ((FAR_VIEWS, far), (NEAR_VIEWS, NEAR_DISTANCE)):
         for direction in fibonacci_directions(count):
             eye = extent.center + distance * extent.radius * direction
-            cameras.append(
-                Camera(
-                    f"view_{len(cameras):03d}.png",
-                    PHOTO_SIDE_PX,
-                    PHOTO_SIDE_PX,
-                    focal_px,
-                    focal_px,
-                    0.5 * PHOTO_SIDE_PX,
-                    0.5 * PHOTO_SIDE_PX,
-                    _look_at(eye, -direction),
-                )
-            )
+            right = np.cross(-direction, [0.0, 0.0, 1.0])  # no direction of the lattice is a pole
+            right /= np.linalg.norm(right)
+            rotation = np.stack([right, np.cross(-direction, right), -direction])
+            name, side, middle = f"view_{len(cameras):03d}.png", PHOTO_SIDE_PX, 0.5 * PHOTO_SIDE_PX
+            lens = (side, side, focal_px, focal_px, middle, middle)
+            cameras.append(Camera(name, *lens, pose_at(rotation, eye)))
     return cameras
-
-
-def _look_at(eye: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """Return (3, 4) ``cam_from_world`` with Z up; no direction of the lattice is a pole."""
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return np.concatenate([rotation, -(rotation @ eye)[:, None]], axis=1)
 
 
 def scene_frame(cameras: list[Camera]) -> Similarity:

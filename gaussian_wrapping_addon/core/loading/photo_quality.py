@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence, Sized
+from collections.abc import Sequence, Sized
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +19,10 @@ from ..photos.formats import RAW, open_image, photo_kind, require_extras, withou
 from ..photos.photo_file import apply_orientation, photo_header, read_photo
 from ..progress import Progress
 from ..readers.source_model import SourceModel
-from .check import Finding, coverage_warnings, listed
+from .check import Finding, Findings, coverage_warnings, listed
 from .source_kind import WITHOUT_PHOTOS, SourceKind, read_poses, source_kind
 
 # -- Measure one photo at a reduced size: sharpness, brightness, and a small picture of it --------
-
 
 MEASURED_PX = 1024
 """Long side that photos are measured at: about what training sees, and quick to decode."""
@@ -59,18 +58,10 @@ class PhotoMeasures:
 def measure_photo(path: Path, name: str) -> PhotoMeasures:
     """Measure a photo.
 
-    Raises
-    ------
-    DatasetError
-        It cannot be decoded.
-    MissingExtraError
-        The worker lacks the package for HEIF or RAW.
+    Raises DatasetError: it cannot be decoded; MissingExtraError: the worker lacks the package for
+    HEIF or RAW.
     """
-    return measure_grey(reduced_grey(path), name)
-
-
-def measure_grey(grey: np.ndarray, name: str) -> PhotoMeasures:
-    """Measure a photo whose (h, w) float32 grey of :func:`reduced_grey` is given."""
+    grey = reduced_grey(path)
     linear = (grey / 255.0) ** 2.2
     light = float(np.log2(max(float(linear.mean()), _DARKEST)))
     return PhotoMeasures(name, sharpness_of(grey), light, shrunk(grey, SMALL_PX))
@@ -81,20 +72,18 @@ def reduced_grey(path: Path) -> np.ndarray:
 
     JPEGs are decoded at a half, a quarter or an eighth of their size where that is enough.
 
-    Raises
-    ------
-    DatasetError, MissingExtraError
-        As :func:`~.photo_file.read_photo`.
+    Raises DatasetError, MissingExtraError: as :func:`~.photo_file.read_photo`.
     """
     header = photo_header(path)
-    long_px = max(header.width, header.height)
-    if long_px >= 2 * MEASURED_PX and photo_kind(path) != RAW:
+    if max(header.width, header.height) >= 2 * MEASURED_PX and photo_kind(path) != RAW:
         with without_warnings():
             pixels = _drafted(path)
         if pixels is not None:
             return apply_orientation(shrunk(pixels, MEASURED_PX), header.orientation)
+    from PIL import Image
+
     color = read_photo(path, enough_px=MEASURED_PX).color
-    return shrunk(np.asarray(_grey(color)), MEASURED_PX)
+    return shrunk(np.asarray(Image.fromarray(color).convert("L")), MEASURED_PX)
 
 
 def _drafted(path: Path) -> np.ndarray | None:
@@ -107,12 +96,6 @@ def _drafted(path: Path) -> np.ndarray | None:
             return np.asarray(image.convert("L"))
     except (OSError, ValueError, SyntaxError):
         return None  # decoded in full, which says what is wrong
-
-
-def _grey(color: np.ndarray) -> np.ndarray:
-    from PIL import Image
-
-    return np.asarray(Image.fromarray(color).convert("L"))
 
 
 def shrunk(grey: np.ndarray, long_px: int) -> np.ndarray:
@@ -158,10 +141,8 @@ def _edge_energy(
     """Return mean squares of differences along an axis in each tile, before and after smoothing."""
     steps = np.diff(grey, axis=axis)
     sums = np.cumsum(steps, axis=axis, dtype=np.float64)
-    ahead = [slice(None), slice(None)]
-    behind = [slice(None), slice(None)]
-    ahead[axis], behind[axis] = slice(_SMOOTH, None), slice(None, -_SMOOTH)
-    smoothed = (sums[tuple(ahead)] - sums[tuple(behind)]) / _SMOOTH
+    along = np.moveaxis(sums, axis, 0)  # a view
+    smoothed = np.moveaxis(along[_SMOOTH:] - along[:-_SMOOTH], 0, axis) / _SMOOTH
     return _tile_means(steps**2, rows, columns), _tile_means(smoothed**2, rows, columns)
 
 
@@ -174,7 +155,6 @@ def _tile_means(values: np.ndarray, rows: int, columns: int) -> np.ndarray:
 
 
 # -- Compare the measures of a set's photos: which are blurred, brighter or darker, the same again
-
 
 NEIGHBOURS = 4
 """Photos before and after one, by name, that it is compared with: they show much the same."""
@@ -271,7 +251,6 @@ def _edge_strength(small: np.ndarray) -> float:
 
 # -- Look at the photos of an input, and say what should be done about which ----------------------
 
-
 _SAID_EVERY_S = 2.0
 """Progress is reported this often."""
 _SPREAD_STOPS = 2.5
@@ -281,25 +260,12 @@ _SPREAD_STOPS = 2.5
 def photo_findings(source: Path, progress: Progress, *, threads: int = 0) -> list[Finding]:
     """Look at every photo of an input at a reduced size, and at what its cameras cover.
 
-    Parameters
-    ----------
-    source : Path
-        As for :func:`~.check.check_input`, which has found no error.
-    progress : Progress
-    threads : int
-        0 uses every core.
-
-    Returns
-    -------
-    list of Finding
-        Blur, exposure, duplicates and coverage, with the photos' names; none of a video or splat.
-
-    Raises
-    ------
-    MissingExtraError
-        Photos need a package that the worker lacks.
-    DatasetError, ParseError
-        The input cannot be read.
+    ``source``: as for :func:`~.check.check_input`, which has found no error. ``threads``: 0 uses
+    every core.
+    Returns blur, exposure, duplicates and coverage, with the photos' names; none of a video or
+    splat.
+    Raises MissingExtraError: photos need a package that the worker lacks; DatasetError, ParseError:
+    the input cannot be read.
     """
     kind = source_kind(real_path(source))
     if kind.kind in WITHOUT_PHOTOS:
@@ -308,8 +274,7 @@ def photo_findings(source: Path, progress: Progress, *, threads: int = 0) -> lis
     require_extras([path for _, path in photos])
     findings = set_findings(_measured(photos, progress, threads or default_threads()))
     if model is not None:
-        covered = coverage_warnings(model)
-        findings += [Finding("warning", warning.text, warning.hint) for warning in covered]
+        findings.take(coverage_warnings(model))
     return findings
 
 
@@ -352,40 +317,38 @@ def _measured(
     return found
 
 
-def set_findings(photos: list[PhotoMeasures]) -> list[Finding]:
+def set_findings(photos: list[PhotoMeasures]) -> Findings:
     """Return what the photos of a set have against each other."""
+    findings = Findings()
     if not photos:
-        return []
-    findings = []
-
-    def names(indices: Iterable[int]) -> str:
-        return listed([photos[i].name for i in indices])
-
+        return findings
     soft = blurred(photos)
     if soft:
-        text = f"{_count(soft)} much less sharp than the photos beside: {names(soft)}."
+        named = listed([photos[i].name for i in soft])
+        text = f"{_count(soft)} much less sharp than the photos beside: {named}."
         hint = "Look at these, and remove them where others show the same; else take them again."
-        findings.append(Finding("warning", text, hint))
+        findings.warn(text, hint)
     jumps = out_of_line(photos)
     if jumps:
         named = listed([f"{photos[i].name} ({stops:+.1f})" for i, stops in jumps])
         text = f"{_count(jumps)} brighter or darker than the photos beside, in stops: {named}."
-        hint = "Remove them where others show the same. Lock exposure for the whole set."
-        findings.append(Finding("warning", text, hint))
+        findings.warn(
+            text, "Remove them where others show the same. Lock exposure for the whole set."
+        )
     spread = light_spread(photos)
     ordered = sorted(range(len(photos)), key=lambda i: photos[i].light)
     ends = f"from {photos[ordered[0]].name} to {photos[ordered[-1]].name}"
     text = f"The photos' mean light differs by {spread:.1f} stops, {ends}."
     if spread > _SPREAD_STOPS:
         hint = "Lock exposure and white balance; exposures are evened out only within limits."
-        findings.append(Finding("warning", text, hint))
+        findings.warn(text, hint)
     else:
-        findings.append(Finding("fact", text))
+        findings.tell(text)
     again = same_again(photos)
     if again:
         named = listed([f"{photos[b].name} (as {photos[a].name})" for a, b in again])
         text = f"{_count(again)} the same as another one: {named}."
-        findings.append(Finding("warning", text, "Remove them: they cost time and show no depth."))
+        findings.warn(text, "Remove them: they cost time and show no depth.")
     return findings
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 import math
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DatasetError, ParseError
-from ..photos.exif import GpsPosition, read_gps_exif
+from ..photos.exif import read_gps_exif
 from ..photos.finder import PhotoIndex
 from ..photos.photo_file import stored_pixels
 from ..progress import Progress, ReportWarning
@@ -24,8 +25,8 @@ from ..settings.job import marker_spec
 from ..units.control_points import (
     ControlFile,
     ControlFit,
+    Observations,
     fit_control_points,
-    observations,
     read_control_file,
 )
 from ..units.georeference import (
@@ -66,12 +67,8 @@ class UnitsRequest:
     def checked(self) -> ControlFile | None:
         """Return the control points, read; raises before any work where something is missing.
 
-        Raises
-        ------
-        UsageError, DatasetError, ParseError
-            The markers are none, the file of control points is wrong.
-        WorkerError
-            Markers are asked for, and OpenCV is not installed.
+        Raises UsageError, DatasetError, ParseError: the markers are none, the file of control
+        points is wrong; WorkerError: markers are asked for, and OpenCV is not installed.
         """
         if marker_spec(self.markers) is not None:
             load_extra(MARKERS_EXTRA, "--markers")
@@ -83,9 +80,7 @@ class UnitsRequest:
         Before cameras are solved, which takes minutes. Whether the positions determine the scene
         is known afterwards.
 
-        Raises
-        ------
-        DatasetError
+        Raises DatasetError.
         """
         if self.georeference != "on" or self.control_points:
             return
@@ -116,23 +111,20 @@ def find_real_units(
     markers decide the scale unless there are control points. What contradicts is added to
     ``warnings``.
 
-    Raises
-    ------
-    DatasetError, ParseError
-        What was asked for cannot be had: no usable marker, a wrong file, or GPS that does not
-        determine the frame with ``georeference`` ``"on"``.
+    Raises DatasetError, ParseError: what was asked for cannot be had: no usable marker, a wrong
+    file, or GPS that does not determine the frame with ``georeference`` ``"on"``.
     """
     spec = marker_spec(request.markers)
     if content is None and spec is None and request.georeference == "off":
         return None, ""
     cameras = [camera_of(view) for view in views]
-    control = (
-        None
-        if content is None
-        else _control(content, request.control_points, views, cameras, kind, warnings)
-    )
-    gps, note = None, ""
-    positions = {} if request.georeference == "off" else _positions(views)
+    control, gps, markers, note = None, None, None, ""
+    if content is not None:
+        control = _control(content, request.control_points, views, cameras, kind, warnings)
+    positions = {}
+    if request.georeference != "off":
+        found = ((view.name, read_gps_exif(view.source_path)) for view in views)
+        positions = {name: position for name, position in found if position is not None}
     if positions or request.georeference == "on":
         try:
             needs = ENOUGH if request.georeference == "on" else GOOD
@@ -145,7 +137,6 @@ def find_real_units(
         text = f"GPS places the scene badly: {gps.doubt}"
         hint = "Check scale and up; give a measured length, markers or control points."
         warnings.append(ReportWarning("georeference-uncertain", text, hint))
-    markers = None
     if spec is not None:
         photos = [view.photo_path for view in views]
         seen = find_markers(spec, photos, work_folder, progress, threads=threads)
@@ -166,10 +157,8 @@ def _not_placed(error: DatasetError) -> DatasetError:
 
 def camera_of(view: PreparedView) -> Camera:
     """Return the pinhole camera of a view, world frame."""
-    fx, fy, cx, cy = view.pinhole.params
-    return Camera(
-        view.name, view.pinhole.width, view.pinhole.height, fx, fy, cx, cy, view.cam_from_world
-    )
+    size, (fx, fy, cx, cy) = (view.pinhole.width, view.pinhole.height), view.pinhole.params
+    return Camera(view.name, *size, fx, fy, cx, cy, view.cam_from_world)
 
 
 def moved_views(views: Sequence[PreparedView], target_from_world: Similarity) -> list[PreparedView]:
@@ -195,54 +184,41 @@ def _combined(
     for part in (control, gps, markers):
         details |= {} if part is None else part.details
     scales = {
-        CONTROL_POINTS: control and (control.metric_from_world.scale, control.fit.scale_error),
+        CONTROL_POINTS: control and (control.fit.target_from_source.scale, control.fit.scale_error),
         GPS: gps and (gps.enu_from_world.scale, gps.scale_error),
         MARKERS: markers and (markers.metres_per_unit, markers.error),
     }
     known = {name: found for name, found in scales.items() if found}
     _warn_of_contradictions(known, warnings)
+    sources = tuple(known)
     if control is not None:
-        return RealUnits(
-            tuple(known), control.metric_from_world, True, True, control.fit.scale_error,
-            control.origin, details,
-        )  # fmt: skip
+        placed, error = control.fit.target_from_source, control.fit.scale_error
+        return RealUnits(sources, placed, True, True, error, control.origin, details)
     if gps is not None and (own_frame or markers is None):
-        placed, error = gps, gps.scale_error
+        error = gps.scale_error
         if markers is not None:
-            placed, error = gps.with_scale(markers.metres_per_unit), markers.error
-        return RealUnits(
-            tuple(known), placed.enu_from_world, own_frame, True, error,
-            placed.origin, details | placed.details,
-        )  # fmt: skip
+            gps, error = gps.with_scale(markers.metres_per_unit), markers.error
+            details |= gps.details
+        return RealUnits(sources, gps.enu_from_world, own_frame, True, error, gps.origin, details)
     if markers is not None:
         sources = (MARKERS, *(name for name in known if name != MARKERS))
-        return RealUnits(
-            sources, Similarity(markers.metres_per_unit), True, False, markers.error,
-            details=details,
-        )  # fmt: skip
+        placed = Similarity(markers.metres_per_unit)
+        return RealUnits(sources, placed, True, False, markers.error, details=details)
     return None
 
 
 def _warn_of_contradictions(
     known: dict[str, tuple[float, float]], warnings: list[ReportWarning]
 ) -> None:
-    names = list(known)
-    for i, first in enumerate(names):
-        for second in names[i + 1 :]:
-            (a, error_a), (b, error_b) = known[first], known[second]
-            apart = abs(math.log(a / b))
-            if apart > max(CONTRADICTION_SIGMAS * math.hypot(error_a, error_b), MIN_CONTRADICTION):
-                text = (
-                    f"The scale by {second} is {100 * (b / a - 1):+.2g} % off that by {first}, "
-                    "more than their errors explain."
-                )
-                hint = "Check the size of the markers, the coordinates, and their unit (metres)."
-                warnings.append(ReportWarning("scales-contradict", text, hint))
-
-
-def _positions(views: Sequence[PreparedView]) -> dict[str, GpsPosition]:
-    found = {view.name: read_gps_exif(view.source_path) for view in views}
-    return {name: position for name, position in found.items() if position is not None}
+    for (first, (a, error_a)), (second, (b, error_b)) in itertools.combinations(known.items(), 2):
+        apart = abs(math.log(a / b))
+        if apart > max(CONTRADICTION_SIGMAS * math.hypot(error_a, error_b), MIN_CONTRADICTION):
+            text = (
+                f"The scale by {second} is {100 * (b / a - 1):+.2g} % off that by {first}, "
+                "more than their errors explain."
+            )
+            hint = "Check the size of the markers, the coordinates, and their unit (metres)."
+            warnings.append(ReportWarning("scales-contradict", text, hint))
 
 
 def _control(
@@ -255,11 +231,11 @@ def _control(
 ) -> ControlFit:
     index = PhotoIndex(kind.photo_roots)
     of_path = {view.source_path: i for i, view in enumerate(views)}
-    pixels: dict[tuple[str, int], tuple[int, np.ndarray]] = {}
+    seen: list[Observations] = []
     for point in content.points:
-        for i, (photo, pixel, line) in enumerate(
-            zip(point.photos, point.pixels, point.lines, strict=True)
-        ):
+        numbers: list[int] = []
+        places: list[np.ndarray] = []
+        for photo, pixel, line in zip(point.photos, point.pixels, point.lines, strict=True):
             match = index.find(photo)
             if match is None:
                 raise ParseError(
@@ -275,8 +251,11 @@ def _control(
                     file, f"line {line}", f"the pixel lies outside of {photo[:80]}.",
                     "Give pixels of the upright photo, from its upper left corner.",
                 )  # fmt: skip
-            pixels[point.name, i] = number, place
-    fit = fit_control_points(content, cameras, observations(content, pixels))
+            numbers.append(number)
+            places.append(place)
+        pixels = np.array(places).reshape(-1, 2)
+        seen.append(Observations(point.name, point.position, tuple(numbers), pixels))
+    fit = fit_control_points(content, cameras, seen)
     found = fit.details["control_points"]
     if found["left_out"]:
         text = f"{len(found['left_out'])} control points disagree with the others: " + ", ".join(

@@ -71,10 +71,7 @@ class SourceKind:
 def source_kind(source: Path) -> SourceKind:
     """Detect the kind of input; prefers a COLMAP model to transforms.json, both to other programs.
 
-    Raises
-    ------
-    DatasetError
-        The path does not exist or holds nothing usable.
+    Raises DatasetError: the path does not exist or holds nothing usable.
     """
     if not source.exists():
         raise DatasetError(f"{source} does not exist.", _WANTED)
@@ -111,12 +108,7 @@ def source_kind(source: Path) -> SourceKind:
 
 
 def read_poses(kind: SourceKind) -> SourceModel:
-    """Read the poses of an input that has them.
-
-    Raises
-    ------
-    ParseError, DatasetError
-    """
+    """Read the poses of an input that has them. Raises ParseError, DatasetError."""
     if kind.kind == SPLAT:
         raise DatasetError("A splat contains no cameras.", "Give the input that it was trained on.")
     if kind.kind == VIDEO:

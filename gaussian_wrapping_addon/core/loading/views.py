@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +20,6 @@ from ..photos.formats import PhotoHeader, require_extras
 from ..photos.photo_file import (
     AS_WRITTEN,
     MASK_THRESHOLD,
-    DecodedPhoto,
     MaskReading,
     apply_orientation,
     photo_header,
@@ -40,6 +40,7 @@ _MAX_ONE_COLOUR_RANGE = 2
 JPEG of one colour may differ by one, the noise of a camera by more."""
 _QUICK_STEP = 16
 """Every so many pixels are compared before all are."""
+_MAX_MAPS = 2
 _SMALLEST_MASKED_SHARE = 1e-4
 """Smallest share of unmasked pixels; photos with less are not used."""
 
@@ -62,21 +63,165 @@ class PreparedView:
 
 
 @dataclass
-class _Notes:
-    """Problems of single photos, collected for warnings with counts."""
+class _Preparation:
+    """Prepares photos, on several threads; collects problems of single ones for warnings."""
 
+    kind: SourceKind
+    reading: MaskReading
+    work_folder: Path
+    prefers_stored: bool
+    """Whether the cameras are of the photos as stored."""
+    photos: frozenset[Path] = frozenset()
+    """Real paths of all photos: none of them is the mask of another."""
     missing: list[str] = field(default_factory=list)
     bad: list[str] = field(default_factory=list)
-    renamed: int = 0
-    rescaled: int = 0
     wrong_masks: list[str] = field(default_factory=list)
     fully_masked: list[str] = field(default_factory=list)
     one_colour: list[str] = field(default_factory=list)
+    renamed: int = 0
+    rescaled: int = 0
     masked: int = 0
     undistorted: int = 0
-    photos: frozenset[Path] = frozenset()
-    """Real paths of all photos: none of them is the mask of another."""
-    lock: threading.Lock = field(default_factory=threading.Lock)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _map_lock: threading.Lock = field(default_factory=threading.Lock)
+    _maps: dict[LensCamera, np.ndarray] = field(default_factory=dict)
+    """Sampling maps, shared by photos of the same lens."""
+
+    def view(self, index: int, posed: PosedPhoto, path: Path) -> PreparedView | None:
+        """Prepare one photo; ``None`` if it cannot be used, which is recorded."""
+        try:
+            header = photo_header(path)
+            if min(header.width, header.height) < MIN_PHOTO_SIDE_PX:
+                raise DatasetError(f"{path.name} is {header.width} x {header.height} pixels.")
+            photo = read_photo(path, upright=False)
+        except DatasetError as error:
+            self._add(self.bad, error.message)
+            return None
+        if photo.color.shape[:2] != (header.height, header.width):
+            self._add(self.bad, f"{path.name} decodes to another size than its header says.")
+            return None
+        lens, upright, rescaled = fit_lens(
+            posed, header, path.name, prefers_stored=self.prefers_stored
+        )
+        color, alpha = photo.color, photo.alpha
+        if upright:
+            color = apply_orientation(color, header.orientation)
+            alpha = None if alpha is None else apply_orientation(alpha, header.orientation)
+        mask = self._mask(posed, path, color.shape[:2], alpha, header if upright else None)
+        if mask is None and _is_one_colour(color):  # a mask's outline tells about shape
+            self._add(self.one_colour, posed.name)
+            return None
+        pinhole = pinhole_of(lens)
+        photo_path = path
+        if not lens.is_pinhole:
+            pixels = self._map(lens, pinhole)
+            color = sample_bicubic(color, pixels)
+            if mask is not None:
+                mask = sample_bicubic(np.where(mask, 255, 0).astype(np.uint8)[..., None], pixels)
+                mask = mask[..., 0] >= MASK_THRESHOLD
+        # Every program reads the same pixels from a plain file without orientation.
+        if not (lens.is_pinhole and photo.plain and header.orientation == 1):
+            photo_path = self.work_folder / "images" / f"{index:06d}.jpg"
+            write_photo(photo_path, color)
+        mask_path = None
+        with self._lock:
+            self.rescaled += rescaled
+            self.undistorted += not lens.is_pinhole
+            if mask is not None and mask.mean() < _SMALLEST_MASKED_SHARE:
+                self.fully_masked.append(posed.name)
+                return None
+            self.masked += mask is not None
+        if mask is not None:
+            mask_path = self.work_folder / "masks" / f"{index:06d}.png"
+            write_mask(mask_path, mask)
+        return PreparedView(
+            posed.name, pinhole, posed.cam_from_world, photo_path, mask_path, path, lens,
+            1 if upright else header.orientation,
+        )  # fmt: skip
+
+    def _mask(
+        self,
+        posed: PosedPhoto,
+        path: Path,
+        shape: tuple[int, ...],
+        alpha: np.ndarray | None,
+        turned: PhotoHeader | None,
+    ) -> np.ndarray | None:
+        """Return the (h, w) bool mask of a photo, of exactly its size, or ``None``.
+
+        ``turned``: header of a photo whose EXIF orientation was applied.
+        """
+        mask_path = posed.mask_path or self._mask_file(posed, path)
+        mask = None if alpha is None else alpha >= MASK_THRESHOLD
+        if mask_path is None:
+            return mask
+        try:
+            stored = read_mask(mask_path)
+            if turned and stored.shape != shape and stored.shape == (turned.height, turned.width):
+                stored = apply_orientation(stored, turned.orientation)
+            if stored.shape != shape:
+                stored = _resized_mask(stored, shape, mask_path)
+        except DatasetError as error:
+            self._add(self.wrong_masks, f"Mask {error.message}")
+            return mask
+        made = posed.mask_path is not None
+        from_file = (AS_WRITTEN if made else self.reading).kept(stored)
+        combined = from_file if mask is None else from_file & mask
+        return None if combined.all() else combined
+
+    def _mask_file(self, posed: PosedPhoto, path: Path) -> Path | None:
+        """Return the mask that the input names for a photo, or that is found for it."""
+        if posed.mask_name is None:
+            for name in (posed.name, path.name):
+                mask = find_mask(self.kind.mask_roots, name, self.kind.photo_roots)
+                # An input may name a.jpg and a_mask.jpg both as photos.
+                if mask is not None and real_path(mask) not in self.photos:
+                    return mask
+            return None
+        found = resolve_photo(self.kind.folder, posed.mask_name)
+        if found is not None and os.path.isfile(found):
+            return found
+        self._add(self.wrong_masks, f"{posed.mask_name} is missing")
+        return None
+
+    def _map(self, lens: LensCamera, pinhole: LensCamera) -> np.ndarray:
+        # Hold the lock while computing: two threads would compute the same map otherwise.
+        with self._map_lock:
+            if lens not in self._maps:
+                while len(self._maps) >= _MAX_MAPS:
+                    del self._maps[next(iter(self._maps))]
+                self._maps[lens] = sampling_map(lens, pinhole)
+            return self._maps[lens]
+
+    def _add(self, items: list[str], text: str) -> None:
+        with self._lock:
+            items.append(text)
+
+    def warnings(self, total: int, kind: str) -> list[ReportWarning]:
+        """Return the warnings of a set of ``total`` photos."""
+        out = []
+
+        def add(code: str, items: list[str], text: str, hint: str = "") -> None:
+            if items:
+                listed = ", ".join(sorted(items)[:3]) + (" ..." if len(items) > 3 else "")
+                out.append(ReportWarning(code, f"{len(items)} {text}: {listed}.", hint))
+
+        text = f"of the {total} photos that the {kind} names were not found"
+        add("photos-not-found", self.missing, text)
+        bad, text = [m.rstrip(".") for m in self.bad], "photos cannot be read and are not used"
+        add("photos-unreadable", bad, text, UNREADABLE_HINT)
+        add("masks-not-used", [m.rstrip(".") for m in self.wrong_masks], "masks were not used")
+        text = "photos are masked altogether and are not used"
+        hint = "White or opaque is kept, black or transparent is masked: check the masks."
+        add("photos-masked-altogether", self.fully_masked, text, hint)
+        text = "photos show one colour only and are not used"
+        hint = "Remove them, or take photos that show something with texture."
+        add("photos-of-one-colour", self.one_colour, text, hint)
+        if self.renamed:
+            differs = "a name that differs in case, extension or folder"
+            text = f"{self.renamed} photos were found under {differs}."
+            out.append(ReportWarning("photos-renamed", text))
+        return out
 
 
 def prepare_views(
@@ -93,125 +238,49 @@ def prepare_views(
     Written files: ``work_folder/images/*.jpg`` (undistorted, or oriented and converted to 8 bits)
     and ``work_folder/masks/*.png``.
 
-    Returns
-    -------
-    views : list of PreparedView
-        In the order of the names.
-    warnings : list of ReportWarning
-    facts : dict
-
-    Raises
-    ------
-    DatasetError
-        No photo was found, more than a fifth cannot be decoded, or sizes do not match the cameras.
-    MissingExtraError
-        Photos need a package that the worker lacks.
+    Returns views in the order of the names, warnings and facts.
+    Raises DatasetError: no photo was found, more than a fifth cannot be decoded, or sizes do not
+    match the cameras; MissingExtraError: photos need a package that the worker lacks.
     """
     threads = threads or default_threads()
-    notes = _Notes()
+    work = _Preparation(kind, reading, work_folder, counts_stored_pixels(model.kind))
     index = PhotoIndex(kind.photo_roots)
     found: list[tuple[PosedPhoto, Path]] = []
     used: set[Path] = set()
     for posed in sorted(model.photos, key=lambda p: p.name):
         match = index.find(posed.name)
         if match is None or match.path in used:
-            notes.missing.append(posed.name)
+            work.missing.append(posed.name)
             continue
         used.add(match.path)
-        notes.renamed += match.how != "exact"
+        work.renamed += match.how != "exact"
         found.append((posed, match.path))
     if not found:
         searched = ", ".join(str(root) for root in kind.photo_roots)
-        raise DatasetError(
-            f"None of the {len(model.photos)} photos that the {model.kind} names was found.",
-            f"Looked for {notes.missing[0]} in {searched}.",
-        )
+        text = f"None of the {len(model.photos)} photos that the {model.kind} names was found."
+        raise DatasetError(text, f"Looked for {work.missing[0]} in {searched}.")
     require_extras([path for _, path in found])
-    notes.photos = frozenset(real_path(path) for path in used)
+    work.photos = frozenset(real_path(path) for path in used)
     (work_folder / "images").mkdir(parents=True, exist_ok=True)
     (work_folder / "masks").mkdir(exist_ok=True)
-    maps = _MapCache()
     views: list[PreparedView] = []
-
-    def prepare(i: int) -> PreparedView | None:
-        posed, path = found[i]
-        return _prepare(i, posed, path, model, kind, reading, work_folder, maps, notes)
-
     with ThreadPoolExecutor(threads) as pool:
         try:
-            for i, view in enumerate(pool.map(prepare, range(len(found)))):
+            done = pool.map(work.view, itertools.count(), *zip(*found, strict=True))
+            for i, view in enumerate(done):
                 if view is not None:
                     views.append(view)
-                check_unreadable_share(notes.bad, len(found))
+                check_unreadable_share(work.bad, len(found))
                 progress.update((i + 1) / len(found), f"preparing photo {i + 1} of {len(found)}")
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return views, _warnings(notes, len(model.photos), model.kind), _facts(notes)
-
-
-def _prepare(
-    index: int,
-    posed: PosedPhoto,
-    path: Path,
-    model: SourceModel,
-    kind: SourceKind,
-    reading: MaskReading,
-    work_folder: Path,
-    maps: _MapCache,
-    notes: _Notes,
-) -> PreparedView | None:
-    """Prepare one photo; ``None`` if it cannot be used, which is recorded in ``notes``."""
-    try:
-        header = photo_header(path)
-        if min(header.width, header.height) < MIN_PHOTO_SIDE_PX:
-            raise DatasetError(f"{path.name} is {header.width} x {header.height} pixels.")
-        photo = read_photo(path, upright=False)
-    except DatasetError as error:
-        with notes.lock:
-            notes.bad.append(error.message)
-        return None
-    if photo.color.shape[:2] != (header.height, header.width):
-        with notes.lock:
-            notes.bad.append(f"{path.name} decodes to another size than its header says.")
-        return None
-    prefers_stored = counts_stored_pixels(model.kind)
-    lens, upright, rescaled = fit_lens(posed, header, path.name, prefers_stored=prefers_stored)
-    color, alpha = photo.color, photo.alpha
-    if upright:
-        color = apply_orientation(color, header.orientation)
-        alpha = None if alpha is None else apply_orientation(alpha, header.orientation)
-    mask = _find_mask(posed, path, kind, reading, color.shape[:2], alpha, header, upright, notes)
-    if mask is None and _is_one_colour(color):  # a mask's outline tells about shape
-        with notes.lock:
-            notes.one_colour.append(posed.name)
-        return None
-    pinhole = pinhole_of(lens)
-    photo_path = path
-    if not lens.is_pinhole:
-        pixels = maps.get(lens, pinhole)
-        color = sample_bicubic(color, pixels)
-        if mask is not None:
-            mask = sample_bicubic(np.where(mask, 255, 0).astype(np.uint8)[..., None], pixels)
-            mask = mask[..., 0] >= MASK_THRESHOLD
-    if not lens.is_pinhole or not _is_plain(photo, header):
-        photo_path = work_folder / "images" / f"{index:06d}.jpg"
-        write_photo(photo_path, color)
-    mask_path = None
-    with notes.lock:
-        notes.rescaled += rescaled
-        notes.undistorted += not lens.is_pinhole
-        if mask is not None and mask.mean() < _SMALLEST_MASKED_SHARE:
-            notes.fully_masked.append(posed.name)
-            return None
-        notes.masked += mask is not None
-    if mask is not None:
-        mask_path = work_folder / "masks" / f"{index:06d}.png"
-        write_mask(mask_path, mask)
-    return PreparedView(
-        posed.name, pinhole, posed.cam_from_world, photo_path, mask_path, path, lens,
-        1 if upright else header.orientation,
-    )  # fmt: skip
+    counts = {
+        "photos_undistorted": work.undistorted, "photos_rescaled": work.rescaled,
+        "photos_masked": work.masked,
+    }  # fmt: skip
+    facts = {name: count for name, count in counts.items() if count}
+    return views, work.warnings(len(model.photos), model.kind), facts
 
 
 def _is_one_colour(color: np.ndarray) -> bool:
@@ -225,60 +294,6 @@ def _is_one_colour(color: np.ndarray) -> bool:
     )
 
 
-def _is_plain(photo: DecodedPhoto, header: PhotoHeader) -> bool:
-    """Whether every program reads the prepared pixels from the original file."""
-    return photo.plain and header.orientation == 1
-
-
-def _find_mask(
-    posed: PosedPhoto,
-    path: Path,
-    kind: SourceKind,
-    reading: MaskReading,
-    shape: tuple[int, ...],
-    alpha: np.ndarray | None,
-    header: PhotoHeader,
-    upright: bool,
-    notes: _Notes,
-) -> np.ndarray | None:
-    """Return the (h, w) bool mask of a photo, of exactly its size, or ``None``."""
-    mask_path = posed.mask_path or _mask_file(posed, path, kind, notes)
-    mask = None if alpha is None else alpha >= MASK_THRESHOLD
-    if mask_path is None:
-        return mask
-    try:
-        stored = read_mask(mask_path)
-        if upright and stored.shape != shape and stored.shape == (header.height, header.width):
-            stored = apply_orientation(stored, header.orientation)
-        if stored.shape != shape:
-            stored = _resized_mask(stored, shape, mask_path)
-    except DatasetError as error:
-        with notes.lock:
-            notes.wrong_masks.append(f"Mask {error.message}")
-        return mask
-    made = posed.mask_path is not None
-    from_file = (AS_WRITTEN if made else reading).kept(stored)
-    combined = from_file if mask is None else from_file & mask
-    return None if combined.all() else combined
-
-
-def _mask_file(posed: PosedPhoto, path: Path, kind: SourceKind, notes: _Notes) -> Path | None:
-    """Return the mask that the input names for a photo, or that is found for it."""
-    if posed.mask_name is None:
-        for name in (posed.name, path.name):
-            mask = find_mask(kind.mask_roots, name, kind.photo_roots)
-            # An input may name a.jpg and a_mask.jpg both as photos.
-            if mask is not None and real_path(mask) not in notes.photos:
-                return mask
-        return None
-    found = resolve_photo(kind.folder, posed.mask_name)
-    if found is not None and os.path.isfile(found):
-        return found
-    with notes.lock:
-        notes.wrong_masks.append(f"{posed.mask_name} is missing")
-    return None
-
-
 def _resized_mask(mask: np.ndarray, shape: tuple[int, ...], path: Path) -> np.ndarray:
     from PIL import Image
 
@@ -288,74 +303,4 @@ def _resized_mask(mask: np.ndarray, shape: tuple[int, ...], path: Path) -> np.nd
             f"{path.name} is {mask.shape[1]} x {mask.shape[0]} pixels, its photo "
             f"{shape[1]} x {shape[0]}."
         )
-    resized = Image.fromarray(mask).resize((shape[1], shape[0]), Image.Resampling.NEAREST)
-    return np.asarray(resized)
-
-
-class _MapCache:
-    """Cache of sampling maps, shared by photos of the same lens."""
-
-    _MAX_MAPS = 2
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._maps: dict[LensCamera, np.ndarray] = {}
-
-    def get(self, lens: LensCamera, pinhole: LensCamera) -> np.ndarray:
-        # Hold the lock while computing: two threads would compute the same map otherwise.
-        with self._lock:
-            if lens not in self._maps:
-                while len(self._maps) >= self._MAX_MAPS:
-                    del self._maps[next(iter(self._maps))]
-                self._maps[lens] = sampling_map(lens, pinhole)
-            return self._maps[lens]
-
-
-def _warnings(notes: _Notes, total: int, kind: str) -> list[ReportWarning]:
-    out = []
-
-    def add(code: str, items: list[str], text: str, hint: str = "") -> None:
-        if items:
-            listed = ", ".join(sorted(items)[:3]) + (" ..." if len(items) > 3 else "")
-            out.append(ReportWarning(code, f"{len(items)} {text}: {listed}.", hint))
-
-    add(
-        "photos-not-found",
-        notes.missing,
-        f"of the {total} photos that the {kind} names were not found",
-    )
-    add(
-        "photos-unreadable",
-        [m.rstrip(".") for m in notes.bad],
-        "photos cannot be read and are not used",
-        UNREADABLE_HINT,
-    )
-    add("masks-not-used", [m.rstrip(".") for m in notes.wrong_masks], "masks were not used")
-    add(
-        "photos-masked-altogether",
-        notes.fully_masked,
-        "photos are masked altogether and are not used",
-        "White or opaque is kept, black or transparent is masked: check the masks.",
-    )
-    add(
-        "photos-of-one-colour",
-        notes.one_colour,
-        "photos show one colour only and are not used",
-        "Remove them, or take photos that show something with texture.",
-    )
-    if notes.renamed:
-        text = (
-            f"{notes.renamed} photos were found under a name that differs in case, extension or "
-            "folder."
-        )
-        out.append(ReportWarning("photos-renamed", text))
-    return out
-
-
-def _facts(notes: _Notes) -> dict[str, int]:
-    counts = {
-        "photos_undistorted": notes.undistorted,
-        "photos_rescaled": notes.rescaled,
-        "photos_masked": notes.masked,
-    }
-    return {name: count for name, count in counts.items() if count}
+    return np.asarray(Image.fromarray(mask).resize((shape[1], shape[0]), Image.Resampling.NEAREST))

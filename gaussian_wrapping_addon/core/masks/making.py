@@ -22,7 +22,6 @@ from ..training.start import LEAST_REACH, onto_sphere
 #
 # Without them, training explains a plain background by fog around the object, inside the region.
 
-
 CELL_PX = 8
 """Side of the cells that are looked at, pixels of the photos."""
 MOST_POINTS = 8000
@@ -36,10 +35,7 @@ def with_background(scene: Scene, photos: PhotoSource, *, seed: int) -> Scene:
     They are in the direction of pixels drawn by chance, where neither the cell nor its neighbours
     show a sparse point; where that gives too few, of all pixels.
 
-    Parameters
-    ----------
-    photos : PhotoStore
-        Small photos of the scene's views.
+    ``photos``: small photos of the scene's views.
     """
     random = np.random.default_rng([seed, 7])
     tried = -(-(MOST_POINTS + LEAST_POINTS) // len(scene.views))  # a photo
@@ -76,7 +72,6 @@ def _near_points(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 # -- Silhouettes of the Gaussians that stand in a region, as photos show them ---------------------
 
-
 WHITE = 0.5 / (0.5 / math.sqrt(math.pi))
 """Coefficient of the constant harmonic of a Gaussian whose colour is 1; minus that, of colour 0."""
 CLEAR_SHARE = 0.5
@@ -104,25 +99,18 @@ def silhouettes(
     The share is the sum of the blending weights of the Gaussians inside: what stands in front of
     them takes its part of the light, and so does what they let through.
 
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Scene frame.
-    inside : (n,) bool
-        Gaussians that belong to the object.
-    cameras : sequence of Camera
-        Scene frame; silhouettes have their size.
-    bounds : (n, 3), optional
-        Corners of the regions, scene frame. What is nearer to a camera than half of the way to
-        them hides nothing: a short training leaves fog right before single cameras.
+    ``gaussians``: scene frame.
+    ``inside``: (n,) bool, Gaussians that belong to the object.
+    ``cameras``: scene frame; silhouettes have their size.
+    ``bounds``: (n, 3), corners of the regions, scene frame. What is nearer to a camera than half of
+        the way to them hides nothing: a short training leaves fog right before single cameras.
     """
     arrays = marked(gaussians, inside)
     for camera in cameras:
         options = RenderOptions(
             depth=False, sh_degree=0, threads=threads, near_z=_near_z(camera, bounds)
         )
-        color = renderer.render(arrays, camera, options).color
-        yield np.clip(color[..., 0], 0.0, 1.0)
+        yield np.clip(renderer.render(arrays, camera, options).color[..., 0], 0.0, 1.0)
 
 
 def _near_z(camera: Camera, bounds: np.ndarray | None) -> float:

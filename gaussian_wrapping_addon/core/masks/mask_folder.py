@@ -24,9 +24,7 @@ from ..limits import MAX_MODEL_BYTES
 def check_model_file(path: Path) -> None:
     """Raise where a model's file is missing, no regular file, empty or too large; reads nothing.
 
-    Raises
-    ------
-    DatasetError, ResourceError
+    Raises DatasetError, ResourceError.
     """
     try:
         size = path.stat().st_size if path.is_file() else None
@@ -46,7 +44,6 @@ def check_model_file(path: Path) -> None:
 # -- The folder of made masks: PNGs to look at and edit, and the list of those that were rejected
 #
 # Standard library only, so that Blender can load it.
-
 
 FOLDER = "masks"
 """In the job folder."""
@@ -90,10 +87,7 @@ class MaskList:
 def read_list(folder: Path) -> MaskList | None:
     """Return the list of a masks folder, or ``None`` where there is none.
 
-    Raises
-    ------
-    ParseError
-        It is damaged, of another version, or names files outside of the folder.
+    Raises ParseError: it is damaged, of another version, or names files outside of the folder.
     """
     path = folder / LIST_NAME
     if not path.is_file():
@@ -160,17 +154,9 @@ def publish(root: Path, made: Path, masks: MaskList) -> Path:
     A folder that a person may have edited is kept: masks of another origin are moved aside, to
     ``masks-KEY``, and come back from there; files without a list, to ``masks-kept``.
 
-    Parameters
-    ----------
-    root : Path
-        The job folder.
-    made : Path
-        Where the files ``000000.png``, ... lie, in the order of ``masks``.
-
-    Returns
-    -------
-    Path
-        The folder of masks.
+    ``root``: the job folder. ``made``: where the files ``000000.png``, ... lie, in the order of
+    ``masks``.
+    Returns the folder of masks.
     """
     folder = root / FOLDER
     there = read_list(folder)
@@ -221,10 +207,7 @@ def used_masks(folder: Path, masks: MaskList) -> Iterable[tuple[MadeMask, Path]]
 def digest(folder: Path, masks: MaskList) -> str:
     """Return a hash of the masks that count, whatever their dates, for the key of a training.
 
-    Raises
-    ------
-    ParseError
-        A mask is a link or another thing that is not a file, or too large.
+    Raises ParseError: a mask is a link or another thing that is not a file, or too large.
     """
     found = hashlib.sha256()
     for mask, path in used_masks(folder, masks):

@@ -14,10 +14,8 @@ from .segmentation import SegmentationModel, cleaned, encoded
 def main(folder: Path) -> None:
     """Make ``masks/000000.png``, ... of the photos in ``task.json``; those there already are kept.
 
-    Raises
-    ------
-    WorkerError, DatasetError, ResourceError
-        The model cannot be used, or a photo cannot be read.
+    Raises WorkerError, DatasetError, ResourceError: the model cannot be used, or a photo cannot be
+    read.
     """
     task = read_json(folder / "task.json")
     model = SegmentationModel(Path(task["model"]), task["range"], threads=task["threads"])

@@ -11,11 +11,11 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import DatasetError
+from ..photos.photo_file import large_parts
 from ..worker.environment import load_extra
 from .mask_folder import check_model_file
 
 # -- From how much of a pixel shows the object to a mask of the photo -----------------------------
-
 
 THRESHOLD = 0.5
 """Share of a pixel from which it belongs to the object."""
@@ -35,34 +35,20 @@ pixel of it inexact, and what a mask cuts off is lost while what it leaves on is
 def cleaned(share: np.ndarray, size: tuple[int, int], grown_share: float = 0.0) -> np.ndarray:
     """Return the (h, w) bool mask of a photo, true where it shows the object.
 
-    Parameters
-    ----------
-    share : (h', w') float
-        In [0, 1]; of the whole photo, usually smaller than it.
-    size : (int, int)
-        Width and height of the photo.
-    grown_share : float
-        Border kept around the object, as a share of the photo's long side.
+    ``share``: (h', w') float, in [0, 1]; of the whole photo, usually smaller than it.
+    ``size``: (int, int), width and height of the photo.
+    ``grown_share``: border kept around the object, as a share of the photo's long side.
     """
     from PIL import Image
 
     grey = Image.fromarray(np.ascontiguousarray(share, np.float32))
     whole = np.asarray(grey.resize(size, Image.Resampling.BILINEAR))
-    kept = _without_thin_spots(_large_parts(whole >= THRESHOLD), whole)
+    kept = _without_thin_spots(large_parts(whole >= THRESHOLD, SMALLEST_SHARE), whole)
     if not grown_share:
         return kept
     radius = max(1, round(grown_share * max(size)))
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     return np.asarray(ndimage.binary_dilation(kept, x * x + y * y <= radius * radius))
-
-
-def _large_parts(mask: np.ndarray) -> np.ndarray:
-    label, count = ndimage.label(mask)
-    if count < 2:
-        return mask
-    areas = np.bincount(label.ravel())
-    areas[0] = 0
-    return np.asarray((areas >= SMALLEST_SHARE * areas.max())[label] & mask)
 
 
 def _without_thin_spots(mask: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -90,7 +76,6 @@ def encoded(mask: np.ndarray) -> bytes:
 # Conventions (docs/file-formats.md): one input ``(1, 3, h, w)`` float, colours normalised in one
 # of three ways; the first output ``(1, 1, h, w)`` or ``(1, h, w)``, shares or logits.
 
-
 USUAL_SIDE_PX = 1024
 """Side of the input where the model leaves it open."""
 MOST_SIDE_PX = 4096
@@ -111,23 +96,10 @@ _FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 class SegmentationModel:
     """A model that is ready to run.
 
-    Parameters
-    ----------
-    path : Path
-        The ONNX file.
-    color_range : str
-        One of ``RANGES``.
-    threads : int
-        0 uses every core.
-
-    Raises
-    ------
-    WorkerError
-        onnxruntime is not installed; says how to install it.
-    DatasetError
-        It is not an ONNX file, or its inputs and outputs are not those of such a model.
-    ResourceError
-        It is too large.
+    ``path``: the ONNX file. ``color_range``: one of ``RANGES``. ``threads``: 0 uses every core.
+    Raises WorkerError: onnxruntime is not installed; says how to install it; DatasetError: it is
+    not an ONNX file, or its inputs and outputs are not those of such a model; ResourceError: it is
+    too large.
     """
 
     def __init__(self, path: Path, color_range: str, *, threads: int = 0) -> None:
@@ -142,9 +114,8 @@ class SegmentationModel:
                 str(path), options, providers=["CPUExecutionProvider"]
             )
         except Exception as error:  # its exceptions share no base of their own
-            raise DatasetError(
-                f"{path.name} cannot be read as an ONNX model ({_first_line(error)}).", _WANTED
-            ) from None
+            text = f"{path.name} cannot be read as an ONNX model ({_first_line(error)})."
+            raise DatasetError(text, _WANTED) from None
         self._name = path.name
         self._mean, self._deviation = (np.array(v, np.float32) for v in RANGES[color_range])
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
@@ -169,15 +140,9 @@ class SegmentationModel:
     def share(self, color: np.ndarray) -> np.ndarray:
         """Return how much of each pixel is the object, (h', w') float32 in [0, 1].
 
-        Parameters
-        ----------
-        color : (h, w, 3) uint8
-            A photo of any size; it is stretched to the model's, and so is the result.
-
-        Raises
-        ------
-        DatasetError
-            The model fails, or its output has another shape or is not finite.
+        ``color``: (h, w, 3) uint8, a photo of any size; it is stretched to the model's, and so is
+            the result.
+        Raises DatasetError: the model fails, or its output has another shape or is not finite.
         """
         from PIL import Image
 
@@ -189,11 +154,8 @@ class SegmentationModel:
         except Exception as error:  # as above
             raise self._unfit(f"fails ({_first_line(error)})") from None
         values = np.asarray(found)
-        if (
-            values.dtype.kind != "f"
-            or values.ndim not in (3, 4)
-            or (values.ndim == 4 and (values.shape[1] != 1))
-        ):
+        is_one_channel = values.ndim == 3 or (values.ndim == 4 and values.shape[1] == 1)
+        if values.dtype.kind != "f" or not is_one_channel:
             raise self._unfit(f"gives {values.dtype} of shape {values.shape}, not (1, 1, h, w)")
         if values.shape[0] != 1 or 0 in values.shape:
             raise self._unfit(f"gives an output of shape {values.shape}")

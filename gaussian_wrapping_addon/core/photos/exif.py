@@ -14,7 +14,6 @@ from .formats import RAW, open_image, photo_kind, raw_focal, without_warnings
 
 # -- Read lens identity and focal length from a photo's EXIF --------------------------------------
 
-
 _EXIF_FOLDER = 0x8769
 _MAKE, _MODEL, _LENS = 0x010F, 0x0110, 0xA434
 _FOCAL_MM, _FOCAL_35MM = 0x920A, 0xA405
@@ -44,10 +43,7 @@ def read_lens_exif(path: Path, width: int, height: int) -> LensExif:
         Image.DecompressionBombError,
     ):  # fmt: skip
         tags = {}
-    focal_mm, focal_35 = (
-        _positive_number(tags.get(_FOCAL_MM)),
-        _positive_number(tags.get(_FOCAL_35MM)),
-    )
+    focal_mm, focal_35 = (_positive(tags.get(tag)) or 0.0 for tag in (_FOCAL_MM, _FOCAL_35MM))
     names = [str(tags.get(tag, "")).strip("\0 ")[:80] for tag in (_MAKE, _MODEL, _LENS)]
     key = (*names, f"{focal_mm:.1f}", f"{focal_35:.1f}")
     longest = max(width, height)
@@ -56,9 +52,9 @@ def read_lens_exif(path: Path, width: int, height: int) -> LensExif:
         # The 35 mm equivalent preserves the diagonal field of view (CIPA DCG-001).
         focal_px = focal_35 * math.hypot(width, height) / _DIAGONAL_35MM
     elif focal_mm:
-        unit_mm = _UNIT_MM.get(int(_positive_number(tags.get(_PLANE_UNIT)) or 2), 25.4)
-        pixels_per_mm = _positive_number(tags.get(_PLANE_X)) / unit_mm
-        stored = _positive_number(tags.get(_PIXELS_X)) or longest
+        unit_mm = _UNIT_MM.get(int(_positive(tags.get(_PLANE_UNIT)) or 2), 25.4)
+        pixels_per_mm = (_positive(tags.get(_PLANE_X)) or 0.0) / unit_mm
+        stored = _positive(tags.get(_PIXELS_X)) or longest
         focal_px = focal_mm * pixels_per_mm * longest / stored
     good = _PLAUSIBLE[0] <= focal_px / longest <= _PLAUSIBLE[1]
     return LensExif(key, focal_px if good else None)
@@ -84,21 +80,11 @@ def _raw_tags(path: Path) -> dict[int, Any]:
     return {_FOCAL_MM: focal_mm, _LENS: lens, **tags}
 
 
-def _positive_number(value: Any) -> float:
-    """Return a finite number above 0, or 0."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return 0.0
-    return number if math.isfinite(number) and number > 0 else 0.0
-
-
 # -- Read where a photo was taken from its EXIF: GPS latitude, longitude and altitude -------------
-
 
 _GPS_FOLDER = 0x8825
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE = 1, 2, 3, 4
-_ALTITUDE_REF, _ALTITUDE, _STATUS, _DOP, _DATUM, _ERROR_M = 5, 6, 9, 11, 18, 31
+_ALTITUDE_REF, _ALTITUDE, _STATUS, _DOP, _ERROR_M = 5, 6, 9, 11, 31
 _SIGNS = {"N": 1.0, "S": -1.0, "E": 1.0, "W": -1.0}
 _VOID = "V"
 """GPSStatus of a receiver without a fix."""
@@ -123,8 +109,6 @@ class GpsPosition:
     """Dilution of precision, where the receiver wrote it."""
     error_m: float | None = None
     """Horizontal error that the receiver states, where it does."""
-    datum: str = ""
-    """Such as ``"WGS-84"``; empty where EXIF names none."""
 
 
 def read_gps_exif(path: Path) -> GpsPosition | None:
@@ -153,15 +137,9 @@ def gps_of_tags(tags: Mapping[int, Any]) -> GpsPosition | None:
     altitude = _finite(tags.get(_ALTITUDE))
     if altitude is not None and abs(altitude) > _MAX_ALTITUDE_M:
         altitude = None
-    return GpsPosition(
-        latitude,
-        longitude,
-        None if altitude is None else sign * altitude,
-        level,
-        _positive(tags.get(_DOP)),
-        _positive(tags.get(_ERROR_M)),
-        str(tags.get(_DATUM, "")).strip("\0 ")[:40],
-    )
+    signed = None if altitude is None else sign * altitude
+    dop, error_m = _positive(tags.get(_DOP)), _positive(tags.get(_ERROR_M))
+    return GpsPosition(latitude, longitude, signed, level, dop, error_m)
 
 
 def _degrees(value: Any, reference: Any, most: float) -> float | None:

@@ -31,10 +31,7 @@ def list_photos(root: Path) -> list[Path]:
 
     Links to files are followed, links to folders are not (they could form a loop).
 
-    Raises
-    ------
-    DatasetError
-        More files than the limit.
+    Raises DatasetError: more files than the limit.
     """
     photos, _ = _walk(root)
     return photos
@@ -56,28 +53,18 @@ def _walk(root: Path) -> tuple[list[Path], list[Path]]:
             subfolders.clear()  # a job beside its video or transforms.json is no input
             continue
         here = Path(folder)
-        deep = len(here.parts) - base_depth >= _MAX_DEPTH
-        subfolders[:] = (
-            []
-            if deep
-            else sorted(
-                s for s in subfolders if not s.startswith(".") and s.lower() not in MASK_FOLDERS
-            )
-        )
-        shown = [
-            name
-            for name in names
-            if not name.startswith(".") and PurePosixPath(name).suffix.lower() in PHOTO_SUFFIXES
-        ]
+        inner = [s for s in subfolders if s[0] != "." and s.lower() not in MASK_FOLDERS]
+        is_deep = len(here.parts) - base_depth >= _MAX_DEPTH
+        subfolders[:] = [] if is_deep else sorted(inner)
+        shown = [name for name in names if _is_photo_name(name)]
         masks = set(masks_among(shown).values())
         photos = [name for name in shown if name not in masks]
         second = second_copies(photos)
         found += [here / name for name in photos if name not in second]
         left_out += [here / name for name in second]
         if len(found) > limits.MAX_IMAGES:
-            raise DatasetError(
-                f"{root.name} holds more than {limits.MAX_IMAGES} photos.", "Choose a subfolder."
-            )
+            text = f"{root.name} holds more than {limits.MAX_IMAGES} photos."
+            raise DatasetError(text, "Choose a subfolder.")
 
     def name_of(path: Path) -> str:
         return path.relative_to(root).as_posix()
@@ -85,14 +72,15 @@ def _walk(root: Path) -> tuple[list[Path], list[Path]]:
     return sorted(found, key=name_of), sorted(left_out, key=name_of)
 
 
+def _is_photo_name(name: str) -> bool:
+    return not name.startswith(".") and PurePosixPath(name).suffix.lower() in PHOTO_SUFFIXES
+
+
 def second_copies(names: Iterable[str]) -> set[str]:
     """Return the names of files that hold the same photo as another one.
 
-    Parameters
-    ----------
-    names : iterable of str
-        Of the photos of one folder. Cameras write ``x.jpg`` and ``x.nef`` of the same photo: the
-        HEIC and RAW files are left out where an image of the same stem is there, the RAW files
+    ``names``: of the photos of one folder. Cameras write ``x.jpg`` and ``x.nef`` of the same photo:
+        the HEIC and RAW files are left out where an image of the same stem is there, the RAW files
         where a HEIC is. An image is what the camera made of it, needs no package and no time.
     """
     rank_of: dict[str, list[tuple[int, str]]] = {}
@@ -112,16 +100,13 @@ def second_copies(names: Iterable[str]) -> set[str]:
 def masks_among(names: Iterable[str]) -> dict[str, str]:
     """Return the masks that lie beside their photos: the mask's name of each photo's.
 
-    Parameters
-    ----------
-    names : iterable of str
-        Of the files of one folder. ``x_mask.png``, ``x.jpg.mask.png`` and the like
-        (``MASK_ENDINGS``), in upper or lower case, belong to ``x.jpg`` if that is there.
+    ``names``: of the files of one folder. ``x_mask.png``, ``x.jpg.mask.png`` and the like
+    (``MASK_ENDINGS``), in upper or lower case, belong to ``x.jpg`` if that is there.
     """
     photos: dict[str, list[str]] = {}
     marked: list[tuple[str, str]] = []
     for name in sorted(names):
-        if PurePosixPath(name).suffix.lower() not in PHOTO_SUFFIXES or name.startswith("."):
+        if not _is_photo_name(name):
             continue
         key = name.casefold()
         stem = PurePosixPath(key).stem
@@ -163,10 +148,7 @@ class Match:
 class PhotoIndex:
     """Photos looked up by the names that a model uses.
 
-    Parameters
-    ----------
-    roots : list of Path
-        Names are looked up exactly under each of them, then by looser rules under the first.
+    ``roots``: names are looked up exactly under each of them, then by looser rules under the first.
     """
 
     def __init__(self, roots: list[Path]) -> None:
@@ -189,8 +171,7 @@ class PhotoIndex:
             path = resolve_photo(root, name)
             if path is not None and os.path.isfile(path):
                 return Match(path, "exact")
-        clean = str(PurePosixPath(name.replace("\\", "/")))
-        keys = _keys(clean)
+        keys = _keys(str(PurePosixPath(name.replace("\\", "/"))))
         # A name without extension may still hold a dot: "img.0001".
         keys.insert(1, ("extension", keys[0][1]))
         for how, key in keys:
@@ -206,12 +187,8 @@ def _keys(name: str) -> list[tuple[str, str]]:
     """Return the keys by which a name is matched, strictest first."""
     folded = unicodedata.normalize("NFC", name).casefold()
     stem = str(PurePosixPath(folded).with_suffix("")) if PurePosixPath(folded).name else folded
-    return [
-        ("case", folded),
-        ("extension", stem),
-        ("folder", PurePosixPath(folded).name),
-        ("folder", PurePosixPath(stem).name),
-    ]
+    in_folder = [("folder", PurePosixPath(key).name) for key in (folded, stem)]
+    return [("case", folded), ("extension", stem), *in_folder]
 
 
 def mask_candidates(name: str) -> list[str]:
@@ -225,13 +202,9 @@ def mask_candidates(name: str) -> list[str]:
 def find_mask(mask_roots: list[Path], name: str, beside: Sequence[Path] = ()) -> Path | None:
     """Return the mask of photo ``name``, or ``None``.
 
-    Parameters
-    ----------
-    mask_roots : list of Path
-        Folders of masks: ``x.jpg.png``, ``x.png``, the same name, or a name that says so
-        (``MASK_ENDINGS``).
-    beside : sequence of Path
-        Folders of photos: the mask lies beside the photo (:func:`masks_among`).
+    ``mask_roots``: folders of masks: ``x.jpg.png``, ``x.png``, the same name, or a name that says
+    so (``MASK_ENDINGS``). ``beside``: folders of photos: the mask lies beside the photo
+    (:func:`masks_among`).
     """
     for root in mask_roots:
         for candidate in mask_candidates(name):
@@ -244,8 +217,7 @@ def find_mask(mask_roots: list[Path], name: str, beside: Sequence[Path] = ()) ->
             continue
         mask = _masks_beside(str(photo.parent), os.stat(photo.parent).st_mtime_ns).get(photo.name)
         if mask is not None:
-            here = PurePosixPath(name.replace("\\", "/")).parent
-            path = resolve_photo(root, str(here / mask))
+            path = resolve_photo(root, str(PurePosixPath(name.replace("\\", "/")).parent / mask))
             if path is not None and os.path.isfile(path):
                 return path
     return None

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 # Pillow goes by the content of a file, not by its name, and knows some forty formats: a
 # PostScript file named ``.jpg`` would start Ghostscript.
 
-
 IMAGE_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "AVIF")
 """Pillow's names; a JPEG with several pictures (MPO) is opened as JPEG."""
 PLAIN_FORMATS = IMAGE_FORMATS[:5]
@@ -60,10 +59,7 @@ def photo_kind(path: Path) -> str:
     HEIF is told by the content (phones' files are often renamed), RAW by the name unless the
     content is something else: many RAW formats are TIFF inside.
 
-    Raises
-    ------
-    OSError
-        The file cannot be read, or is a pipe or a device, which reading could wait for.
+    Raises OSError: the file cannot be read, or is a pipe or a device, which reading could wait for.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} is no file.")
@@ -81,10 +77,7 @@ def photo_kind(path: Path) -> str:
 def require_extras(photos: Sequence[Path]) -> None:
     """Raise where the worker lacks the packages that photos need; decodes nothing.
 
-    Raises
-    ------
-    MissingExtraError
-        Names the photos and the next step.
+    Raises MissingExtraError, which names the photos and the next step.
     """
     of_kind: dict[str, list[str]] = {}
     for path in photos:
@@ -104,14 +97,9 @@ def open_image(path: Path) -> Image.Image:
 
     HEIF photos come upright, their own rotation and mirroring applied.
 
-    Raises
-    ------
-    ImportError
-        Pillow is not installed.
-    MissingExtraError
-        A HEIF photo, and its extra is not installed.
-    PIL.UnidentifiedImageError, OSError, ValueError, SyntaxError, DecompressionBombError
-        Of Pillow: no image in one of :data:`IMAGE_FORMATS`.
+    Raises ImportError: Pillow is not installed; MissingExtraError: a HEIF photo, and its extra is
+    not installed; PIL.UnidentifiedImageError, OSError, ValueError, SyntaxError,
+    DecompressionBombError: of Pillow: no image in one of :data:`IMAGE_FORMATS`.
     """
     from PIL import Image
 
@@ -129,36 +117,24 @@ def without_warnings() -> Iterator[None]:
     The filters belong to the process: photos are read on several threads, so that the first to
     come sets them and the last to go restores them.
     """
-    _quiet.enter()
+    global _quiet_threads
+    with _quiet_lock:
+        if not _quiet_threads:
+            _earlier_filters.enter_context(warnings.catch_warnings())
+            warnings.simplefilter("ignore")
+        _quiet_threads += 1
     try:
         yield
     finally:
-        _quiet.leave()
+        with _quiet_lock:
+            _quiet_threads -= 1
+            if not _quiet_threads:
+                _earlier_filters.close()
 
 
-class _QuietFilters:
-    """Filters that ignore every warning while at least one thread wants them."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._wanted_by = 0
-        self._earlier = contextlib.ExitStack()
-
-    def enter(self) -> None:
-        with self._lock:
-            if not self._wanted_by:
-                self._earlier.enter_context(warnings.catch_warnings())
-                warnings.simplefilter("ignore")
-            self._wanted_by += 1
-
-    def leave(self) -> None:
-        with self._lock:
-            self._wanted_by -= 1
-            if not self._wanted_by:
-                self._earlier.close()
-
-
-_quiet = _QuietFilters()
+_quiet_lock = threading.Lock()
+_quiet_threads = 0
+_earlier_filters = contextlib.ExitStack()
 
 
 def forbid_ghostscript() -> None:
@@ -185,7 +161,6 @@ def _formats() -> tuple[str, ...]:
 # its white level are stretched, so that exposures of a set stay comparable. The colours are sRGB,
 # with the camera's orientation applied. It comes out darker than the camera's own JPEG.
 
-
 _SRGB_GAMMA = (2.4, 12.92)
 """Exponent and slope at black; LibRaw's default is that of television."""
 _TURNED = (4, 5, 6, 7)
@@ -197,12 +172,8 @@ _one_at_a_time = threading.Lock()
 def raw_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of a RAW photo once it is developed, without reading its pixels.
 
-    Raises
-    ------
-    MissingExtraError
-        The worker has no package for RAW photos.
-    ValueError
-        Not a RAW photo that LibRaw knows.
+    Raises MissingExtraError: the worker has no package for RAW photos; ValueError: not a RAW photo
+    that LibRaw knows.
     """
     with _opened(path) as raw:
         sizes = raw.sizes
@@ -213,44 +184,25 @@ def raw_size(path: Path) -> tuple[int, int]:
 def develop(path: Path, *, half: bool = False) -> np.ndarray:
     """Develop a RAW photo.
 
-    Parameters
-    ----------
-    path : Path
-    half : bool
-        At half the size: each 2 x 2 block of the sensor gives one pixel, several times faster.
-
-    Returns
-    -------
-    (h, w, 3) uint8
-        Upright, sRGB.
-
-    Raises
-    ------
-    MissingExtraError
-        The worker has no package for RAW photos.
-    ValueError
-        Not a RAW photo that LibRaw knows, or damaged.
+    ``half``: at half the size: each 2 x 2 block of the sensor gives one pixel, several times
+        faster.
+    Returns (h, w, 3) uint8, upright, sRGB.
+    Raises MissingExtraError: the worker has no package for RAW photos; ValueError: not a RAW photo
+    that LibRaw knows, or damaged.
     """
     with _one_at_a_time, _opened(path) as raw:
-        return np.ascontiguousarray(
-            raw.postprocess(
-                use_camera_wb=True,
-                no_auto_bright=True,
-                adjust_maximum_thr=0.0,  # else the brightest pixel of a photo may become white
-                gamma=_SRGB_GAMMA,
-                output_bps=8,
-                half_size=half,
-            )
-        )
+        # Without the last setting the brightest pixel of a photo may become white.
+        pixels = raw.postprocess(
+            use_camera_wb=True, no_auto_bright=True, gamma=_SRGB_GAMMA, output_bps=8,
+            half_size=half, adjust_maximum_thr=0.0,
+        )  # fmt: skip
+        return np.ascontiguousarray(pixels)
 
 
 def raw_focal(path: Path) -> tuple[float, str]:
     """Return focal length in mm (0 where unknown) and name of the lens, as LibRaw reads them.
 
-    Raises
-    ------
-    MissingExtraError, ValueError
-        As :func:`raw_size`.
+    Raises MissingExtraError, ValueError: as :func:`raw_size`.
     """
     with _opened(path) as raw:
         return float(raw.other.focal_length), str(raw.lens.model)
@@ -279,7 +231,6 @@ def _opened(path: Path) -> Iterator[Any]:
 # JPEG and PNG are parsed here, so that a Python with numpy alone (Blender's) can check an input;
 # other formats are read by Pillow and the worker's extras if these are installed.
 
-
 _EXIF_ORIENTATION = 0x0112
 _JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _MAX_SEGMENTS = 4096
@@ -302,23 +253,15 @@ class PhotoHeader:
     @property
     def upright_size(self) -> tuple[int, int]:
         """(width, height) after the EXIF orientation is applied."""
-        if self.orientation >= 5:
-            return (self.height, self.width)
-        return (self.width, self.height)
+        size = (self.width, self.height)
+        return size[::-1] if self.orientation >= 5 else size
 
 
 def read_photo_header(path: Path) -> PhotoHeader | None:
     """Read the header of a photo.
 
-    Returns
-    -------
-    PhotoHeader or None
-        ``None`` where the format needs Pillow or an extra that is not installed.
-
-    Raises
-    ------
-    DatasetError
-        Not a regular file, no image, or larger than the limits.
+    Returns ``None`` where the format needs Pillow or an extra that is not installed.
+    Raises DatasetError: not a regular file, no image, or larger than the limits.
     """
     if not path.is_file():
         raise DatasetError(f"{path.name} is not a file.", "Remove the name or restore the photo.")
@@ -330,15 +273,13 @@ def read_photo_header(path: Path) -> PhotoHeader | None:
                 header = _read_jpeg(stream)
             elif magic == b"\x89PNG\r\n\x1a\n":
                 header = _read_png(stream)
-            else:
-                other = _read_other(path)
-                if other is None:
-                    return None
+            elif (other := _read_other(path)) is not None:
                 header = other
+            else:
+                return None
     except PermissionError as error:
-        raise DatasetError(
-            f"{path.name} cannot be read: {error.strerror}.", "Check its permissions."
-        ) from None
+        text = f"{path.name} cannot be read: {error.strerror}."
+        raise DatasetError(text, "Check its permissions.") from None
     except (OSError, ValueError, struct.error, SyntaxError, OverflowError) as error:
         reason = str(error) or type(error).__name__
         raise DatasetError(f"{path.name} is not a readable photo ({reason}).", _ANOTHER) from None
@@ -349,10 +290,8 @@ def read_photo_header(path: Path) -> PhotoHeader | None:
             "Scale it down.",
         )
     if header.width * header.height > pixels:
-        raise DatasetError(
-            f"{path.name} has {header.width} x {header.height} pixels; the limit is {pixels}.",
-            "Scale it down.",
-        )
+        text = f"{path.name} has {header.width} x {header.height} pixels; the limit is {pixels}."
+        raise DatasetError(text, "Scale it down.")
     return header
 
 

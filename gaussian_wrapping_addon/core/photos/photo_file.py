@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 # -- Decode one photo or mask to 8-bit arrays: any mode, any EXIF orientation, within the limits
 
-
 JPEG_QUALITY = 97
 """Of written photos: no visible loss, a fifth of a PNG's size."""
 
@@ -56,12 +55,8 @@ class DecodedPhoto:
 def photo_header(path: Path) -> PhotoHeader:
     """Return the header of a photo; Pillow is needed for other formats than JPEG and PNG.
 
-    Raises
-    ------
-    DatasetError
-        As :func:`~.formats.read_photo_header`, or Pillow is not installed.
-    MissingExtraError
-        The worker lacks the package for HEIF or RAW.
+    Raises DatasetError: as :func:`~.formats.read_photo_header`, or Pillow is not installed;
+    MissingExtraError: the worker lacks the package for HEIF or RAW.
     """
     header = read_photo_header(path)
     if header is None:
@@ -75,26 +70,19 @@ def photo_header(path: Path) -> PhotoHeader:
 def read_photo(path: Path, *, upright: bool = True, enough_px: int = 0) -> DecodedPhoto:
     """Decode a photo.
 
-    Parameters
-    ----------
-    path : Path
-    upright : bool
-        Apply the EXIF orientation. HEIF and RAW photos are upright always.
-    enough_px : int
-        If given, a RAW photo is developed at half its size where the long side of that still has
-        so many pixels.
-
-    Raises
-    ------
-    DatasetError
-        Names the file: not an image, cut, too large.
-    MissingExtraError
-        The worker lacks the package for HEIF or RAW.
+    ``upright``: apply the EXIF orientation. HEIF and RAW photos are upright always. ``enough_px``:
+    if given, a RAW photo is developed at half its size where the long side of that still has so
+    many pixels.
+    Raises DatasetError, which names the file: not an image, cut, too large; MissingExtraError: the
+    worker lacks the package for HEIF or RAW.
     """
     header = photo_header(path)
     if photo_kind(path) == RAW:
         half = bool(enough_px) and max(header.width, header.height) >= 2 * enough_px
-        return DecodedPhoto(_developed(path, half=half), None, False)
+        try:
+            return DecodedPhoto(develop(path, half=half), None, False)
+        except (OSError, ValueError) as error:
+            raise DatasetError(f"{path.name} cannot be decoded ({error}).", _ANOTHER) from None
     image = _open(path)
     is_common = image.format in PLAIN_FORMATS
     plain = image.mode in ("RGB", "L") and header.orientation == 1 and is_common
@@ -108,10 +96,7 @@ def read_photo(path: Path, *, upright: bool = True, enough_px: int = 0) -> Decod
 def read_mask(path: Path, *, upright: bool = True) -> np.ndarray:
     """Decode a mask to (h, w) uint8; if only the alpha varies, it is the mask.
 
-    Raises
-    ------
-    DatasetError
-        Names the file.
+    Raises DatasetError, which names the file.
     """
     header = photo_header(path)
     color, alpha = _to_arrays(_open(path))
@@ -157,13 +142,6 @@ def write_mask(path: Path, mask: np.ndarray) -> None:
     from PIL import Image
 
     Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path, compress_level=1)
-
-
-def _developed(path: Path, *, half: bool) -> np.ndarray:
-    try:
-        return develop(path, half=half)
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{path.name} cannot be decoded ({error}).", _ANOTHER) from None
 
 
 def _open(path: Path) -> Image.Image:
@@ -212,13 +190,10 @@ def _to_arrays(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
     """Return (h, w, 3) uint8 colour and (h, w) uint8 alpha or ``None``."""
     mode = image.mode
     if mode in ("I;16", "I;16L", "I;16B", "I", "F"):
-        grey = _grey_to_eight_bits(np.asarray(image))
-        return np.repeat(grey[..., None], 3, 2), None
-    has_alpha = mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
-    if has_alpha:
+        return np.repeat(_grey_to_eight_bits(np.asarray(image))[..., None], 3, 2), None
+    if mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
         pixels = np.asarray(image.convert("RGBA"))
-        alpha = np.ascontiguousarray(pixels[..., 3])
-        color = np.ascontiguousarray(pixels[..., :3])
+        color, alpha = (np.ascontiguousarray(part) for part in (pixels[..., :3], pixels[..., 3]))
         return color, (None if alpha.min() == 255 else alpha)
     return np.array(image if mode == "RGB" else image.convert("RGB")), None
 
@@ -262,3 +237,15 @@ class MaskReading:
 
 
 AS_WRITTEN = MaskReading()
+
+
+def large_parts(mask: np.ndarray, smallest_share: float) -> np.ndarray:
+    """Return a (h, w) bool mask without parts smaller than this share of the largest one."""
+    from scipy import ndimage
+
+    label, count = ndimage.label(mask)
+    if count < 2:
+        return mask
+    areas = np.bincount(label.ravel())
+    areas[0] = 0
+    return np.asarray((areas >= smallest_share * areas.max())[label] & mask)

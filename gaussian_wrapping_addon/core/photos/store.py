@@ -75,21 +75,14 @@ class PhotoMemory:
 def photo_memory(photos: int, pixels: float, *, masked: bool, free_bytes: int) -> PhotoMemory:
     """Return what photos take that are read at three sizes, each half of the one before.
 
-    Parameters
-    ----------
-    pixels : float
-        Of a photo at the largest of them.
-    masked : bool
-    free_bytes : int
-        Free memory of the machine; 0 if unknown.
+    ``pixels``: of a photo at the largest of them. ``free_bytes``: free memory of the machine; 0 if
+    unknown.
     """
-    channels = 4 if masked else 3
-    all_bytes = round(photos * pixels * channels * (1 + 1 / 4 + 1 / 16))
+    all_bytes = round(photos * pixels * (4 if masked else 3) * (1 + 1 / 4 + 1 / 16))
     return PhotoMemory(photos, all_bytes, photo_budget_bytes(free_bytes))
 
 
 # -- Arrays of photos kept in memory, up to a number of bytes, for readers that come round again
-
 
 Key = tuple[str, int, int]
 """Kind of array, number of the photo, divisor of its size."""
@@ -107,10 +100,6 @@ class KeptPhotos:
     asked for at another size since; then arrays more than :data:`MUCH_LARGER` times as large, as
     many small ones save more reading than one large one. Beyond the limit, the array used last is
     kept, one of each kind. Thread-safe.
-
-    Parameters
-    ----------
-    limit_bytes : int
     """
 
     MUCH_LARGER = 2
@@ -142,12 +131,8 @@ class KeptPhotos:
     def put(self, key: Key, array: np.ndarray) -> tuple[np.ndarray, list[tuple[Key, np.ndarray]]]:
         """Keep an array that was asked for.
 
-        Returns
-        -------
-        array : ndarray
-            The same, or that of another thread that was first.
-        left_out : list of (Key, ndarray)
-            What does not stay for later: what had to make room, or the array itself.
+        Returns ``array``: the same, or that of another thread that was first; ``left_out``: what
+        does not stay for later: what had to make room, or the array itself.
         """
         left_out: list[tuple[Key, np.ndarray]] = []
         with self._lock:
@@ -215,7 +200,6 @@ class KeptPhotos:
 
 # -- A file without a name that holds decoded photos: quicker to read again than to decode again
 
-
 _logger = logging.getLogger(__name__)
 
 
@@ -225,10 +209,7 @@ class DecodedFile:
     A file that cannot be written (a full disk, a folder without write access) is given up with a
     line in the log; photos are then decoded each time they are needed. Thread-safe.
 
-    Parameters
-    ----------
-    folder : Path
-        On the file system to write to. No entry appears in it.
+    ``folder``: on the file system to write to. No entry appears in it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -247,12 +228,15 @@ class DecodedFile:
                 return
             try:
                 if self._file is None:
-                    self._begin()
-                assert self._file is not None
+                    free = shutil.disk_usage(self._folder).free
+                    self._limit_bytes = int(DECODED_PHOTOS_DISK_SHARE * free)
+                    # Unlinked at once, or removed by Windows with the last handle: none is left.
+                    self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
                 if self.bytes_written + array.nbytes > self._limit_bytes:
                     return
                 self._file.seek(self.bytes_written)
-                _write(self._file, np.ascontiguousarray(array))
+                if not _moved(np.ascontiguousarray(array), self._file.write):
+                    raise OSError("nothing more can be written")
             except OSError as error:
                 _logger.warning("decoded photos are not kept on disk: %s", error)
                 self._end()
@@ -270,7 +254,7 @@ class DecodedFile:
             array = np.zeros(shape, dtype)
             try:
                 self._file.seek(begin)
-                if _read(self._file, array):
+                if _moved(array, self._file.readinto):  # type: ignore[attr-defined]
                     return array
                 reason: object = "it is shorter than it was"
             except OSError as error:
@@ -284,11 +268,6 @@ class DecodedFile:
         with self._lock:
             self._end()
 
-    def _begin(self) -> None:
-        self._limit_bytes = int(DECODED_PHOTOS_DISK_SHARE * shutil.disk_usage(self._folder).free)
-        # Unlinked at once, or removed by Windows when the last handle goes: nothing can be left.
-        self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
-
     def _end(self) -> None:
         self._is_open = False
         self._places.clear()
@@ -300,21 +279,11 @@ class DecodedFile:
                 _logger.debug("closing decoded photos: %s", error)
 
 
-def _bytes_of(array: np.ndarray) -> memoryview:
-    return array.reshape(-1).view(np.uint8).data
-
-
-def _write(file: IO[bytes], array: np.ndarray) -> None:
-    left = _bytes_of(array)
+def _moved(array: np.ndarray, move: Callable[[memoryview], int]) -> bool:
+    """Let ``move`` write or read the bytes of an array; return whether it moved all of them."""
+    left = array.reshape(-1).view(np.uint8).data
     while len(left):
-        left = left[file.write(left) :]
-
-
-def _read(file: IO[bytes], array: np.ndarray) -> bool:
-    """Fill an array; return whether the file had enough."""
-    left = _bytes_of(array)
-    while len(left):
-        count = file.readinto(left)  # type: ignore[attr-defined]
+        count = move(left)
         if not count:
             return False
         left = left[count:]
@@ -332,15 +301,9 @@ class PhotoStore:
     so that the camera of a level is exactly the base camera with intrinsics divided by d.
     What comes out does not depend on the budget. Thread-safe.
 
-    Parameters
-    ----------
-    scene : Scene
-    max_image_px : int
-        Long side of the base level, pixels.
-    memory_bytes : int, optional
-        Limit of the arrays kept (:class:`~.store.KeptPhotos`); by default a share of the
-        memory that is free now (:func:`~.store.photo_budget_bytes`). The photo and the mask
-        used last are kept beyond it.
+    ``max_image_px``: long side of the base level, pixels. ``memory_bytes``: limit of the arrays
+    kept (:class:`~.store.KeptPhotos`); by default a share of the memory that is free now
+    (:func:`~.store.photo_budget_bytes`). The photo and the mask used last are kept beyond it.
     """
 
     def __init__(self, scene: Scene, max_image_px: int, *, memory_bytes: int | None = None) -> None:
@@ -348,7 +311,8 @@ class PhotoStore:
             memory_bytes = photo_budget_bytes(available_memory_bytes())
         self._views = scene.views
         self._kept = KeptPhotos(memory_bytes)
-        self._decoded: DecodedFile | None = None
+        self.decoded: DecodedFile | None = None
+        """Set by :func:`decoded_in`."""
         self._base = [_base_camera(view.camera, max_image_px) for view in scene.views]
 
     def __len__(self) -> int:
@@ -361,27 +325,15 @@ class PhotoStore:
         if width < 1 or height < 1:
             raise ValueError(f"divisor {divisor} leaves nothing of {base.width} x {base.height}")
         return dataclasses.replace(
-            base,
-            width=width,
-            height=height,
-            fx=base.fx / divisor,
-            fy=base.fy / divisor,
-            cx=base.cx / divisor,
-            cy=base.cy / divisor,
-        )
+            base, width=width, height=height, fx=base.fx / divisor, fy=base.fy / divisor,
+            cx=base.cx / divisor, cy=base.cy / divisor,
+        )  # fmt: skip
 
     def photo(self, index: int, divisor: int = 1) -> np.ndarray:
         """Return the photo at a level.
 
-        Returns
-        -------
-        (h, w, 3) uint8
-            Read-only.
-
-        Raises
-        ------
-        DatasetError
-            The file was changed or removed after the scene was made.
+        Returns (h, w, 3) uint8, read-only.
+        Raises DatasetError: the file was changed or removed after the scene was made.
         """
         return self._array(("photo", index, divisor), lambda: self._make_photo(index, divisor))
 
@@ -432,32 +384,16 @@ class PhotoStore:
                 "Put the photo back, or start the job anew.",
             )
 
-    @contextmanager
-    def decoded_in(self, folder: Path) -> Iterator[None]:
-        """Keep decoded on disk, in this context, what does not fit into memory.
-
-        Parameters
-        ----------
-        folder : Path
-            As for :class:`~.store.DecodedFile`.
-        """
-        before, self._decoded = self._decoded, DecodedFile(folder)
-        try:
-            yield
-        finally:
-            self._decoded.close()
-            self._decoded = before
-
     def _array(self, key: Key, make: Callable[[], np.ndarray]) -> np.ndarray:
         found = self._kept.get(key)
         if found is not None:
             return found
         array = self._made(key, make)  # without a lock: decoding is slow
         array, left_out = self._kept.put(key, array)
-        if self._decoded is not None:
+        if self.decoded is not None:
             for other, dropped in left_out:
                 if other == key or other[2] == 1:  # other levels are made of that of divisor 1
-                    self._decoded.add(other, dropped)
+                    self.decoded.add(other, dropped)
         return array
 
     def _base_array(
@@ -472,12 +408,12 @@ class PhotoStore:
         if found is not None:
             return found
         array = self._made(key, lambda: make(index, 1))
-        if not self._kept.put_aside(key, array) and self._decoded is not None:
-            self._decoded.add(key, array)
+        if not self._kept.put_aside(key, array) and self.decoded is not None:
+            self.decoded.add(key, array)
         return array
 
     def _made(self, key: Key, make: Callable[[], np.ndarray]) -> np.ndarray:
-        array = None if self._decoded is None else self._decoded.get(key)
+        array = None if self.decoded is None else self.decoded.get(key)
         if array is None:
             array = make()
         array.setflags(write=False)
@@ -486,12 +422,20 @@ class PhotoStore:
 
 @contextmanager
 def decoded_in(photos: PhotoSource, folder: Path) -> Iterator[None]:
-    """Keep photos decoded in a folder, in this context, where they are read from files at all."""
-    if isinstance(photos, PhotoStore):
-        with photos.decoded_in(folder):
-            yield
-    else:
+    """Keep decoded in a folder, in this context, what photos of files do not fit into memory.
+
+    ``folder``: as for :class:`~.store.DecodedFile`.
+    """
+    if not isinstance(photos, PhotoStore):
         yield
+        return
+    before, now = photos.decoded, DecodedFile(folder)
+    photos.decoded = now
+    try:
+        yield
+    finally:
+        now.close()
+        photos.decoded = before
 
 
 def _base_camera(camera: Camera, max_image_px: int) -> Camera:

@@ -9,7 +9,7 @@ import os
 import struct
 import subprocess
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 # -- Recognise video files by name and first bytes, and find the one of an input; decodes nothing
 
-
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 _HEAD_BYTES = 16
 _QUICKTIME_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
@@ -42,22 +41,14 @@ def is_video_path(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
 
 
-def videos_in(folder: Path) -> list[Path]:
-    """Return the video files directly in a folder, by name."""
-    with os.scandir(folder) as entries:
-        found = [Path(entry.path) for entry in entries if entry.is_file()]
-    return sorted(path for path in found if is_video_path(path))
-
-
 def the_video_in(folder: Path) -> Path | None:
     """Return the only video of a folder, or ``None`` where it has none.
 
-    Raises
-    ------
-    DatasetError
-        There are several: cameras, lenses and zoom may differ between them.
+    Raises DatasetError: there are several: cameras, lenses and zoom may differ between them.
     """
-    found = videos_in(folder)
+    with os.scandir(folder) as entries:
+        files = [Path(entry.path) for entry in entries if entry.is_file()]
+    found = sorted(path for path in files if is_video_path(path))
     if len(found) > 1:
         raise DatasetError(
             f"{folder.name} holds no photos, but {len(found)} videos: "
@@ -72,20 +63,15 @@ def container_of(path: Path) -> str:
 
     Going by the content keeps playlists and scripts, which name other files, from being opened.
 
-    Raises
-    ------
-    DatasetError
-        The file is empty, cannot be read, or begins like none of these.
-    ParseError
-        It is no regular file.
+    Raises DatasetError: the file is empty, cannot be read, or begins like none of these;
+    ParseError: it is no regular file.
     """
     try:
         with open_regular(path, follow_links=True) as stream:
             head = stream.read(_HEAD_BYTES)
     except OSError as error:
-        raise DatasetError(
-            f"{path.name} cannot be read: {error.strerror}.", "Check the path and its permissions."
-        ) from None
+        text = f"{path.name} cannot be read: {error.strerror}."
+        raise DatasetError(text, "Check the path and its permissions.") from None
     if not head:
         raise DatasetError(f"{path.name} is empty.", _COPY_AGAIN)
     if head[4:8] in _QUICKTIME_BOXES:
@@ -106,7 +92,6 @@ def container_of(path: Path) -> str:
 # :func:`probe_video` needs the standard library alone, as Blender has no PyAV. The child writes
 # one JSON line: the facts, or ``{"error", "hint"}``.
 
-
 PROBE_DEADLINE_S = 60.0
 _AGAIN = "Copy it from the camera again, or export it as MP4."
 
@@ -119,8 +104,8 @@ class ProbedVideo:
     height: int
     """As players show it."""
     frames: int
-    """0 where it is not known."""
     duration_s: float
+    """Both 0 where they are not known."""
     codec: str
     is_hdr: bool
     is_interlaced: bool
@@ -129,18 +114,9 @@ class ProbedVideo:
 def probe_video(path: Path, python: str) -> ProbedVideo:
     """Look at a video.
 
-    Parameters
-    ----------
-    path : Path
-    python : str
-        The worker's interpreter, or the folder of its environment.
-
-    Raises
-    ------
-    DatasetError
-        It is no video that can be read.
-    WorkerError
-        The worker's Python does not answer.
+    ``python``: the worker's interpreter, or the folder of its environment.
+    Raises DatasetError: it is no video that can be read; WorkerError: the worker's Python does not
+    answer.
     """
     try:
         command = child_command("photos.video", str(path), python=python)
@@ -148,9 +124,8 @@ def probe_video(path: Path, python: str) -> ProbedVideo:
     except OSError as error:
         raise not_started(python, error) from None
     except subprocess.TimeoutExpired:
-        raise DatasetError(
-            f"{path.name} was not opened within {PROBE_DEADLINE_S:.0f} s.", _AGAIN
-        ) from None
+        text = f"{path.name} was not opened within {PROBE_DEADLINE_S:.0f} s."
+        raise DatasetError(text, _AGAIN) from None
     for line in output.splitlines():
         try:
             values: Any = json.loads(line)
@@ -164,10 +139,8 @@ def probe_video(path: Path, python: str) -> ProbedVideo:
         except TypeError:
             continue
     said = errors.strip().splitlines()
-    raise DatasetError(
-        f"{path.name} cannot be opened: the decoder ended ({said[-1] if said else 'no output'}).",
-        _AGAIN,
-    )
+    text = f"{path.name} cannot be opened: the decoder ended ({said[-1] if said else 'no output'})."
+    raise DatasetError(text, _AGAIN)
 
 
 def main(arguments: list[str]) -> int:
@@ -189,52 +162,43 @@ def main(arguments: list[str]) -> int:
 def probed(path: Path) -> ProbedVideo:
     """Return the facts of a video, with one frame decoded; needs PyAV.
 
-    Raises
-    ------
-    DatasetError, ParseError
-        It is no video that can be read.
+    Raises DatasetError, ParseError: it is no video that can be read.
     """
-
     with open_video(path) as video:
         first = next(frames_of(video), None)
         if first is None:
-            raise DatasetError(
-                f"No frame of {path.name} can be decoded: the file is cut or damaged.", _AGAIN
-            )
+            text = f"No frame of {path.name} can be decoded: the file is cut or damaged."
+            raise DatasetError(text, _AGAIN)
         facts = video.facts
         width, height = upright_size(first.frame, facts.pixel_ratio)
-        frames = facts.frames or round(facts.duration_s * facts.fps)
         return ProbedVideo(
-            width, height, frames, facts.duration_s, facts.codec, facts.is_hdr, facts.is_interlaced
-        )
+            width, height, facts.expected_frames, facts.duration_s, facts.codec, facts.is_hdr,
+            facts.is_interlaced,
+        )  # fmt: skip
 
 
 # -- Warnings about kinds of videos, the same when one is checked and when it is read -------------
 
 
-def hdr_warning(video: Path) -> ReportWarning:
-    """Return the warning of a video with a transfer function of HDR."""
-    return ReportWarning(
+def kind_warnings(video: Path, is_hdr: bool, is_interlaced: bool) -> list[ReportWarning]:
+    """Return the warnings of a video with a transfer function of HDR, and of an interlaced one."""
+    hdr = ReportWarning(
         "video-hdr",
         f"{video.name} is an HDR video (PQ or HLG): its colours are taken as they are stored, and "
         "look pale.",
         "Film without HDR, or export it as SDR.",
     )
-
-
-def interlaced_warning(video: Path) -> ReportWarning:
-    """Return the warning of an interlaced video."""
-    return ReportWarning(
+    interlaced = ReportWarning(
         "video-interlaced",
         f"{video.name} is interlaced: what moves has combs at its edges.",
         "Film or export it progressive.",
     )
+    return [hdr] * is_hdr + [interlaced] * is_interlaced
 
 
 # -- Open a video with PyAV and decode its frames one by one, within limits and past damage -------
 #
 # Frames are read as the file has them; :func:`upright_color` turns them as players show them.
-
 
 MAX_DECODE_ERRORS = 1000
 """Packets that cannot be decoded until the rest of the file is given up."""
@@ -249,22 +213,17 @@ _INTERLACED = (2, 3, 4, 5)
 
 
 @dataclass(frozen=True)
-class VideoFacts:
-    """What the headers of a video say."""
+class VideoFacts(ProbedVideo):
+    """What the headers of a video say; its size is as stored, before any rotation."""
 
-    width: int
-    height: int
-    """As stored, before any rotation."""
-    frames: int
-    """0 where it is not stated."""
-    duration_s: float
-    """0 where it is not stated."""
     fps: float
-    codec: str
-    is_hdr: bool
-    is_interlaced: bool
     pixel_ratio: float
     """Width over height of a pixel."""
+
+    @property
+    def expected_frames(self) -> int:
+        """Number of frames as stated, else by the length; 0 where neither is known."""
+        return self.frames or round(self.duration_s * self.fps)
 
 
 @dataclass
@@ -276,7 +235,7 @@ class OpenVideo:
     stream: Any
     facts: VideoFacts
     bad_packets: int = 0
-    is_cut: bool = field(default=False)
+    is_cut: bool = False
     """Whether reading ended before the end of the file."""
 
 
@@ -286,10 +245,7 @@ def open_video(path: Path, threads: int = 0) -> Iterator[OpenVideo]:
 
     FFmpeg gets an open file, not a name: nothing in it can make FFmpeg open something else.
 
-    Raises
-    ------
-    DatasetError, ParseError
-        It is no video, is cut before its index, or exceeds a limit.
+    Raises DatasetError, ParseError: it is no video, is cut before its index, or exceeds a limit.
     """
     import av
 
@@ -308,9 +264,8 @@ def open_video(path: Path, threads: int = 0) -> Iterator[OpenVideo]:
                 raise DatasetError(f"{path.name} holds no pictures.", _AGAIN)
             stream = container.streams.video[0]
             if stream.codec_context is None:
-                raise DatasetError(
-                    f"{path.name}: its codec is not known here.", "Export it as MP4 with H.264."
-                )
+                text = f"{path.name}: its codec is not known here."
+                raise DatasetError(text, "Export it as MP4 with H.264.")
             if threads:
                 stream.codec_context.thread_count = threads
             stream.thread_type = "AUTO"
@@ -326,27 +281,19 @@ def _facts(container: Any, stream: Any) -> VideoFacts:
         duration_s = float(stream.duration * stream.time_base)
     elif container.duration:
         duration_s = container.duration / 1e6  # FFmpeg's AV_TIME_BASE
-    rate = stream.average_rate or stream.guessed_rate
-    fps = float(rate) if rate else 0.0
-    ratio = stream.sample_aspect_ratio
+    ratio = float(stream.sample_aspect_ratio or 1.0)
     return VideoFacts(
         int(context.width), int(context.height), int(stream.frames or 0), max(duration_s, 0.0),
-        fps, str(context.name), int(context.color_trc or 0) in (PQ, HLG),
-        int(context.field_order) in _INTERLACED, _plausible(float(ratio) if ratio else 1.0),
+        str(context.name), int(context.color_trc or 0) in (PQ, HLG),
+        int(context.field_order) in _INTERLACED,
+        float(stream.average_rate or stream.guessed_rate or 0.0),
+        ratio if 0.25 <= ratio <= 4.0 else 1.0,  # what is stated may be absurd
     )  # fmt: skip
-
-
-def _plausible(pixel_ratio: float) -> float:
-    """Return the shape of a pixel, 1 where what is stated is absurd."""
-    return pixel_ratio if 0.25 <= pixel_ratio <= 4.0 else 1.0
 
 
 def _check_limits(name: str, facts: VideoFacts) -> None:
     width, height = facts.width, facts.height
-    too_large = (
-        max(width, height) > limits.MAX_IMAGE_SIDE_PX or width * height > limits.MAX_IMAGE_PIXELS
-    )
-    if too_large:
+    if max(width, height) > limits.MAX_IMAGE_SIDE_PX or width * height > limits.MAX_IMAGE_PIXELS:
         raise DatasetError(
             f"{name} claims to have {width} x {height} pixels; at most "
             f"{limits.MAX_IMAGE_PIXELS // 10**6} million are read.",
@@ -377,10 +324,7 @@ def frames_of(video: OpenVideo) -> Iterator[DecodedFrame]:
     ``video.bad_packets`` and ``video.is_cut`` tell of damage afterwards. Two passes over a file
     give the same frames with the same numbers.
 
-    Raises
-    ------
-    DatasetError
-        More frames than the limit.
+    Raises DatasetError: more frames than the limit.
     """
     import av
 
@@ -406,10 +350,8 @@ def frames_of(video: OpenVideo) -> Iterator[DecodedFrame]:
             continue
         for frame in decoded:
             if index >= limits.MAX_VIDEO_FRAMES:
-                raise DatasetError(
-                    f"{video.name} holds more than {limits.MAX_VIDEO_FRAMES} frames.",
-                    "Cut the part that shows the object.",
-                )
+                text = f"{video.name} holds more than {limits.MAX_VIDEO_FRAMES} frames."
+                raise DatasetError(text, "Cut the part that shows the object.")
             same_size = (frame.width, frame.height) == (video.facts.width, video.facts.height)
             if frame.is_corrupt or not same_size:
                 video.bad_packets += 1
@@ -446,8 +388,7 @@ def upright_color(frame: VideoFrame, pixel_ratio: float = 1.0) -> np.ndarray:
 def upright_size(frame: VideoFrame, pixel_ratio: float) -> tuple[int, int]:
     """Return width and height of :func:`upright_color`."""
     width = max(MIN_SIDE_PX, round(frame.width * pixel_ratio))
-    is_turned = _display_matrix(frame)[1] != 0
-    return (frame.height, width) if is_turned else (width, frame.height)
+    return (frame.height, width) if _display_matrix(frame)[1] else (width, frame.height)
 
 
 def _plane(frame: VideoFrame, channels: int) -> np.ndarray:
@@ -476,11 +417,9 @@ def _sign(value: int) -> int:
 def _turned(pixels: np.ndarray, matrix: tuple[int, int, int, int]) -> np.ndarray:
     """Apply a matrix of quarter turns and mirrors: (x, y) goes to (a x + c y, b x + d y)."""
     a, b, c, d = matrix
+    across, down = (c, b) if b else (a, d)
     if b:  # x becomes y, and y becomes x
         pixels = pixels.swapaxes(0, 1)
-        across, down = c, b
-    else:
-        across, down = a, d
     if across < 0:
         pixels = pixels[:, ::-1]
     if down < 0:

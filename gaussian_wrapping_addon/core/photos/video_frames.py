@@ -26,19 +26,14 @@ from ..progress import Progress, ReportWarning
 from ..worker.helper_process import emit, run_helper
 from .photo_file import write_photo
 from .video import (
-    OpenVideo,
     frames_of,
     grey_of,
-    hdr_warning,
-    interlaced_warning,
+    kind_warnings,
     open_video,
     upright_color,
 )
 
-# -- How far the picture has moved between two frames: parts of small grey pictures are followed
-#
-# docs/method.md, section 14.1.
-
+# -- How far the picture has moved between two frames (docs/method.md, section 14.1) --------------
 
 MOTION_SIDE_PX = 160
 """Long side of the pictures that motion is measured in."""
@@ -73,10 +68,8 @@ class MotionMeter:
     def add(self, grey: np.ndarray) -> float:
         """Return the way so far, in long sides of the picture.
 
-        Parameters
-        ----------
-        grey : (h, w) float32
-            The next frame, of the size of those before; ``MOTION_SIDE_PX`` long.
+        ``grey``: (h, w) float32, the next frame, of the size of those before; ``MOTION_SIDE_PX``
+            long.
         """
         if self._anchor is None:
             self._anchor = grey
@@ -123,9 +116,9 @@ def displacement_px(first: np.ndarray, second: np.ndarray) -> float:
         # A block that lost its track goes no further than a block from the whole.
         flow[0] = flow[0].clip(shift_y - block, shift_y + block)
         flow[1] = flow[1].clip(shift_x - block, shift_x + block)
-    rows_at, columns_at = np.mgrid[:rows, :columns] * block
-    leaves = (rows_at + flow[0] < 0) | (rows_at + flow[0] > height - block)
-    leaves |= (columns_at + flow[1] < 0) | (columns_at + flow[1] > width - block)
+    row_at, column_at = np.mgrid[:rows, :columns] * block + flow
+    leaves = (row_at < 0) | (row_at > height - block)
+    leaves |= (column_at < 0) | (column_at > width - block)
     followed &= ~leaves if (followed & ~leaves).any() else True
     return float(np.percentile(np.hypot(flow[0], flow[1])[followed], _PERCENTILE))
 
@@ -138,8 +131,9 @@ def _whole_shift(first: np.ndarray, second: np.ndarray) -> tuple[int, int]:
     cross = b * a.conj()
     cross /= np.abs(cross) + 1e-3 * (np.abs(cross).max() + 1e-12)
     peak = np.fft.irfft2(cross, s=first.shape)
-    y, x = np.unravel_index(int(np.argmax(peak)), peak.shape)
-    shift = _signed(int(y), first.shape[0]), _signed(int(x), first.shape[1])
+    at = np.unravel_index(int(np.argmax(peak)), peak.shape)
+    y, x = (int(k) - n if k > n // 2 else int(k) for k, n in zip(at, first.shape, strict=True))
+    shift = y, x
     # A peak of chance would send all blocks astray.
     return shift if _misfit(first, second, shift) < _misfit(first, second, (0, 0)) else (0, 0)
 
@@ -153,20 +147,13 @@ def _misfit(first: np.ndarray, second: np.ndarray, shift: tuple[int, int]) -> fl
     return float(np.abs(moved - base).mean())
 
 
-def _signed(value: int, size: int) -> int:
-    return value - size if value > size // 2 else value
-
-
 def _block_sums(values: np.ndarray, cut: Sequence[slice], block: int) -> np.ndarray:
     inside = values[tuple(cut)]
     height, width = inside.shape
     return inside.reshape(height // block, block, width // block, block).sum((1, 3))
 
 
-# -- Sharpness of frames: fine detail in each direction, and which frames lack it -----------------
-#
-# docs/method.md, section 14.2.
-
+# -- Sharpness of frames: fine detail in each direction (docs/method.md, section 14.2) ------------
 
 SHARPNESS_SIDE_PX = 960
 """Long side of the pictures that sharpness is measured in."""
@@ -192,16 +179,11 @@ def details(grey: np.ndarray) -> np.ndarray:
 
     Across, down and the two diagonals, since camera shake takes the detail of one direction.
 
-    Parameters
-    ----------
-    grey : (h, w) float32
-        Brightness, 0 to 255.
+    ``grey``: (h, w) float32, brightness, 0 to 255.
     """
-    height, width = (side - side % _COARSE for side in grey.shape)
-    cut = grey[:height, :width]
-    coarse = cut.reshape(height // _COARSE, _COARSE, width // _COARSE, _COARSE).mean((1, 3))
+    coarse = _energies(_block_means(grey, _COARSE))
     fine = _energies(grey) - 6.0 * _noise_variance(grey)  # 1 + 4 + 1: of (1, -2, 1) on noise
-    return np.log(np.maximum(np.stack([fine, _energies(coarse)]), _LEAST))
+    return np.log(np.maximum(np.stack([fine, coarse]), _LEAST))
 
 
 def relative_sharpness(details: np.ndarray, times_s: np.ndarray, ways: np.ndarray) -> np.ndarray:
@@ -209,12 +191,8 @@ def relative_sharpness(details: np.ndarray, times_s: np.ndarray, ways: np.ndarra
 
     The worst direction counts. Only frames with the same content are compared.
 
-    Parameters
-    ----------
-    details : (n, 2, 4) float64
-        Of :func:`details`.
-    times_s, ways : (n,) float64
-        Time, and way of the picture so far in its sides.
+    ``details``: (n, 2, 4) float64, of :func:`details`. ``times_s``, ``ways``: (n,) float64, time,
+    and way of the picture so far in its sides.
     """
     fine = details[:, 0]
     relative = np.zeros(len(fine))
@@ -223,8 +201,7 @@ def relative_sharpness(details: np.ndarray, times_s: np.ndarray, ways: np.ndarra
     first = np.maximum(first, np.searchsorted(ways, ways - _LOCAL_MOTION))
     last = np.minimum(last, np.searchsorted(ways, ways + _LOCAL_MOTION, side="right"))
     for i in range(len(fine)):
-        around = fine[first[i] : last[i]]
-        reference = np.percentile(around, _REFERENCE_PERCENTILE, axis=0)
+        reference = np.percentile(fine[first[i] : last[i]], _REFERENCE_PERCENTILE, axis=0)
         relative[i] = (fine[i] - reference).min()
     return relative
 
@@ -254,10 +231,7 @@ def _noise_variance(grey: np.ndarray) -> float:
     return (1.4826 * median / 6.0) ** 2  # of a normal distribution; the mask has the norm 6
 
 
-# -- Choose the frames of a video: the sharpest of each stretch of motion -------------------------
-#
-# docs/method.md, section 14.3.
-
+# -- Choose frames: the sharpest of each stretch of motion (docs/method.md, section 14.3) ---------
 
 MOTION_STEP = 0.08
 """Way of the picture from one chosen frame to the next, in its long sides."""
@@ -302,13 +276,8 @@ class Choice:
 def choose_frames(measures: FrameMeasures, *, frames: int = 0, fps: float = 0.0) -> Choice:
     """Choose frames.
 
-    Parameters
-    ----------
-    measures : FrameMeasures
-    frames : int
-        Number of stretches of equal motion, so the most frames; 0: by the motion.
-    fps : float
-        If not 0 and ``frames`` is: stretches of equal time instead, so many a second.
+    ``frames``: number of stretches of equal motion, so the most frames; 0: by the motion. ``fps``:
+    if not 0 and ``frames`` is: stretches of equal time instead, so many a second.
     """
     ways, times_s = measures.ways, measures.times_s
     if not len(ways):
@@ -340,13 +309,12 @@ def choose_frames(measures: FrameMeasures, *, frames: int = 0, fps: float = 0.0)
                 chosen[-1] = pick
             continue
         chosen.append(pick)
-    positions = np.array(chosen, np.int64)
-    gaps = [
+    gaps = tuple(
         (float(times_s[before]), float(times_s[after]))
         for before, after in itertools.pairwise(chosen)
         if ways[after] - ways[before] > _FAR and any(before < i < after for i in empty)
-    ]
-    return Choice(positions, int(blurred.sum()), int(still.sum()), tuple(gaps))
+    )
+    return Choice(np.array(chosen, np.int64), int(blurred.sum()), int(still.sum()), gaps)
 
 
 def automatic_count(way: float) -> int:
@@ -366,11 +334,9 @@ def _show_the_same(ways: np.ndarray, blurred: np.ndarray) -> np.ndarray:
     return same
 
 
-# -- Helper process of :mod:`.video_frames`: decodes a video twice, measures frames and writes the
-#    chosen
+# -- Helper process: decodes a video twice, measures frames and writes the chosen -----------------
 #
 # Reads ``task.json`` of its folder; writes ``frames/`` and, last, ``chosen.json``.
-
 
 FRAMES_FOLDER = "frames"
 CHOSEN_NAME = "chosen.json"
@@ -399,20 +365,15 @@ def _run(folder: Path) -> None:
     _check_rate(path, measures, task)
     choice = choose_frames(measures, frames=task["frames"], fps=task["fps"])
     if not len(choice.positions):
-        raise DatasetError(
-            f"All {choice.blurred} frames of {path.name} are blurred.",
-            "Film again, more slowly and in more light.",
-        )
-    written, facts = _write(path, folder / FRAMES_FOLDER, measures, choice, task["threads"])
+        text = f"All {choice.blurred} frames of {path.name} are blurred."
+        raise DatasetError(text, "Film again, more slowly and in more light.")
+    written = _write(path, folder / FRAMES_FOLDER, measures, choice, task["threads"])
     first["damaged"] += len(choice.positions) - len(written)
-    write_json(
-        folder / CHOSEN_NAME,
-        {
-            **first, **facts, "frames": written,
-            "read": len(measures.indices), "blurred": choice.blurred, "still": choice.still,
-            "gaps_s": [list(gap) for gap in choice.gaps_s],
-        },
-    )  # fmt: skip
+    chosen = {
+        **first, "frames": written, "read": len(measures.indices), "blurred": choice.blurred,
+        "still": choice.still, "gaps_s": choice.gaps_s,
+    }  # fmt: skip
+    write_json(folder / CHOSEN_NAME, chosen)
 
 
 def _check_rate(path: Path, measures: FrameMeasures, task: dict[str, Any]) -> None:
@@ -436,25 +397,21 @@ def _measure(path: Path, threads: int) -> tuple[FrameMeasures, dict[str, Any]]:
     found: list[np.ndarray] = []
     meter, ticker = MotionMeter(), _Ticker(0.0, _MEASURED, "looking at frame")
     with open_video(path, threads) as video:
-        expected = _expected(video)
         for decoded in frames_of(video):
             grey = grey_of(decoded.frame, SHARPNESS_SIDE_PX)
             indices.append(decoded.index)
             times_s.append(decoded.time_s)
             ways.append(meter.add(_small(grey)))
             found.append(details(grey))
-            ticker.tick(len(indices), expected)
+            ticker.tick(len(indices), video.facts.expected_frames)
         if not indices:
-            raise DatasetError(
-                f"No frame of {path.name} can be decoded: the file is cut or damaged.",
-                "Copy it from the camera again, or export it as MP4.",
-            )
+            text = f"No frame of {path.name} can be decoded: the file is cut or damaged."
+            raise DatasetError(text, "Copy it from the camera again, or export it as MP4.")
         stated = video.facts.frames
         missing = max(video.bad_packets, stated - len(indices) if stated else 0)
         facts = {
-            "codec": video.facts.codec, "is_hdr": video.facts.is_hdr, "is_cut": video.is_cut,
-            "is_interlaced": video.facts.is_interlaced, "damaged": missing,
-            "fps": video.facts.fps,
+            "is_hdr": video.facts.is_hdr, "is_interlaced": video.facts.is_interlaced,
+            "is_cut": video.is_cut, "damaged": missing,
         }  # fmt: skip
     measures = FrameMeasures(np.array(indices), np.array(times_s), np.array(ways), np.stack(found))
     return measures, facts
@@ -462,30 +419,26 @@ def _measure(path: Path, threads: int) -> tuple[FrameMeasures, dict[str, Any]]:
 
 def _write(
     path: Path, folder: Path, measures: FrameMeasures, choice: Choice, threads: int
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Decode again and write the chosen frames; return their entries, and facts."""
+) -> list[str]:
+    """Decode again and write the chosen frames; return their names."""
     folder.mkdir()
-    wanted = {int(measures.indices[p]): float(measures.times_s[p]) for p in choice.positions}
-    written: list[dict[str, Any]] = []
+    wanted = set(measures.indices[choice.positions].tolist())
+    written: list[str] = []
     ticker = _Ticker(_MEASURED, 1.0, "writing frames, at frame")
     last = max(wanted)
-    size: list[int] = []
     with open_video(path, threads) as video:
         for decoded in frames_of(video):
             if decoded.index in wanted:
-                color = upright_color(decoded.frame, video.facts.pixel_ratio)
                 name = f"frame-{decoded.index:06d}.jpg"
-                write_photo(folder / name, color)
-                size = [color.shape[1], color.shape[0]]
-                written.append({"name": name, "time_s": round(decoded.time_s, 6)})
+                write_photo(folder / name, upright_color(decoded.frame, video.facts.pixel_ratio))
+                written.append(name)
             ticker.tick(decoded.index + 1, last + 1)
             if decoded.index >= last:
                 break
     if not written:
-        raise DatasetError(
-            f"{path.name} has changed while it was read.", "Start again once it is complete."
-        )
-    return written, {"size_px": size}
+        text = f"{path.name} has changed while it was read."
+        raise DatasetError(text, "Start again once it is complete.")
+    return written
 
 
 def _small(grey: np.ndarray) -> np.ndarray:
@@ -493,14 +446,14 @@ def _small(grey: np.ndarray) -> np.ndarray:
     factor = max(1, round(max(grey.shape) / MOTION_SIDE_PX))
     while factor > 1 and min(grey.shape) // factor < _MIN_SIDE_PX:
         factor -= 1
+    return _block_means(grey, factor)
+
+
+def _block_means(grey: np.ndarray, factor: int) -> np.ndarray:
+    """Return the means of whole blocks, ``factor`` pixels wide and high."""
     height, width = (side // factor for side in grey.shape)
     cut = grey[: height * factor, : width * factor]
     return cut.reshape(height, factor, width, factor).mean((1, 3))
-
-
-def _expected(video: OpenVideo) -> int:
-    facts = video.facts
-    return facts.frames or round(facts.duration_s * facts.fps)
 
 
 class _Ticker:
@@ -511,20 +464,15 @@ class _Ticker:
         self._last_s = 0.0
 
     def tick(self, done: int, expected: int) -> None:
-        now_s = time.monotonic()
-        if now_s - self._last_s < _EMIT_EVERY_S:
+        if time.monotonic() - self._last_s < _EMIT_EVERY_S:
             return
-        self._last_s = now_s
+        self._last_s = time.monotonic()
         share = min(done / expected, 1.0) if expected else 0.5
-        of = f" of {expected}" if expected else ""
-        emit(
-            fraction=self._begin + (self._end - self._begin) * share,
-            message=f"{self._message} {done}{of}",
-        )
+        message = f"{self._message} {done}" + (f" of {expected}" if expected else "")
+        emit(fraction=self._begin + (self._end - self._begin) * share, message=message)
 
 
 # -- Take photos out of a video, in a helper process: FFmpeg may crash or hang on damaged files
-
 
 _HELPER = "photos.video_frames"
 _DEADLINE_S = 4 * 3600.0
@@ -557,22 +505,12 @@ def extract_frames(
 ) -> VideoFrames:
     """Choose sharp frames of a video and write them as JPEG into ``work_folder/frames``.
 
-    Parameters
-    ----------
-    video : Path
-        Nothing is written beside it.
-    work_folder : Path
-        What an interrupted run has left there is removed.
-    frames, fps : int, float
-        As of :func:`~.video_frames.choose_frames`; 0 chooses by the motion.
-    threads : int
-        Of the decoder; 0 uses every core.
-
-    Raises
-    ------
-    DatasetError, ParseError
-        It is no video that can be read, or fewer than ``MIN_IMAGES`` frames can be used.
-    Cancelled
+    ``video``: nothing is written beside it.
+    ``work_folder``: what an interrupted run has left there is removed.
+    ``frames``, ``fps``: as of :func:`~.video_frames.choose_frames`; 0 chooses by the motion.
+    ``threads``: of the decoder; 0 uses every core.
+    Raises DatasetError, ParseError: it is no video that can be read, or fewer than ``MIN_IMAGES``
+    frames can be used; Cancelled.
     """
     target = work_folder / FRAMES_FOLDER
     task_folder = work_folder / "video"
@@ -592,7 +530,7 @@ def extract_frames(
     chosen = read_json(task_folder / CHOSEN_NAME)
     os.replace(task_folder / FRAMES_FOLDER, target)
     shutil.rmtree(task_folder)
-    names = tuple(entry["name"] for entry in chosen["frames"])
+    names = tuple(chosen["frames"])
     left_out = (
         f"{chosen['read']} frames were read: {chosen['blurred']} are blurred, {chosen['still']} "
         "show the same as the one before."
@@ -604,40 +542,25 @@ def extract_frames(
             "Film again: walk around the object, slowly and in enough light.",
         )
     facts = {
-        "kind": "video",
-        "photos_in_order": "frames of a video",
-        "video_frames_read": chosen["read"],
-        "video_frames_blurred": chosen["blurred"],
-        "video_frames_still": chosen["still"],
-        "video_frames_damaged": chosen["damaged"],
+        "kind": "video", "photos_in_order": "frames of a video",
+        **{f"video_frames_{k}": chosen[k] for k in ("read", "blurred", "still", "damaged")},
         "video_frames_kept": len(names),
-    }
+    }  # fmt: skip
     return VideoFrames(target, names, facts, tuple(_warnings(video, chosen)))
 
 
 def _warnings(video: Path, chosen: dict[str, Any]) -> list[ReportWarning]:
     found = []
     if chosen["is_cut"] or chosen["damaged"] > _MOST_DAMAGED_SHARE * chosen["read"]:
-        found.append(
-            ReportWarning(
-                "video-damaged",
-                f"{chosen['damaged']} frames of {video.name} cannot be decoded and are not used; "
-                f"{chosen['read']} can.",
-                "Copy it from the camera again.",
-            )
+        text = (
+            f"{chosen['damaged']} frames of {video.name} cannot be decoded and are not used; "
+            f"{chosen['read']} can."
         )
+        found.append(ReportWarning("video-damaged", text, "Copy it from the camera again."))
     if chosen["gaps_s"]:
         gaps = [f"{begin:.1f} to {end:.1f} s" for begin, end in chosen["gaps_s"]]
         listed = ", ".join(gaps[:_LISTED_GAPS]) + (", ..." if len(gaps) > _LISTED_GAPS else "")
-        found.append(
-            ReportWarning(
-                "video-blurred",
-                f"All frames of {video.name} are blurred at {listed}; nothing is used of it.",
-                "Where cameras or surface are missing, film that part again, more slowly.",
-            )
-        )
-    if chosen["is_hdr"]:
-        found.append(hdr_warning(video))
-    if chosen["is_interlaced"]:
-        found.append(interlaced_warning(video))
-    return found
+        text = f"All frames of {video.name} are blurred at {listed}; nothing is used of it."
+        hint = "Where cameras or surface are missing, film that part again, more slowly."
+        found.append(ReportWarning("video-blurred", text, hint))
+    return found + kind_warnings(video, chosen["is_hdr"], chosen["is_interlaced"])

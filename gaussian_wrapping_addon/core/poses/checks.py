@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,6 @@ from ..readers.source_model import SourceModel
 #
 # Between two such photos the background's features stay where they are and the object's move. A
 # camera that moves leaves no feature in its place; a pause of it leaves all of them.
-
 
 TURNTABLE_NAME = "turntable.json"
 """How many ``photos`` are of a turntable, and whether it ``is_masked``."""
@@ -66,10 +66,7 @@ def pair_motion(
 ) -> PairMotion:
     """Judge the matches of photos ``first`` and ``second``, both of ``size`` (width, height).
 
-    Parameters
-    ----------
-    points, others : (n, 2) float
-        Matched positions in the two photos, pixels.
+    ``points``, ``others``: (n, 2) float, matched positions in the two photos, pixels.
     """
     long_side = max(size)
     distance = np.linalg.norm(np.subtract(points, others), axis=1)
@@ -94,28 +91,14 @@ def standing_groups(count: int, motions: Sequence[PairMotion]) -> list[list[int]
 
     Whether what moves turns as one body is left to :func:`are_turning`.
 
-    Parameters
-    ----------
-    count : int
-        Number of photos.
-    motions : sequence of PairMotion
-        Of all pairs that were matched, also of those without a match.
-
-    Returns
-    -------
-    list of list of int
-        Ascending numbers of photos; photos of no such group are in none.
+    ``count``: number of photos. ``motions``: of all pairs that were matched, also of those without
+    a match.
+    Numbers ascend; photos of no such group are in none.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    still = [motion for motion in motions if motion.is_still]
+    still = [(motion.first, motion.second) for motion in motions if motion.is_still]
     if not still:
         return []
-    rows = [motion.first for motion in still]
-    columns = [motion.second for motion in still]
-    graph = coo_matrix((np.ones(len(still)), (rows, columns)), (count, count))
-    label = connected_components(graph, directed=False)[1]
+    label = connected_parts(count, still)
     partners, matched, moved = (np.zeros(count, int) for _ in range(3))
     for motion in motions:
         pair = [motion.first, motion.second]
@@ -126,21 +109,28 @@ def standing_groups(count: int, motions: Sequence[PairMotion]) -> list[list[int]
         moved[pair] = np.maximum(moved[pair], motion.moved)
     groups = []
     for number in np.unique(label):
-        of_group = label == number
-        group = np.flatnonzero(of_group & (partners >= MIN_PARTNERS_SHARE * matched))
+        group = np.flatnonzero((label == number) & (partners >= MIN_PARTNERS_SHARE * matched))
         # Nothing that turns: the same photo many times, or a camera that waits.
         if len(group) >= MIN_GROUP and np.median(moved[group]) >= MIN_TURNING_MATCHES:
             groups.append(group.tolist())
     return groups if sum(map(len, groups)) >= MIN_PHOTOS_SHARE * count else []
 
 
+def connected_parts(count: int, links: Iterable[tuple[int, int]]) -> np.ndarray:
+    """Return for each of ``count`` photos the number of its part, (count,): what links connect."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    first, second = np.array([*links], int).reshape(-1, 2).T
+    graph = coo_matrix((np.ones(len(first)), (first, second)), (count, count))
+    return connected_components(graph, directed=False)[1]
+
+
 def are_turning(most_inliers: Sequence[int]) -> bool:
     """Tell whether photos of still cameras show a body that turns.
 
-    Parameters
-    ----------
-    most_inliers : sequence of int
-        For each photo: the most matches with another photo that move and agree with one motion.
+    ``most_inliers``: for each photo: the most matches with another photo that move and agree with
+        one motion.
     """
     return len(most_inliers) > 0 and float(np.median(most_inliers)) >= MIN_TURNING_MATCHES
 
@@ -149,7 +139,6 @@ def are_turning(most_inliers: Sequence[int]) -> bool:
 #
 # Plain geometry, no solver: pairs of photos whose matches agree with some motion, against the
 # motion that the solved cameras have.
-
 
 EPIPOLAR_PX = 6.0
 """Largest Sampson distance of a match that agrees; the matcher lets 4 pass."""
@@ -297,21 +286,11 @@ class Verdict:
 
     def parts(self, names: Sequence[str]) -> list[list[str]]:
         """Return photos in parts that no agreeing pair links, the largest part first."""
-        part = {name: name for name in names}
-
-        def root(name: str) -> str:
-            while part[name] != name:
-                part[name] = part[part[name]]
-                name = part[name]
-            return name
-
-        for pair in self.pairs:
-            if pair.agrees:
-                one, other = sorted((root(pair.first), root(pair.second)))
-                part[other] = one
-        groups: dict[str, list[str]] = {}
-        for name in names:
-            groups.setdefault(root(name), []).append(name)
+        number = {name: k for k, name in enumerate(names)}
+        links = [(number[pair.first], number[pair.second]) for pair in self.pairs if pair.agrees]
+        groups: dict[int, list[str]] = defaultdict(list)
+        for name, part in zip(names, connected_parts(len(names), links).tolist(), strict=True):
+            groups[part].append(name)
         return sorted(groups.values(), key=lambda group: (-len(group), group[0]))
 
     def to_json(self, names: Sequence[str]) -> dict[str, Any]:
@@ -341,12 +320,12 @@ def check_solution(database: Path, model: Any) -> Verdict:
     Pairs that the solver did not use, or gave up, count like all others.
     """
     pycolmap = import_pycolmap()
-
-    placed = {image_id: _Placed(model, image_id) for image_id in sorted(model.reg_image_ids())}
     pairs = []
     with pycolmap.Database.open(database) as db:
-        for image_id, photo in placed.items():
-            photo.read_features(db.read_keypoints(image_id)[:, :2])
+        placed = {
+            image_id: _Placed(model, image_id, db.read_keypoints(image_id)[:, :2])
+            for image_id in sorted(model.reg_image_ids())
+        }
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
             ids = pycolmap.pair_id_to_image_pair(pair_id)
             matches = geometry.inlier_matches
@@ -359,36 +338,27 @@ def check_solution(database: Path, model: Any) -> Verdict:
 
 
 class _Placed:
-    """A placed photo with its features."""
+    """A placed photo with its features, at (n, 2) ``pixels``."""
 
-    def __init__(self, model: Any, image_id: int) -> None:
+    def __init__(self, model: Any, image_id: int, pixels: np.ndarray) -> None:
         image = model.image(image_id)
         self.name: str = image.name
         self.pose = np.asarray(image.cam_from_world().matrix())
         self._camera = model.camera(image.camera_id)
-        numbers = [p.point3D_id if p.has_point3D() else None for p in image.points2D]
-        self._points = np.full((len(numbers), 3), np.nan)
-        for at, number in enumerate(numbers):
-            if number is not None:
-                self._points[at] = model.point3D(number).xyz
-        self._rays = np.zeros((0, 2))
-
-    def read_features(self, pixels: np.ndarray) -> None:
-        """Set the rays of all features from their (n, 2) pixels."""
         self._rays = np.asarray(self._camera.cam_from_img(pixels.astype(np.float64)))
-        if len(self._points) != len(pixels):  # a photo without any match has no features there
-            self._points = np.full((len(pixels), 3), np.nan)
+        self._points = np.full((len(pixels), 3), np.nan)
+        if len(image.points2D) == len(pixels):  # a photo without any match has no features there
+            for at, feature in enumerate(image.points2D):
+                if feature.has_point3D():
+                    self._points[at] = model.point3D(feature.point3D_id).xyz
 
     def side(self, features: np.ndarray) -> Side:
         """Return this photo with the features of a pair's matches."""
-        return Side(
-            self.pose, self._rays[features], self._points[features],
-            float(self._camera.mean_focal_length()),
-        )  # fmt: skip
+        focal_px = float(self._camera.mean_focal_length())
+        return Side(self.pose, self._rays[features], self._points[features], focal_px)
 
 
 # -- What the solver's check of its own cameras found: facts and warnings of the report -----------
-
 
 SOLUTION_NAME = "solution.json"
 """Of the helper, in its folder."""
@@ -402,25 +372,17 @@ _logger = logging.getLogger(__name__)
 def with_findings(model: SourceModel, folder: Path, source_names: Mapping[str, str]) -> SourceModel:
     """Add facts and warnings to a solved model; warnings also go to the log.
 
-    Parameters
-    ----------
-    folder : Path
-        The solver's.
-    source_names : mapping of str to str
-        Photos by the solver's names.
+    ``folder``: the solver's. ``source_names``: photos by the solver's names.
     """
     found = read_json(folder / SOLUTION_NAME)
     warnings = findings(found, source_names)
     for warning in warnings:
         _logger.warning("%s %s", warning.text, warning.hint)
     facts = {
-        **model.facts,
-        "pairs_matched": found["pairs_matched"],
-        "pairs_verified": found["pairs"],
+        **model.facts, "pairs_matched": found["pairs_matched"], "pairs_verified": found["pairs"],
         "pairs_contradicting_cameras": found["contradicting_pairs"],
-        "photos_joined": found["joined"],
-        "mapper": found["mapper"],
-    }
+        "photos_joined": found["joined"], "mapper": found["mapper"],
+    }  # fmt: skip
     return dataclasses.replace(model, facts=facts, warnings=(*model.warnings, *warnings))
 
 
@@ -432,56 +394,48 @@ def photos_in_parts(folder: Path) -> frozenset[str]:
 def findings(found: Mapping[str, Any], source_names: Mapping[str, str]) -> list[ReportWarning]:
     """Return the warnings of ``solution.json``."""
     warnings = []
+
+    def add(code: str, text: str, hint: str) -> None:
+        warnings.append(ReportWarning(code, text, hint))
+
     share = f"{100 * found['contradicting_share']:.0f} %"
     if found["is_doubtful"]:
         strongest = "; ".join(
             f"{source_names[one]} and {source_names[other]} ({agreeing} of {matches} matches fit)"
             for one, other, matches, agreeing in found["strongest"][:_NAMED]
         )
-        warnings.append(
-            ReportWarning(
-                "cameras-contradicted",
-                f"The solved cameras may be wrong: {found['contradicting_pairs']} of "
-                f"{found['strong_pairs']} strong pairs of photos, with {share} of the matches, "
-                f"contradict them, as where things look alike or repeat. Strongest: {strongest}.",
-                "Look at the cameras before the mesh. Take photos that show what is different "
-                "from place to place, or mask what repeats.",
-            )
+        add(
+            "cameras-contradicted",
+            f"The solved cameras may be wrong: {found['contradicting_pairs']} of "
+            f"{found['strong_pairs']} strong pairs of photos, with {share} of the matches, "
+            f"contradict them, as where things look alike or repeat. Strongest: {strongest}.",
+            "Look at the cameras before the mesh. Take photos that show what is different "
+            "from place to place, or mask what repeats.",
         )
     if found["is_mended"]:
-        warnings.append(
-            ReportWarning(
-                "cameras-mended",
-                "The cameras solved first contradicted many matches. These are solved again from "
-                "the photos that have most in common, and contradict fewer of their matches.",
-                "Look at the cameras before the mesh.",
-            )
+        add(
+            "cameras-mended",
+            "The cameras solved first contradicted many matches. These are solved again from "
+            "the photos that have most in common, and contradict fewer of their matches.",
+            "Look at the cameras before the mesh.",
         )
     weak = [part for part in found["parts"][1:] if len(part) >= _MIN_PART]
     if weak:
-        warnings.append(
-            ReportWarning(
-                "cameras-weakly-linked",
-                f"{_count(weak)} placed photos are linked to the others by few matches; where they "
-                f"stand is uncertain: {_listed(weak, source_names)}.",
-                "Take photos in between, with more overlap.",
-            )
+        add(
+            "cameras-weakly-linked",
+            f"{sum(map(len, weak))} placed photos are linked to the others by few matches; where "
+            f"they stand is uncertain: {_listed(weak, source_names)}.",
+            "Take photos in between, with more overlap.",
         )
     if found["apart"]:
-        warnings.append(
-            ReportWarning(
-                "cameras-in-parts",
-                f"{_count(found['apart'])} photos fit each other but not the rest, in "
-                f"{len(found['apart'])} parts, and are not used: "
-                f"{_listed(found['apart'], source_names)}.",
-                "Take photos that connect the parts.",
-            )
+        add(
+            "cameras-in-parts",
+            f"{sum(map(len, found['apart']))} photos fit each other but not the rest, in "
+            f"{len(found['apart'])} parts, and are not used: "
+            f"{_listed(found['apart'], source_names)}.",
+            "Take photos that connect the parts.",
         )
     return warnings
-
-
-def _count(parts: Sequence[Sequence[str]]) -> int:
-    return sum(len(part) for part in parts)
 
 
 def _listed(parts: Sequence[Sequence[str]], source_names: Mapping[str, str]) -> str:

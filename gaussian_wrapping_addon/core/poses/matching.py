@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,9 @@ import numpy as np
 from ..photos.exif import GpsPosition
 from ..readers.lenses import import_pycolmap
 from ..worker.helper_process import emit
+from .checks import connected_parts
 
 # -- Distances between photos by their GPS positions ----------------------------------------------
-
 
 EARTH_RADIUS_M = 6_371_000.0
 MIN_POSITIONS = 3
@@ -28,8 +29,7 @@ def gps_distances(positions: Sequence[GpsPosition | None]) -> np.ndarray | None:
     Heights are left out: cameras measure them worst, and what they see lies on the ground. None
     where fewer than three photos have a position, or all have the same.
     """
-    known = [p for p in positions if p is not None]
-    if len(known) < MIN_POSITIONS:
+    if sum(p is not None for p in positions) < MIN_POSITIONS:
         return None
     angles = np.radians(
         [[np.nan] * 2 if p is None else [p.latitude_deg, p.longitude_deg] for p in positions]
@@ -47,7 +47,6 @@ def gps_distances(positions: Sequence[GpsPosition | None]) -> np.ndarray | None:
 
 # -- Pairs of photos by their order, and by known poses -------------------------------------------
 
-
 Pairs = list[tuple[int, int]]
 """Sorted, without repetition, (i, j) with i < j."""
 
@@ -64,7 +63,7 @@ _MAX_VIEW_ANGLE_COS = np.cos(np.radians(60.0))
 
 def all_pairs(count: int) -> Pairs:
     """Return all pairs of ``count`` photos."""
-    return [(i, j) for i in range(count) for j in range(i + 1, count)]
+    return list(itertools.combinations(range(count), 2))
 
 
 def pairs_in_order(count: int) -> Pairs:
@@ -72,44 +71,38 @@ def pairs_in_order(count: int) -> Pairs:
 
     Each with the 12 next ones, and with those 16, 32, 64, ... later.
     """
-    steps = [*range(1, _ORDER_NEIGHBOURS + 1), *(2**k for k in range(4, count.bit_length()))]
-    return sorted((i, i + step) for step in steps for i in range(count - step))
+    return pairs_at_steps(
+        count, [*range(1, _ORDER_NEIGHBOURS + 1), *(2**k for k in range(4, count.bit_length()))]
+    )
 
 
 def pairs_by_name(count: int) -> Pairs:
     """Return each photo with the next ones by name, which mostly were taken next."""
-    steps = range(1, _NAME_NEIGHBOURS + 1)
+    return pairs_at_steps(count, range(1, _NAME_NEIGHBOURS + 1))
+
+
+def pairs_at_steps(count: int, steps: Iterable[int]) -> Pairs:
+    """Return each photo with those that come so many steps after it."""
     return sorted((i, i + step) for step in steps for i in range(count - step))
 
 
 def nearest_pairs(distances: np.ndarray, nearest: int) -> Pairs:
     """Return each item with its ``nearest`` others.
 
-    Parameters
-    ----------
-    distances : (n, n) array
-        Symmetric; infinite or not a number where unknown. Of equal ones the first is taken.
+    ``distances``: (n, n) array, symmetric; infinite or not a number where unknown. Of equal ones
+        the first is taken.
     """
     known = np.where(np.isfinite(distances), distances, np.inf)
     np.fill_diagonal(known, np.inf)
     order = np.argsort(known, axis=1, kind="stable")[:, :nearest]
-    return sorted(
-        {
-            (min(i, j), max(i, j))
-            for i, row in enumerate(order.tolist())
-            for j in row
-            if np.isfinite(known[i, j])
-        }
-    )
+    both = {(i, j) for i, row in enumerate(order.tolist()) for j in row if np.isfinite(known[i, j])}
+    return sorted({(min(pair), max(pair)) for pair in both})
 
 
 def pairs_by_pose(centers: np.ndarray, forwards: np.ndarray) -> Pairs:
     """Return pairs (i < j) of posed photos with similar positions and viewing directions.
 
-    Parameters
-    ----------
-    centers, forwards : (n, 3) float64
-        Camera centres and unit viewing directions.
+    ``centers``, ``forwards``: (n, 3) float64, camera centres and unit viewing directions.
     """
     pairs: set[tuple[int, int]] = set()
     typical = max(float(np.linalg.norm(centers - centers.mean(0), axis=1).mean()), 1e-12)
@@ -128,7 +121,6 @@ def pairs_by_pose(centers: np.ndarray, forwards: np.ndarray) -> Pairs:
 #
 # Up to 150 photos: all. Beyond, the nearest by order, by GPS and by resemblance; then, for photos
 # with few verified neighbours, the neighbours of their neighbours.
-
 
 ALIKE_NEIGHBOURS = 20
 ALIKE_IN_ORDER = 8
@@ -153,16 +145,12 @@ def choose_pairs(
 ) -> Pairs:
     """Return the pairs of the first round.
 
-    Parameters
-    ----------
-    count : int
-        Photos, sorted by name.
-    in_order : bool
-        They were taken one after the other, as of a video.
-    metres : (count, count) array or None
-        Distances by GPS, infinite where unknown. They may be wrong: they add pairs only.
-    resemblance : (count, count) array or None
-        The more alike, the larger; needed for more than ``EXHAUSTIVE_LIMIT`` photos.
+    ``count``: photos, sorted by name.
+    ``in_order``: they were taken one after the other, as of a video.
+    ``metres``: (count, count) array or None, distances by GPS, infinite where unknown. They may be
+        wrong: they add pairs only.
+    ``resemblance``: (count, count) array or None, the more alike, the larger; needed for more than
+        ``EXHAUSTIVE_LIMIT`` photos.
     """
     if count <= EXHAUSTIVE_LIMIT:
         return all_pairs(count)
@@ -176,21 +164,14 @@ def choose_pairs(
 
 
 def second_round(
-    count: int,
-    tried: Pairs,
-    verified: Mapping[tuple[int, int], int],
-    resemblance: np.ndarray,
+    count: int, tried: Pairs, verified: Mapping[tuple[int, int], int], resemblance: np.ndarray
 ) -> Pairs:
     """Return more pairs for photos with few neighbours.
 
-    Parameters
-    ----------
-    tried : list of (int, int)
-        Pairs of the first round.
-    verified : mapping of (int, int) to int
-        Matches of a pair that agree with one motion.
-    resemblance : (count, count) array
-        Decides between equals, and for photos without any neighbour.
+    ``tried``: pairs of the first round.
+    ``verified``: matches of a pair that agree with one motion.
+    ``resemblance``: (count, count) array, decides between equals, and for photos without any
+        neighbour.
     """
     linked = np.zeros((count, count), bool)
     for (i, j), matches in verified.items():
@@ -201,7 +182,7 @@ def second_round(
         done[i, j] = done[j, i] = True
     # Neighbours in common, then resemblance, which lies in [-1, 1].
     common = linked.astype(np.float32) @ linked.astype(np.float32)
-    apart = _components(linked)
+    apart = connected_parts(count, np.argwhere(linked))
     largest = np.bincount(apart).argmax()
     pairs: set[tuple[int, int]] = set()
     for i in range(count):
@@ -230,19 +211,10 @@ def _at_ranks(metres: np.ndarray) -> set[tuple[int, int]]:
     }
 
 
-def _components(linked: np.ndarray) -> np.ndarray:
-    """Return the number of each item's connected part."""
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    return connected_components(csr_matrix(linked), directed=False)[1]
-
-
 # -- How much photos resemble each other, by the features that were found in them (VLAD) ----------
 #
 # A vocabulary is learnt from the set's own descriptors by k-means; a photo is described by how
 # its descriptors differ from their words (docs/method.md, section 15.1).
-
 
 WORDS = 64
 SAMPLED_DESCRIPTORS = 60_000
@@ -271,8 +243,7 @@ def vocabulary(count: int, read: ReadDescriptors, *, seed: int) -> np.ndarray:
     samples = []
     for number in range(count):
         found = _unit(read(number)[-DESCRIBING:])
-        picked = chance.permutation(len(found))[:each]
-        samples.append(found[np.sort(picked)])
+        samples.append(found[np.sort(chance.permutation(len(found))[:each])])
     sample = np.concatenate(samples) if samples else np.zeros((0, 128), np.float32)
     words = sample[np.sort(chance.permutation(len(sample))[:WORDS])]
     for _ in range(_ROUNDS if len(words) else 0):
@@ -305,8 +276,7 @@ def photo_vectors(count: int, read: ReadDescriptors, words: np.ndarray) -> np.nd
     has_any = np.any(vectors != 0.0, axis=1)
     if has_any.any():
         vectors[has_any] -= vectors[has_any].mean(0)
-        lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-        vectors /= np.maximum(lengths, 1e-12)
+        vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
     return vectors
 
 
@@ -322,7 +292,6 @@ def _nearest_words(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
 
 # -- Find and match features, in the helper processes that solve cameras and points ---------------
 
-
 EXTRACT_END, MATCH_END = 0.5, 0.85
 """Shares of the solver's progress."""
 _SECOND_ROUND_BEGIN = 0.8
@@ -332,19 +301,14 @@ _MATCHING_BLOCK_PAIRS = 1500
 
 
 def extract(
-    folder: Path,
-    database: Path,
-    names_of_camera: dict[int, list[str]],
-    threads: int,
-    max_features: int,
+    folder: Path, database: Path, names_of_camera: dict[int, list[str]], threads: int, most: int
 ) -> None:
-    """Find features of photos of each camera, in order, with progress."""
+    """Find features of photos of each camera, at most so many a photo, in order, with progress."""
     pycolmap = import_pycolmap()
-
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.use_gpu = False
-    options.sift.max_num_features = max_features
+    options.sift.max_num_features = most
     reader = pycolmap.ImageReaderOptions()
     if any((folder / "masks").iterdir()):
         reader.mask_path = folder / "masks"
@@ -354,12 +318,9 @@ def extract(
         reader.existing_camera_id = camera_id
         # Import in order first: extraction would number the photos as its threads finish.
         pycolmap.import_images(
-            database,
-            folder / "images",
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            image_names=names,
-            options=reader,
-        )
+            database, folder / "images", camera_mode=pycolmap.CameraMode.SINGLE,
+            image_names=names, options=reader,
+        )  # fmt: skip
         for begin in range(0, len(names), 2 * threads):
             block = names[begin : begin + 2 * threads]
             emit(
@@ -367,27 +328,19 @@ def extract(
                 message=f"searching features, photo {done + 1} of {total}",
             )
             pycolmap.extract_features(
-                database,
-                folder / "images",
-                image_names=block,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=options,
-                device=pycolmap.Device.cpu,
-            )
+                database, folder / "images", image_names=block,
+                camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
+                extraction_options=options, device=pycolmap.Device.cpu,
+            )  # fmt: skip
             done += len(block)
 
 
 def match_chosen(folder: Path, database: Path, task: dict[str, Any], names: list[str]) -> None:
     """Choose pairs, match them, and in large sets those of a second round; ``task`` gets both.
 
-    Parameters
-    ----------
-    task : dict
-        ``seed``, ``threads``, ``in_order`` and ``positions`` (degrees of latitude and longitude of
-        each photo, or None); gets ``pairs`` of names.
-    names : list of str
-        All photos, sorted.
+    ``task``: ``seed``, ``threads``, ``in_order`` and ``positions``
+    (degrees of latitude and longitude of each photo, or None); gets ``pairs`` of names. ``names``:
+    all photos, sorted.
     """
     count = len(names)
     if count <= EXHAUSTIVE_LIMIT:
@@ -395,7 +348,6 @@ def match_chosen(folder: Path, database: Path, task: dict[str, Any], names: list
         match(folder, database, task)
         return
     pycolmap = import_pycolmap()
-
     emit(fraction=EXTRACT_END, message=f"comparing {count} photos")
     with pycolmap.Database.open(database) as db:
         number_of = {image.name: image.image_id for image in db.read_all_images()}
@@ -404,12 +356,8 @@ def match_chosen(folder: Path, database: Path, task: dict[str, Any], names: list
             return np.asarray(db.read_descriptors(number_of[names[index]]).data)
 
         alike = resemblances(count, descriptors, seed=task["seed"])
-    metres = gps_distances(
-        [
-            None if place is None else GpsPosition(place[0], place[1], None)
-            for place in task["positions"]
-        ]
-    )
+    places = [place and GpsPosition(place[0], place[1], None) for place in task["positions"]]
+    metres = gps_distances(places)
     first = choose_pairs(count, in_order=task["in_order"], metres=metres, resemblance=alike)
     task["pairs"] = _named(first, names)
     match(folder, database, task, end=_SECOND_ROUND_BEGIN)
@@ -421,10 +369,10 @@ def match_chosen(folder: Path, database: Path, task: dict[str, Any], names: list
             verified[i, j] = len(geometry.inlier_matches)
     more = _named(second_round(count, first, verified, alike), names)
     match(folder, database, {**task, "pairs": more}, begin=_SECOND_ROUND_BEGIN)
-    task["pairs"] = task["pairs"] + more
+    task["pairs"] += more
 
 
-def _named(pairs: list[tuple[int, int]], names: list[str]) -> list[list[str]]:
+def _named(pairs: Pairs, names: list[str]) -> list[list[str]]:
     return [[names[i], names[j]] for i, j in pairs]
 
 
@@ -439,7 +387,6 @@ def match(
 ) -> None:
     """Match and verify the pairs of ``task``, with progress from ``begin`` to ``end``."""
     pycolmap = import_pycolmap()
-
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = task["threads"]
@@ -456,26 +403,21 @@ def match(
         block = pairs[done : done + step]
         pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in block))
         pycolmap.match_image_pairs(
-            database,
-            matching_options=matching,
-            pairing_options=pairing,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
+            database, matching_options=matching, pairing_options=pairing,
+            verification_options=verification, device=pycolmap.Device.cpu,
+        )  # fmt: skip
 
 
 def verify_again(database: Path, task: dict[str, Any], *, is_turntable: bool) -> None:
     """Verify all matches anew."""
     pycolmap = import_pycolmap()
-
     with pycolmap.Database.open(database) as db:
         db.clear_two_view_geometries()
     verifier = pycolmap.GeometricVerifierOptions()
     verifier.num_threads = task["threads"]
+    options = _options_of(task, is_turntable=is_turntable)
     pycolmap.geometric_verification(
-        database,
-        verifier_options=verifier,
-        two_view_geometry_options=_options_of(task, is_turntable=is_turntable),
+        database, verifier_options=verifier, two_view_geometry_options=options
     )
 
 

@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -14,9 +13,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ..errors import DatasetError
-from ..files import write_json
-from ..limits import HELPER_DEADLINE_S, MIN_IMAGES
-from ..machine import helper_memory_limit_bytes
+from ..limits import MIN_IMAGES
 from ..parallel import default_threads
 from ..photos.formats import PhotoHeader, read_photo_header
 from ..photos.photo_file import (
@@ -29,17 +26,15 @@ from ..photos.photo_file import (
     write_photo,
 )
 from ..progress import Progress, ReportWarning
-from ..readers.colmap import ModelFiles, read_model
-from ..readers.source_model import LensCamera, PosedPhoto, SourceModel
+from ..readers.source_model import PHOTOS, LensCamera, PosedPhoto, SourceModel
 from ..resampling import sample_bicubic
-from ..worker.helper_process import run_helper
-from .solver import HELPER
+from .matching import all_pairs, pairs_at_steps
+from .solver import fresh_folder, run_solver, save_model, write_reduced
 
 # -- The pinhole views of an equirectangular photo: directions, lens, and where their pixels lie
 #
 # A panorama's frame has x right, y down and z forward, where forward is the middle of the photo;
 # its long side is a full turn about y. Needs numpy only.
-
 
 FIELD_OF_VIEW_DEG = 84.0
 """Of each view: neighbours on the horizon, 45 degrees apart, share nearly half of their width; with
@@ -92,20 +87,12 @@ def view_lens(width: int) -> LensCamera:
     return LensCamera("PINHOLE", side, side, (focal, focal, 0.5 * side, 0.5 * side))
 
 
-def _has_panorama_size(width: int, height: int) -> bool:
-    """Whether a photo is exactly twice as wide as high."""
-    return width == 2 * height
-
-
 def panorama_evidence(photos: Sequence[Path]) -> str:
     """Return what tells that photos are panoramas, by the headers of those that can be read.
 
-    Returns
-    -------
-    str
-        :data:`BY_SHAPE` where all are exactly twice as wide as high, :data:`STATED` where one of
-        them also says that it is equirectangular. Empty where they are none: another shape, or one
-        says another projection.
+    Returns :data:`BY_SHAPE` where all are exactly twice as wide as high, :data:`STATED` where one
+    of them also says that it is equirectangular. Empty where they are none: another shape, or one
+    says another projection.
     """
     stated: set[str] = set()
     for path in photos:
@@ -113,7 +100,7 @@ def panorama_evidence(photos: Sequence[Path]) -> str:
             header = read_photo_header(path)
         except DatasetError:
             continue
-        if header is None or not _has_panorama_size(*header.upright_size):
+        if header is None or not _is_twice_as_wide(header.upright_size):
             return ""
         stated.add(header.projection)
     if stated - {"", _EQUIRECTANGULAR}:
@@ -124,20 +111,19 @@ def panorama_evidence(photos: Sequence[Path]) -> str:
 def check_panorama(header: PhotoHeader, file_name: str) -> None:
     """Raise :class:`DatasetError` where a photo has not the shape of a whole panorama."""
     width, height = header.upright_size
-    if not _has_panorama_size(width, height):
-        raise DatasetError(
-            f"{file_name} is {width} x {height} pixels; a panorama is twice as wide as high.",
-            "Export the photos as whole equirectangular panoramas.",
-        )
+    if not _is_twice_as_wide((width, height)):
+        text = f"{file_name} is {width} x {height} pixels; a panorama is twice as wide as high."
+        raise DatasetError(text, "Export the photos as whole equirectangular panoramas.")
+
+
+def _is_twice_as_wide(size: tuple[int, int]) -> bool:
+    return size[0] == 2 * size[1]
 
 
 def panorama_pixels(view: PanoramaView, width: int, height: int) -> np.ndarray:
     """Return where the pixels of a view lie in a panorama of ``width`` x ``height``.
 
-    Returns
-    -------
-    (side, side, 2) float64
-        First pixel's centre at (0.5, 0.5); x in [0, width].
+    Returns (side, side, 2) float64, first pixel's centre at (0.5, 0.5); x in [0, width].
     """
     lens = view_lens(width)
     fx, fy, cx, cy = lens.params
@@ -152,7 +138,6 @@ def panorama_pixels(view: PanoramaView, width: int, height: int) -> np.ndarray:
 
 
 # -- Cut equirectangular photos and their masks into pinhole views --------------------------------
-
 
 CUT_FOLDER, CUT_MASKS = "panoramas", "panorama-masks"
 """Folders of the views and of their masks, in the work folder."""
@@ -192,22 +177,15 @@ def cut_panoramas(
 ) -> tuple[list[CutView], list[str]]:
     """Write the views below ``work_folder / CUT_FOLDER``, all of the same lens for a size.
 
-    Returns
-    -------
-    views : list of CutView
-        Of each panorama that could be read, in order.
-    bad : list of str
-        What is wrong with the others.
-
-    Raises
-    ------
-    DatasetError
-        A photo is not twice as wide as high.
+    Returns the views of each panorama that could be read, in order, and what is wrong with the
+    others.
+    Raises DatasetError: a photo is not twice as wide as high.
     """
     threads = threads or default_threads()
     cut: list[CutView] = []
     bad: list[str] = []
-    maps: dict[tuple[int, int], list[np.ndarray]] = {}
+    mapped: tuple[int, int] | None = None
+    maps: list[np.ndarray] = []
     names: set[str] = set()
     for number, panorama in enumerate(panoramas):
         if view_name(panorama.name, 0) in names:
@@ -232,18 +210,16 @@ def cut_panoramas(
             bad.append(error.message)
             continue
         height, width = decoded.color.shape[:2]
-        if (width, height) not in maps:
-            maps.clear()  # one size at a time: a map takes 8 bytes a pixel of each view
-            grids = [panorama_pixels(view, width, height) for view in VIEWS]
-            maps[width, height] = [
-                (g + np.array([_WRAP_PX, 0.0])).astype(np.float32) for g in grids
-            ]
-        color = _wrapped(decoded.color)
-        grey = (
-            None if kept is None else _wrapped(np.where(kept, 255, 0).astype(np.uint8)[..., None])
-        )
-        for view, pixels in enumerate(maps[width, height]):
-            name = view_name(panorama.name, view)
+        if (width, height) != mapped:  # one size at a time: 8 bytes a pixel of each view
+            mapped, maps = (width, height), []
+            for view in VIEWS:
+                grid = panorama_pixels(view, width, height) + np.array([_WRAP_PX, 0.0])
+                maps.append(grid.astype(np.float32))
+        color, grey = _wrapped(decoded.color), None
+        if kept is not None:
+            grey = _wrapped(np.where(kept, 255, 0).astype(np.uint8)[..., None])
+        for index, pixels in enumerate(maps):
+            name = view_name(panorama.name, index)
             path = work_folder / CUT_FOLDER / name
             path.parent.mkdir(parents=True, exist_ok=True)
             write_photo(path, sample_bicubic(color, pixels, threads))
@@ -252,7 +228,7 @@ def cut_panoramas(
                 mask = (work_folder / CUT_MASKS / name).with_suffix(".png")
                 mask.parent.mkdir(parents=True, exist_ok=True)
                 write_mask(mask, sample_bicubic(grey, pixels, threads)[..., 0] >= MASK_THRESHOLD)
-            cut.append(CutView(name, number, view, mask, width))
+            cut.append(CutView(name, number, index, mask, width))
         progress.update(
             (number + 1) / len(panoramas), f"cutting panorama {number + 1} of {len(panoramas)}"
         )
@@ -265,7 +241,6 @@ def _wrapped(pixels: np.ndarray) -> np.ndarray:
 
 
 # -- Solve the poses of panoramas from their views, which keep their known directions (a rig) -----
-
 
 _MAX_SIFT_PX = 1000
 """Side of the views that features are extracted from."""
@@ -282,87 +257,56 @@ def panorama_pairs(count: int) -> list[tuple[int, int]]:
     Few: all. Many: the next ones, and those at powers of two for ways that come back.
     """
     if count <= _ALL_PAIRS:
-        return [(i, j) for i in range(count) for j in range(i + 1, count)]
-    steps = {*range(1, _NEIGHBOURS + 1), *(2**k for k in range(3, count.bit_length()))}
-    return sorted((i, i + step) for i in range(count) for step in steps if i + step < count)
+        return all_pairs(count)
+    return pairs_at_steps(
+        count, [*range(1, _NEIGHBOURS + 1), *(2**k for k in range(3, count.bit_length()))]
+    )
 
 
 def solve_panoramas(
-    cut: Sequence[CutView],
-    cut_folder: Path,
-    work_folder: Path,
-    progress: Progress,
-    *,
-    seed: int = 0,
-    threads: int = 0,
+    cut: Sequence[CutView], work_folder: Path, progress: Progress, *, seed: int, threads: int
 ) -> SourceModel:
     """Solve cameras and sparse points of the views of panoramas without poses.
 
     Views of a panorama share its place and keep the directions that they were cut in; their lens
     is known. Nothing of either is adjusted.
 
-    Parameters
-    ----------
-    cut : sequence of CutView
-        All of panoramas of one size.
-    cut_folder : Path
-        Holds the views.
-
-    Raises
-    ------
-    DatasetError
-        The panoramas differ in size, or fewer than ``MIN_IMAGES`` of them can be placed.
+    ``cut``: all of panoramas of one size, as :func:`cut_panoramas` has written them.
+    Raises DatasetError: the panoramas differ in size, or fewer than ``MIN_IMAGES`` of them can be
+    placed.
     """
     widths = sorted({view.width for view in cut})
     if len(widths) != 1:
-        raise DatasetError(
-            f"The panoramas are {', '.join(f'{w} x {w // 2}' for w in widths[:3])} pixels large.",
-            "Give panoramas of one size.",
-        )
-    folder = work_folder / "pose_solver"
-    if folder.exists():
-        shutil.rmtree(folder)
+        text = f"The panoramas are {', '.join(f'{w} x {w // 2}' for w in widths[:3])} pixels large."
+        raise DatasetError(text, "Give panoramas of one size.")
+    folder = fresh_folder(work_folder)
     full = view_lens(widths[0])
     side = min(full.width, _MAX_SIFT_PX)
     numbers = sorted({view.panorama for view in cut})
     names: dict[str, CutView] = {}
     for i, view in enumerate(cut):
         name = f"{view.view:02d}/{numbers.index(view.panorama):06d}.jpg"
-        _write_small(folder, name, cut_folder / view.name, view.mask, side)
+        visible = None if view.mask is None else read_mask(view.mask)
+        color = read_photo(work_folder / CUT_FOLDER / view.name).color
+        write_reduced(folder, name, color, visible, (side, side))
         names[name] = view
         progress.update(0.08 * (i + 1) / len(cut), f"reading view {i + 1} of {len(cut)}")
-    horizon = [v for v, view in enumerate(VIEWS) if view.pitch_deg == 0]
-    upper = [v for v, view in enumerate(VIEWS) if view.pitch_deg > 0]
-    lower = [v for v, view in enumerate(VIEWS) if view.pitch_deg < 0]
+    pitches = [view.pitch_deg for view in VIEWS]
+    rings = [[v for v, own in enumerate(pitches) if own == p] for p in (0.0, _TILT_DEG, -_TILT_DEG)]
     pairs = [
         [f"{v:02d}/{a:06d}.jpg", f"{w:02d}/{b:06d}.jpg"]
         for a, b in panorama_pairs(len(numbers))
-        for ring in (horizon, upper, lower)
-        for v in ring
-        for w in ring
+        for ring in rings
+        for v, w in itertools.product(ring, ring)
     ]
-    lens = full.resized(side, side)
     task = {
-        "mode": "panoramas",
-        "seed": seed,
-        "threads": threads or default_threads(),
-        "side": side,
-        "focal_px": lens.focal[0],
+        "mode": "panoramas", "seed": seed, "threads": threads or default_threads(), "side": side,
+        "focal_px": full.resized(side, side).focal[0],
         "cam_from_panorama": [view.cam_from_panorama.tolist() for view in VIEWS],
-        "panoramas": len(numbers),
-        "pairs": pairs,
-    }
-    write_json(folder / "task.json", task)
-    run_helper(
-        HELPER, folder, progress.span(0.08, 1.0), memory_bytes=helper_memory_limit_bytes(),
-        deadline_s=max(HELPER_DEADLINE_S, _SECONDS_A_PANORAMA * len(numbers)),
-    )  # fmt: skip
-    model = read_model(ModelFiles(folder / "model", ".bin"))
-    target = work_folder / "cameras"
-    if target.exists():
-        shutil.rmtree(target)
-    os.replace(folder / "model", target)
-    shutil.rmtree(folder)
+        "panoramas": len(numbers), "pairs": pairs,
+    }  # fmt: skip
+    model = run_solver(folder, task, progress, expected_s=_SECONDS_A_PANORAMA * len(numbers))
+    save_model(folder, work_folder)
     photos: list[PosedPhoto] = []
     placed = set()
     for posed in model.photos:
@@ -378,36 +322,11 @@ def solve_panoramas(
         )
     warnings = list(model.warnings)
     if len(placed) < len(numbers):
-        warnings.append(
-            ReportWarning(
-                "photos-not-placed",
-                f"{len(numbers) - len(placed)} of {len(numbers)} panoramas could not be placed and "
-                "are not used.",
-                "Take more panoramas in between.",
-            )
-        )
+        count = f"{len(numbers) - len(placed)} of {len(numbers)}"
+        text = f"{count} panoramas could not be placed and are not used."
+        warnings.append(ReportWarning("photos-not-placed", text, "Take more panoramas in between."))
     facts = {**model.facts, "panoramas": len(numbers), "panoramas_placed": len(placed)}
+    photos.sort(key=lambda photo: photo.name)
     return dataclasses.replace(
-        model,
-        kind="photos",
-        photos=tuple(sorted(photos, key=lambda photo: photo.name)),
-        warnings=tuple(warnings),
-        facts=facts,
+        model, kind=PHOTOS, photos=tuple(photos), warnings=tuple(warnings), facts=facts
     )
-
-
-def _write_small(folder: Path, name: str, path: Path, mask: Path | None, side: int) -> None:
-    """Write a view, and its mask, in the size that features are extracted from."""
-    from PIL import Image
-
-    color = read_photo(path).color
-    if color.shape[0] != side:
-        color = np.asarray(Image.fromarray(color).resize((side, side), Image.Resampling.LANCZOS))
-    (folder / "images" / name).parent.mkdir(parents=True, exist_ok=True)
-    (folder / "masks").mkdir(exist_ok=True)
-    write_photo(folder / "images" / name, color)
-    if mask is not None:
-        small = Image.fromarray(read_mask(mask)).resize((side, side), Image.Resampling.NEAREST)
-        target = folder / "masks" / f"{name}.png"
-        target.parent.mkdir(parents=True, exist_ok=True)
-        small.save(target)

@@ -18,7 +18,7 @@ from ..files import read_json, write_json
 from ..limits import HELPER_DEADLINE_S, MIN_IMAGES
 from ..machine import helper_memory_limit_bytes
 from ..parallel import default_threads
-from ..photos.exif import GpsPosition, read_gps_exif, read_lens_exif
+from ..photos.exif import GpsPosition, LensExif, read_gps_exif, read_lens_exif
 from ..photos.finder import find_mask
 from ..photos.photo_file import (
     AS_WRITTEN,
@@ -33,14 +33,13 @@ from ..photos.photo_file import (
 )
 from ..progress import UNREADABLE_HINT, Progress, ReportWarning
 from ..readers.colmap import ModelFiles, read_model
-from ..readers.source_model import PosedPhoto, SourceModel
-from ..scene.camera import Camera
+from ..readers.source_model import PHOTOS, PosedPhoto, SourceModel
+from ..scene.scene import View
 from ..worker.helper_process import run_helper
 from .checks import MIN_GROUP, TURNING_FOLDER, TURNTABLE_NAME, photos_in_parts, with_findings
 from .matching import EXHAUSTIVE_LIMIT, pairs_by_pose
 
 # -- What the pose solver found of a turntable: facts, warnings and masks of the photos' full size
-
 
 _NOT_FOUND = ReportWarning(
     "no-turntable",
@@ -60,22 +59,10 @@ def with_turntable(
 ) -> SourceModel:
     """Add what the solver found to a model that still has the solver's names.
 
-    Parameters
-    ----------
-    folder : Path
-        The solver's.
-    sizes : mapping of str to (int, int)
-        Width and height of the photos.
-    target : Path
-        New folder for the masks.
-    wanted : bool
-        The user says that there is a turntable.
-
-    Returns
-    -------
-    SourceModel
-        With the facts ``turntable_photos`` and, where masks were made,
-        ``photos_masked_as_turning``.
+    ``folder``: the solver's. ``sizes``: width and height of the photos. ``target``: new folder for
+    the masks. ``wanted``: the user says that there is a turntable.
+    Its new facts are ``turntable_photos`` and, where masks were made,
+    ``photos_masked_as_turning``.
     """
     from PIL import Image
 
@@ -120,15 +107,15 @@ def with_turntable(
 # The photos are decoded here, oriented, limited in size and written under plain names; the native
 # solver reads only these files. Its result is a COLMAP model read by our own reader.
 
-
 MAX_SIFT_PX = 1600
 """Long side of the photos that features are extracted from."""
 MAX_UNREADABLE_SHARE = 0.2
 """Largest share of photos that cannot be decoded; with more, loading fails."""
 TURNTABLE_FOLDER = "turntable"
 """Masks of what turns, of the photos' full size."""
-HELPER = "poses.solver_helper"
+_HELPER = "poses.solver_helper"
 """Module of the process that solves."""
+_UNKNOWN_LENS = LensExif((), None)
 _SECONDS_A_PHOTO = 60.0
 """Longest time that solving may take: more than ten times what 400 photos took on two cores."""
 
@@ -139,6 +126,8 @@ class _SolverPhoto:
 
     name: str
     """Name under ``images/`` of the task folder."""
+    source_name: str
+    """Name in the input."""
     width: int
     height: int
     full_width: int
@@ -163,41 +152,24 @@ def solve_poses(
 ) -> SourceModel:
     """Solve cameras and sparse points of photos without poses (structure from motion).
 
-    Parameters
-    ----------
-    root : Path
-        Folder that the photo names are relative to.
-    photos : sequence of Path
-    mask_roots : list of Path
-        Folders of masks; features on black pixels are not used.
-    work_folder : Path
-        Temporary files, ``cameras/`` (the COLMAP model) and ``turntable/`` (masks) are written
-        here.
-    turntable : {"auto", "on", "off"}
-        Whether the camera stood still while the object turned; ``"auto"`` sees it by matches that
-        stay in their place. Matches of the background are then left out, and the background is
-        masked, unless a photo has a mask.
-    reading : MaskReading
-        How mask files are understood.
-    in_order : bool
-        Photos sorted by name were taken one after the other, as of a video. Matters where there are
-        too many to match all pairs.
-
-    Returns
-    -------
-    SourceModel
-        Photos that could not be registered are left out, with a warning. World is the solver's own
-        frame. Reproducible for the same seed with one thread; with more, the native matcher
-        differed once in about 60 runs.
-
-    Raises
-    ------
-    DatasetError
-        Too few photos can be decoded, or fewer than ``MIN_IMAGES`` can be registered.
+    ``root``: folder that the photo names are relative to.
+    ``mask_roots``: folders of masks; features on black pixels are not used.
+    ``work_folder``: temporary files, ``cameras/`` (the COLMAP model) and ``turntable/`` (masks) are
+        written here.
+    ``turntable``: {"auto", "on", "off"}, whether the camera stood still while the object turned;
+        ``"auto"`` sees it by matches that stay in their place. Matches of the background are then
+        left out, and the background is masked, unless a photo has a mask.
+    ``reading``: how mask files are understood.
+    ``in_order``: photos sorted by name were taken one after the other, as of a video. Matters where
+        there are too many to match all pairs.
+    Photos that could not be registered are left out, with a warning. World is the solver's
+    own frame. Reproducible for the same seed with one thread; with more, the native matcher
+    differed once in about 60 runs.
+    Raises DatasetError: too few photos can be decoded, or fewer than ``MIN_IMAGES`` can be
+    registered.
     """
-    folder = _fresh_folder(work_folder)
+    folder = fresh_folder(work_folder)
     prepared: list[_SolverPhoto] = []
-    names: list[str] = []
     bad: list[str] = []
     positions: list[GpsPosition | None] = []
     for i, path in enumerate(photos):
@@ -210,93 +182,67 @@ def solve_poses(
             check_unreadable_share(bad, len(photos))
             continue
         mask = find_mask(mask_roots, name, [root])
-        prepared.append(_write_solver_photo(folder, i, decoded, full_size, path, mask, reading))
-        names.append(name)
+        visible = _visible(decoded, mask, reading)
+        lens = read_lens_exif(path, *full_size)
+        prepared.append(
+            _write_solver_photo(folder, i, decoded.color, visible, full_size, lens, name)
+        )
         positions.append(read_gps_exif(path) if len(photos) > EXHAUSTIVE_LIMIT else None)
         progress.update(0.08 * (i + 1) / len(photos), f"reading photo {i + 1} of {len(photos)}")
     if len(prepared) < MIN_IMAGES:
-        raise DatasetError(
-            f"Only {len(prepared)} photos can be read; {MIN_IMAGES} are needed.", "Add photos."
-        )
-    threads = threads or default_threads()
+        text = f"Only {len(prepared)} photos can be read; {MIN_IMAGES} are needed."
+        raise DatasetError(text, "Add photos.")
     groups: dict[tuple[Any, ...], list[_SolverPhoto]] = {}
     for photo in prepared:
-        key = (photo.full_width, photo.full_height, *photo.lens_key)
-        groups.setdefault(key, []).append(photo)
+        groups.setdefault((photo.full_width, photo.full_height, *photo.lens_key), []).append(photo)
+    told = []
+    for group in groups.values():
+        size = {"width": group[0].width, "height": group[0].height}
+        told.append({**size, "focal_px": group[0].focal_px, "names": [p.name for p in group]})
     task = {
-        "mode": "solve",
-        "seed": seed,
-        "threads": threads,
-        "turntable": turntable,
-        "groups": [
-            {
-                "width": group[0].width,
-                "height": group[0].height,
-                "focal_px": group[0].focal_px,
-                "names": [p.name for p in group],
-            }
-            for group in groups.values()
-        ],
-        "in_order": in_order,
+        "mode": "solve", "seed": seed, "threads": threads or default_threads(),
+        "turntable": turntable, "groups": told, "in_order": in_order,
         "positions": [p and [p.latitude_deg, p.longitude_deg] for p in positions],
-    }
-    write_json(folder / "task.json", task)
-    run_helper(
-        HELPER, folder, progress.span(0.08, 1.0), memory_bytes=helper_memory_limit_bytes(),
-        deadline_s=max(HELPER_DEADLINE_S, _SECONDS_A_PHOTO * len(prepared)),
-    )  # fmt: skip
-    model = read_model(ModelFiles(folder / "model", ".bin"))
+    }  # fmt: skip
+    model = run_solver(folder, task, progress, expected_s=_SECONDS_A_PHOTO * len(prepared))
     sizes = {p.name: (p.full_width, p.full_height) for p in prepared}
     target = work_folder / TURNTABLE_FOLDER
     model = with_turntable(model, folder, sizes, target, wanted=turntable == "on")
-    model = with_findings(model, folder, {p.name: n for p, n in zip(prepared, names, strict=True)})
+    model = with_findings(model, folder, {p.name: p.source_name for p in prepared})
     in_parts = photos_in_parts(folder)
-    _save_model(folder, work_folder)
-    return _with_source_names(model, prepared, names, bad, len(photos), in_parts)
+    save_model(folder, work_folder)
+    return _with_source_names(model, prepared, bad, in_parts)
 
 
 def _with_source_names(
-    model: SourceModel,
-    prepared: list[_SolverPhoto],
-    names: list[str],
-    bad: list[str],
-    offered: int,
-    in_parts: Collection[str] = (),
+    model: SourceModel, prepared: list[_SolverPhoto], bad: list[str], in_parts: Collection[str]
 ) -> SourceModel:
     """Restore original names and full-size intrinsics of the solved photos.
 
     Of photos that are not placed, those ``in_parts`` have a warning already.
     """
-    of_name = {p.name: (p, name) for p, name in zip(prepared, names, strict=True)}
+    offered = len(prepared) + len(bad)
+    of_name = {p.name: p for p in prepared}
     photos: list[PosedPhoto] = []
     for posed in model.photos:
-        photo, name = of_name[posed.name]
+        photo = of_name[posed.name]
         assert posed.lens is not None
         lens = posed.lens.resized(photo.full_width, photo.full_height)
-        photos.append(dataclasses.replace(posed, name=name, lens=lens))
+        photos.append(dataclasses.replace(posed, name=photo.source_name, lens=lens))
     photos.sort(key=lambda p: p.name)
     if len(photos) < MIN_IMAGES:
-        raise DatasetError(
-            f"Only {len(photos)} of {offered} photos could be placed; {MIN_IMAGES} are needed.",
-            "Take more photos with more overlap, from a textured object that does not move.",
-        )
+        text = f"Only {len(photos)} of {offered} photos could be placed; {MIN_IMAGES} are needed."
+        hint = "Take more photos with more overlap, from a textured object that does not move."
+        raise DatasetError(text, hint)
     warnings = list(model.warnings)
-    registered = {p.name for p in photos}
-    unregistered = [
-        name
-        for photo, name in zip(prepared, names, strict=True)
-        if name not in registered and photo.name not in in_parts
-    ]
+    explained = {p.name for p in model.photos}.union(in_parts)
+    unregistered = [p.source_name for p in prepared if p.name not in explained]
     if unregistered:
         listed = ", ".join(unregistered[:5]) + (" ..." if len(unregistered) > 5 else "")
-        warnings.append(
-            ReportWarning(
-                "photos-not-placed",
-                f"{len(unregistered)} of {len(names)} photos could not be placed and are not used: "
-                f"{listed}.",
-                "Take more photos with more overlap there, or remove blurred ones.",
-            )
-        )
+        count = f"{len(unregistered)} of {len(prepared)}"
+        text = f"{count} photos could not be placed and are not used: {listed}."
+        hint = "Take more photos with more overlap there, or remove blurred ones."
+        warnings.append(ReportWarning("photos-not-placed", text, hint))
     if bad:
         text = f"{len(bad)} photos cannot be read and are not used: {bad[0]}"
         warnings.append(ReportWarning("photos-unreadable", text, UNREADABLE_HINT))
@@ -307,109 +253,113 @@ def _with_source_names(
         **{k: v for k, v in model.facts.items() if k != "images_in_model"},
     }
     return dataclasses.replace(
-        model, kind="photos", photos=tuple(photos), warnings=tuple(warnings), facts=facts
+        model, kind=PHOTOS, photos=tuple(photos), warnings=tuple(warnings), facts=facts
     )
 
 
 def triangulate_points(
-    cameras: Sequence[Camera],
-    photos: Sequence[Path],
-    masks: Sequence[Path | None],
-    work_folder: Path,
-    progress: Progress,
-    *,
-    seed: int = 0,
-    threads: int = 0,
+    views: Sequence[View], work_folder: Path, progress: Progress, *, seed: int, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Triangulate features of photos with known, fixed pinhole cameras.
 
-    Returns
-    -------
-    points : (n, 3) float64
-        In the frame of ``cameras``; may be empty.
-    colors : (n, 3) uint8
+    Returns ``points``: (n, 3) float64, in the frame of ``cameras``; may be empty; ``colors``:
+    (n, 3) uint8.
     """
-    folder = _fresh_folder(work_folder)
+    folder = fresh_folder(work_folder)
     entries = []
-    for i, (camera, path) in enumerate(zip(cameras, photos, strict=True)):
-        size = (camera.width, camera.height)
-        prepared = _write_solver_photo(folder, i, read_photo(path), size, None, masks[i])
+    cameras = [view.camera for view in views]
+    for i, (view, camera) in enumerate(zip(views, cameras, strict=True)):
+        decoded, size = read_photo(view.photo_path), (camera.width, camera.height)
+        visible = _visible(decoded, view.mask_path, AS_WRITTEN)
+        prepared = _write_solver_photo(folder, i, decoded.color, visible, size)
         small = camera.resized(prepared.width, prepared.height)
-        entries.append(
-            {
-                "name": prepared.name,
-                "width": small.width,
-                "height": small.height,
-                "params": [small.fx, small.fy, small.cx, small.cy],
-                "cam_from_world": np.asarray(small.cam_from_world).tolist(),
-            }
-        )
-        progress.update(0.08 * (i + 1) / len(photos), f"reading photo {i + 1} of {len(photos)}")
+        entries.append({
+            "name": prepared.name, "width": small.width, "height": small.height,
+            "params": [small.fx, small.fy, small.cx, small.cy],
+            "cam_from_world": np.asarray(small.cam_from_world).tolist(),
+        })  # fmt: skip
+        progress.update(0.08 * (i + 1) / len(views), f"reading photo {i + 1} of {len(views)}")
     pairs = pairs_by_pose(
         np.array([c.center for c in cameras]), np.array([c.forward for c in cameras])
     )
     task = {
-        "mode": "triangulate",
-        "seed": seed,
-        "threads": threads or default_threads(),
-        "photos": entries,
-        "pairs": [[entries[i]["name"], entries[j]["name"]] for i, j in pairs],
-    }
-    write_json(folder / "task.json", task)
-    run_helper(HELPER, folder, progress.span(0.08, 1.0), memory_bytes=helper_memory_limit_bytes())
-    model = read_model(ModelFiles(folder / "model", ".bin"))
+        "mode": "triangulate", "seed": seed, "threads": threads or default_threads(),
+        "photos": entries, "pairs": [[entries[i]["name"], entries[j]["name"]] for i, j in pairs],
+    }  # fmt: skip
+    model = run_solver(folder, task, progress)
     shutil.rmtree(folder)
     return model.points, model.point_colors
+
+
+def run_solver(
+    folder: Path, task: dict[str, Any], progress: Progress, *, expected_s: float = 0.0
+) -> SourceModel:
+    """Run a task of the helper in ``folder``, with the last 92 % of ``progress``; read its model.
+
+    ``expected_s`` is the longest time that it may take, where that is more than usual.
+    """
+    write_json(folder / "task.json", task)
+    run_helper(
+        _HELPER, folder, progress.span(0.08, 1.0), memory_bytes=helper_memory_limit_bytes(),
+        deadline_s=max(HELPER_DEADLINE_S, expected_s),
+    )  # fmt: skip
+    return read_model(ModelFiles(folder / "model", ".bin"))
 
 
 def check_unreadable_share(bad: Sequence[str], offered: int) -> None:
     """Raise :class:`DatasetError` once more than a fifth of the photos cannot be read."""
     if len(bad) > MAX_UNREADABLE_SHARE * offered:
-        raise DatasetError(
-            f"{len(bad)} of {offered} photos cannot be read. First: {bad[0]}",
-            "Restore the photos, or remove the bad ones.",
-        )
+        text = f"{len(bad)} of {offered} photos cannot be read. First: {bad[0]}"
+        raise DatasetError(text, "Restore the photos, or remove the bad ones.")
+
+
+def _visible(decoded: DecodedPhoto, mask: Path | None, reading: MaskReading) -> np.ndarray | None:
+    """Return what the mask of a photo, or else its transparency, shows of it, uint8."""
+    if mask is None:
+        return decoded.alpha
+    return np.where(reading.kept(read_mask(mask)), 255, 0).astype(np.uint8)
 
 
 def _write_solver_photo(
     folder: Path,
     index: int,
-    decoded: DecodedPhoto,
+    color: np.ndarray,
+    visible: np.ndarray | None,
     full_size: tuple[int, int],
-    source: Path | None,
-    mask: Path | None,
-    reading: MaskReading = AS_WRITTEN,
+    lens: LensExif = _UNKNOWN_LENS,
+    source_name: str = "",
 ) -> _SolverPhoto:
-    """Write one upright photo of limited size; the lens is read from the EXIF of ``source``.
+    """Write one upright photo, and what is ``visible`` of it (uint8), in limited size.
 
     ``full_size`` is (width, height) of the whole photo, which may be decoded at less.
     """
-    from PIL import Image
-
     full_width, full_height = full_size
     factor = min(1.0, MAX_SIFT_PX / max(full_width, full_height))
     size = (max(1, round(full_width * factor)), max(1, round(full_height * factor)))
-    color = decoded.color
+    name = f"{index:06d}.jpg"
+    write_reduced(folder, name, color, visible, size)
+    focal_px = None if lens.focal_px is None else lens.focal_px * factor
+    return _SolverPhoto(name, source_name, *size, full_width, full_height, lens.key, focal_px)
+
+
+def write_reduced(
+    folder: Path, name: str, color: np.ndarray, visible: np.ndarray | None, size: tuple[int, int]
+) -> None:
+    """Write a photo of a task, and what is ``visible`` of it (uint8), at width and height."""
+    from PIL import Image
+
     if size != (color.shape[1], color.shape[0]):
         color = np.asarray(Image.fromarray(color).resize(size, Image.Resampling.LANCZOS))
-    name = f"{index:06d}.jpg"
-    write_photo(folder / "images" / name, color)
-    visible = decoded.alpha
-    if mask is not None:
-        visible = np.where(reading.kept(read_mask(mask)), 255, 0).astype(np.uint8)
+    target, mask = folder / "images" / name, folder / "masks" / f"{name}.png"
+    target.parent.mkdir(exist_ok=True)
+    write_photo(target, color)
     if visible is not None:
-        resized = Image.fromarray(visible).resize(size, Image.Resampling.NEAREST)
-        resized.save(folder / "masks" / f"{name}.png")
-    key: tuple[str, ...] = ()
-    focal_px = None
-    if source is not None:
-        lens = read_lens_exif(source, full_width, full_height)
-        key = lens.key
-        focal_px = None if lens.focal_px is None else lens.focal_px * factor
-    return _SolverPhoto(name, size[0], size[1], full_width, full_height, key, focal_px)
+        mask.parent.mkdir(exist_ok=True)
+        Image.fromarray(visible).resize(size, Image.Resampling.NEAREST).save(mask)
 
 
-def _fresh_folder(work_folder: Path) -> Path:
+def fresh_folder(work_folder: Path) -> Path:
+    """Return a new folder for a task of the helper; what an earlier run has left is removed."""
     folder = work_folder / "pose_solver"
     for earlier in (folder, work_folder / TURNTABLE_FOLDER):
         if earlier.exists():
@@ -419,7 +369,7 @@ def _fresh_folder(work_folder: Path) -> Path:
     return folder
 
 
-def _save_model(folder: Path, work_folder: Path) -> None:
+def save_model(folder: Path, work_folder: Path) -> None:
     """Keep the solved model as ``cameras/``, drop features and temporary photos."""
     target = work_folder / "cameras"
     if target.exists():

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import sqlite3
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from ..errors import DatasetError
 from ..files import read_json, write_json
 from ..photos.photo_file import write_mask
 from ..readers.lenses import import_pycolmap
+from ..scene.camera import pose_at
 from ..worker.helper_process import emit
 from .checks import (
     SOLUTION_NAME,
@@ -36,9 +38,6 @@ from .turntable import (
 )
 
 # -- Place the photos of a solver's database: one after the other, or all at once -----------------
-#
-# Runs in the helper process of :mod:`.solver`.
-
 
 MIN_MODEL = 3
 """Photos of the smallest part that is kept."""
@@ -51,13 +50,11 @@ MAX_JOIN_SHARE = 0.02
 def mapping_options(seed: int) -> Any:
     """Return options of the incremental mapper that give the same result for the same seed."""
     pycolmap = import_pycolmap()
-
     options = pycolmap.IncrementalPipelineOptions()
     for part in (options, options.mapper, options.triangulation):
         part.random_seed = seed
     # One thread: the order of sums in bundle adjustment, and so the result, stays the same.
-    options.num_threads = 1
-    options.mapper.num_threads = 1
+    options.num_threads = options.mapper.num_threads = 1
     return options
 
 
@@ -72,22 +69,15 @@ def place_one_by_one(
 ) -> list[Any]:
     """Return the reconstructions of the incremental mapper, the largest first.
 
-    Parameters
-    ----------
-    folder : Path
-        With ``images/``; ``models/`` is used for temporary files.
-    lenient : bool
-        Accept fewer matches, and a first pair with less parallax.
-    known_lens : bool
-        Neither the lenses nor the places of cameras in their rig are adjusted.
+    ``folder``: with ``images/``; ``models/`` is used for temporary files.
+    ``lenient``: accept fewer matches, and a first pair with less parallax.
+    ``known_lens``: neither the lenses nor the places of cameras in their rig are adjusted.
     """
     pycolmap = import_pycolmap()
-
     options = mapping_options(seed)
     options.min_model_size = MIN_MODEL
     if known_lens:
-        options.ba_refine_focal_length = False
-        options.ba_refine_extra_params = False
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.ba_refine_sensor_from_rig = False
     if lenient:
         options.mapper.init_min_num_inliers = 40
@@ -114,18 +104,14 @@ def place_one_by_one(
 def place_at_once(database: Path, folder: Path, seed: int, total: int) -> list[Any]:
     """Return the reconstructions of the global mapper, the largest first."""
     pycolmap = import_pycolmap()
-
     options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = 1  # repeatable, as above
-    options.random_seed = seed
     options.min_model_size = MIN_MODEL
-    options.mapper.num_threads = 1
-    options.mapper.random_seed = seed
-    options.mapper.rotation_averaging.random_seed = seed
-    options.mapper.global_positioning.random_seed = seed
-    options.mapper.retriangulation.random_seed = seed
-    for part in (options.mapper.global_positioning, options.mapper.bundle_adjustment.ceres):
-        part.use_gpu = False
+    mapper = options.mapper
+    options.num_threads = mapper.num_threads = 1  # repeatable, as above
+    steps = mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation
+    for part in (options, mapper, *steps):
+        part.random_seed = seed
+    mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
     emit(fraction=MATCH_END, message=f"placing {total} photos at once")
     found = pycolmap.global_mapping(database, folder / "images", _empty(folder), options)
     return _largest_first(found)
@@ -147,51 +133,63 @@ def _largest_first(found: dict[int, Any]) -> list[Any]:
 def joined(database: Path, folder: Path, seed: int, models: Sequence[Any]) -> tuple[Any, int]:
     """Join parts to the largest that have three photos or more in common with it.
 
-    Returns
-    -------
-    model : Reconstruction
-        The first of ``models`` where nothing could be joined.
-    count : int
-        Photos that the others added.
+    Returns the model, the first of ``models`` where nothing could be joined, and how many photos
+    the others added.
     """
     pycolmap = import_pycolmap()
-
     first = models[0]
     added: dict[int, np.ndarray] = {}
     poses = _poses(first)
     for other in models[1:]:
-        theirs = _poses(other)
-        common = sorted(set(poses) & set(theirs))
-        moved = _moved_onto(theirs, poses, common)
-        if moved is None:
-            continue
+        moved = _moved_onto(_poses(other), poses)
         new = {number: pose for number, pose in moved.items() if number not in poses}
         added |= new
         poses |= new
     if not added:
         return first, 0
     emit(fraction=MATCH_END, message=f"joining parts, {len(added)} photos more")
+    target = folder / "joined"
+    target.mkdir(exist_ok=True)
+
+    def lens(stored: Any) -> Any:
+        number = stored.camera_id
+        return first.camera(number) if first.exists_camera(number) else stored
+
+    model = _triangulated(database, folder, target, seed, poses, lens)
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.ceres.solver_options.num_threads = 1
+    pycolmap.bundle_adjustment(model, adjustment)
+    return model, len(added)
+
+
+def _triangulated(
+    database: Path,
+    folder: Path,
+    target: Path,
+    seed: int,
+    poses: Mapping[int, np.ndarray],
+    lens: Callable[[Any], Any],
+) -> Any:
+    """Return the reconstruction of the photos that have (3, 4) poses, by number, which stay.
+
+    ``lens`` returns the camera to use for one of the database.
+    """
+    pycolmap = import_pycolmap()
     posed = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as db:
         for camera in db.read_all_cameras():
-            lens = first.camera(camera.camera_id) if first.exists_camera(camera.camera_id) else None
-            posed.add_camera_with_trivial_rig(camera if lens is None else lens)
+            posed.add_camera_with_trivial_rig(lens(camera))
         for stored in db.read_all_images():
             if stored.image_id in poses:
                 image = pycolmap.Image(
                     name=stored.name, camera_id=stored.camera_id, image_id=stored.image_id
                 )
                 posed.add_image_with_trivial_frame(image, pycolmap.Rigid3d(poses[stored.image_id]))
-    target = folder / "joined"
-    target.mkdir(exist_ok=True)
-    model = pycolmap.triangulate_points(
+    # Bundle adjustment may move points only.
+    return pycolmap.triangulate_points(
         posed, database, folder / "images", target, clear_points=True,
         options=mapping_options(seed),
     )  # fmt: skip
-    adjustment = pycolmap.BundleAdjustmentOptions()
-    adjustment.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(model, adjustment)
-    return model, len(added)
 
 
 def _poses(model: Any) -> dict[int, np.ndarray]:
@@ -203,11 +201,12 @@ def _poses(model: Any) -> dict[int, np.ndarray]:
 
 
 def _moved_onto(
-    theirs: dict[int, np.ndarray], ours: dict[int, np.ndarray], common: Sequence[int]
-) -> dict[int, np.ndarray] | None:
-    """Return their poses in our frame, None where the common photos do not tell it."""
+    theirs: dict[int, np.ndarray], ours: dict[int, np.ndarray]
+) -> dict[int, np.ndarray]:
+    """Return their poses in our frame; none where the common photos do not tell it."""
+    common = sorted(set(ours) & set(theirs))
     if len(common) < MIN_COMMON:
-        return None
+        return {}
     # R_ours = R_theirs Q^T: the mean of the rotations, by singular values.
     turn = sum(ours[k][:, :3].T @ theirs[k][:, :3] for k in common)
     u, _, vt = np.linalg.svd(turn)
@@ -219,13 +218,11 @@ def _moved_onto(
     spread = float(np.sqrt((b**2).sum(1).mean()))
     error = float(np.sqrt(((scale * a - b) ** 2).sum(1).mean()))
     if scale <= 0.0 or error > MAX_JOIN_SHARE * spread:
-        return None
+        return {}
     shift = target.mean(0) - scale * source.mean(0)
     moved = {}
     for number, pose in theirs.items():
-        turned = pose[:, :3] @ rotation.T
-        center = scale * rotation @ _center(pose) + shift
-        moved[number] = np.concatenate([turned, -(turned @ center)[:, None]], 1)
+        moved[number] = pose_at(pose[:, :3] @ rotation.T, scale * rotation @ _center(pose) + shift)
     return moved
 
 
@@ -233,13 +230,10 @@ def _center(pose: np.ndarray) -> np.ndarray:
     return -pose[:, :3].T @ pose[:, 3]
 
 
-# -- Solve doubtful cameras again from the pairs that are most alike (docs/method.md, section
-#    15.3)
+# -- Solve doubtful cameras again from the most alike pairs (docs/method.md, section 15.3) --------
 #
-# Runs in the helper process of :mod:`.solver`. Where things repeat, photos match that show
-# different things. They have less in common than true neighbours: beside what repeats, each shows
-# things that the other does not.
-
+# Where things repeat, photos match that show different things. They have less in common than true
+# neighbours: beside what repeats, each shows things that the other does not.
 
 MOST_ALIKE = 3
 """Pairs of each photo by which two solutions are compared."""
@@ -255,31 +249,16 @@ Alike = Mapping[tuple[int, int], float]
 
 
 def mended(
-    database: Path,
-    folder: Path,
-    solve: Callable[[Path], Any],
-    model: Any,
-    verdict: Verdict,
+    database: Path, folder: Path, solve: Callable[[Path], Any], model: Any, verdict: Verdict
 ) -> tuple[Any, Verdict, bool]:
     """Solve again from the most alike pairs; keep the result if these contradict it far less.
 
-    Parameters
-    ----------
-    database : Path
-        With the verified pairs, all of which judge every solution.
-    folder : Path
-        For temporary files.
-    solve : callable
-        Returns the reconstruction of a database, or None.
-    model, verdict
-        The doubtful solution.
-
-    Returns
-    -------
-    model, verdict
-        Those given where the other is not better.
-    is_mended : bool
-        They are the other.
+    ``database``: with the verified pairs, all of which judge every solution.
+    ``folder``: for temporary files.
+    ``solve``: returns the reconstruction of a database, or None.
+    ``model``, ``verdict``: the doubtful solution.
+    Returns model and verdict, those given where the other is not better, and whether they are the
+    other.
     """
     emit(
         fraction=MATCH_END,
@@ -287,7 +266,11 @@ def mended(
         "again from the most alike",
     )
     trial = folder / "alike.db"
-    _copy(database, trial)
+    with (
+        contextlib.closing(sqlite3.connect(database)) as one,
+        contextlib.closing(sqlite3.connect(trial)) as other,
+    ):
+        one.backup(other)
     alike = pair_likeness(database)
     kept = near_in_tree(alike)
     pycolmap = import_pycolmap()
@@ -301,31 +284,26 @@ def mended(
         return model, verdict, False
     judged = check_solution(database, found)
     closest = {frozenset((names[a], names[b])) for a, b in most_alike(alike)}
-    if _contradictions(judged, closest) <= MAX_LEFT * _contradictions(verdict, closest):
-        return found, judged, True
-    return model, verdict, False
-
-
-def _contradictions(verdict: Verdict, pairs: set[frozenset[str]]) -> int:
-    return sum(
-        pair.contradicts and frozenset((pair.first, pair.second)) in pairs for pair in verdict.pairs
+    left, before = (
+        sum(p.contradicts and frozenset((p.first, p.second)) in closest for p in one.pairs)
+        for one in (judged, verdict)
     )
+    return (found, judged, True) if left <= MAX_LEFT * before else (model, verdict, False)
 
 
 def pair_likeness(database: Path) -> dict[tuple[int, int], float]:
     """Return how alike the photos of verified pairs are, in (0, 1]."""
     pycolmap = import_pycolmap()
-
     with pycolmap.Database.open(database) as db:
         matches = {
             pycolmap.pair_id_to_image_pair(pair_id): geometry.inlier_matches
             for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True)
             if len(geometry.inlier_matches)
         }
-    features: dict[int, list[np.ndarray]] = {}
+    features: dict[int, list[np.ndarray]] = defaultdict(list)
     for pair, found in matches.items():
         for side, number in enumerate(pair):
-            features.setdefault(number, []).append(found[:, side])
+            features[number].append(found[:, side])
     useful = {number: len(np.unique(np.concatenate(all_))) for number, all_ in features.items()}
     return {
         (a, b): len(found) / (useful[a] + useful[b] - len(found))
@@ -335,10 +313,10 @@ def pair_likeness(database: Path) -> dict[tuple[int, int], float]:
 
 def most_alike(alike: Alike) -> set[tuple[int, int]]:
     """Return the ``MOST_ALIKE`` pairs of each photo."""
-    of_photo: dict[int, list[tuple[float, tuple[int, int]]]] = {}
+    of_photo: dict[int, list[tuple[float, tuple[int, int]]]] = defaultdict(list)
     for pair, value in alike.items():
         for number in pair:
-            of_photo.setdefault(number, []).append((-value, pair))
+            of_photo[number].append((-value, pair))
     return {pair for pairs in of_photo.values() for _, pair in sorted(pairs)[:MOST_ALIKE]}
 
 
@@ -349,29 +327,18 @@ def near_in_tree(alike: Alike) -> set[tuple[int, int]]:
 
     numbers = sorted({number for pair in alike for number in pair})
     index = {number: k for k, number in enumerate(numbers)}
-    rows = [index[a] for a, _ in alike]
-    columns = [index[b] for _, b in alike]
+    ends = [index[a] for a, _ in alike], [index[b] for _, b in alike]
     # Zero would mean no edge.
     apart = np.array([1.0 + 1e-9 - value for value in alike.values()])
-    shape = (len(numbers), len(numbers))
-    tree = minimum_spanning_tree(csr_matrix((apart, (rows, columns)), shape=shape))
+    tree = minimum_spanning_tree(csr_matrix((apart, ends), shape=(len(numbers), len(numbers))))
     steps = shortest_path(tree, directed=False, unweighted=True)
     return {pair for pair in alike if steps[index[pair[0]], index[pair[1]]] <= TREE_STEPS}
 
 
-def _copy(source: Path, target: Path) -> None:
-    with (
-        contextlib.closing(sqlite3.connect(source)) as one,
-        contextlib.closing(sqlite3.connect(target)) as other,
-    ):
-        one.backup(other)
-
-
-# -- Helper process of :mod:`.solver`: feature extraction, matching, mapping, triangulation
+# -- The helper process: feature extraction, matching, mapping, triangulation ---------------------
 #
 # Reads ``task.json``, ``images/`` and ``masks/`` of its folder, writes ``model/`` (COLMAP
 # binary), and ``turntable.json``, ``turning/`` and ``solution.json`` where it solves.
-
 
 DEFAULT_FOCAL_FACTORS = (1.2, 0.85, 1.7, 2.5)
 """Focal lengths over the long side to try if EXIF gives none, the most common first."""
@@ -390,43 +357,38 @@ _MAX_FEATURES_PANORAMA = 2048
 def main(folder: Path) -> None:
     """Run the task of ``folder``."""
     pycolmap = import_pycolmap()
-
     pycolmap.logging.minloglevel = 1
     task = read_json(folder / "task.json")
     pycolmap.set_random_seed(task["seed"])
-    if task["mode"] == "solve":
-        _solve(folder, task)
-    elif task["mode"] == "panoramas":
-        _solve_panoramas(folder, task)
-    else:
-        _triangulate(folder, task)
+    run = {"solve": _solve, "panoramas": _solve_panoramas, "triangulate": _triangulate}
+    run[task["mode"]](folder, task)
+
+
+def _added_camera(
+    db: Any, model: str, size: tuple[int, int], params: Sequence[float], *, is_known: bool = True
+) -> int:
+    """Add a camera of width and height to a database; return its number."""
+    camera = import_pycolmap().Camera(model=model, width=size[0], height=size[1], params=params)
+    camera.has_prior_focal_length = is_known
+    return int(db.write_camera(camera))
 
 
 def _solve(folder: Path, task: dict[str, Any]) -> None:
     pycolmap = import_pycolmap()
-
     database = folder / "database.db"
     guessed: list[int] = []
     names_of_camera: dict[int, list[str]] = {}
     with pycolmap.Database.open(database) as db:
         for group in task["groups"]:
-            width, height = group["width"], group["height"]
-            focal_px = group["focal_px"]
+            width, height, focal_px = group["width"], group["height"], group["focal_px"]
             start_px = focal_px or DEFAULT_FOCAL_FACTORS[0] * max(width, height)
-            camera = pycolmap.Camera(
-                model="SIMPLE_RADIAL",
-                width=width,
-                height=height,
-                params=[start_px, width / 2, height / 2, 0.0],
-            )
-            camera.has_prior_focal_length = focal_px is not None
-            camera_id = db.write_camera(camera)
-            names_of_camera[camera_id] = group["names"]
-            if focal_px is None:
-                guessed.append(camera_id)
+            params = [start_px, width / 2, height / 2, 0.0]
+            is_known = focal_px is not None
+            number = _added_camera(db, "SIMPLE_RADIAL", (width, height), params, is_known=is_known)
+            names_of_camera[number] = group["names"]
+            guessed += [] if is_known else [number]
     total = sum(len(names) for names in names_of_camera.values())
-    is_small = total <= EXHAUSTIVE_LIMIT
-    features = _MAX_FEATURES if is_small else _MAX_FEATURES_MANY
+    features = _MAX_FEATURES if total <= EXHAUSTIVE_LIMIT else _MAX_FEATURES_MANY
     extract(folder, database, names_of_camera, task["threads"], features)
     names = sorted(name for group in names_of_camera.values() for name in group)
     match_chosen(folder, database, task, names)
@@ -441,10 +403,9 @@ def _solve(folder: Path, task: dict[str, Any]) -> None:
 
     best = solve(database)
     if best is None:
-        raise DatasetError(
-            f"No two of the {total} photos could be placed relative to each other.",
-            "Take more photos with more overlap, from a textured object that does not move.",
-        )
+        text = f"No two of the {total} photos could be placed relative to each other."
+        hint = "Take more photos with more overlap, from a textured object that does not move."
+        raise DatasetError(text, hint)
     verdict = check_solution(database, best)
     is_mended = False
     if verdict.is_doubtful:
@@ -454,9 +415,10 @@ def _solve(folder: Path, task: dict[str, Any]) -> None:
         best.extract_colors_for_all_images(folder / "images")
         best.update_point_3d_errors()
     placed = [best.image(number).name for number in sorted(best.reg_image_ids())]
-    said |= verdict.to_json(placed)
-    said |= {"is_doubtful": verdict.is_doubtful, "is_mended": is_mended}
-    said["pairs_matched"] = len(task["pairs"])
+    said |= {
+        **verdict.to_json(placed), "is_doubtful": verdict.is_doubtful, "is_mended": is_mended,
+        "pairs_matched": len(task["pairs"]),
+    }  # fmt: skip
     write_json(folder / SOLUTION_NAME, said)
     _write(folder, best)
 
@@ -464,7 +426,6 @@ def _solve(folder: Path, task: dict[str, Any]) -> None:
 def _solve_panoramas(folder: Path, task: dict[str, Any]) -> None:
     """Solve views of panoramas as a rig whose directions and lens are known and stay."""
     pycolmap = import_pycolmap()
-
     database = folder / "database.db"
     side, focal_px = task["side"], task["focal_px"]
     rotations = [np.array(rows) for rows in task["cam_from_panorama"]]
@@ -472,15 +433,9 @@ def _solve_panoramas(folder: Path, task: dict[str, Any]) -> None:
     rig = []
     with pycolmap.Database.open(database) as db:
         for view, rotation in enumerate(rotations):
-            camera = pycolmap.Camera(
-                model="PINHOLE",
-                width=side,
-                height=side,
-                params=[focal_px, focal_px, side / 2, side / 2],
-            )
-            camera.has_prior_focal_length = True
+            params = [focal_px, focal_px, side / 2, side / 2]
             names = [f"{view:02d}/{number:06d}.jpg" for number in range(task["panoramas"])]
-            names_of_camera[db.write_camera(camera)] = names
+            names_of_camera[_added_camera(db, "PINHOLE", (side, side), params)] = names
             sensor = pycolmap.RigConfigCamera(ref_sensor=view == 0, image_prefix=f"{view:02d}/")
             if view:
                 turned = rotation @ rotations[0].T
@@ -507,21 +462,20 @@ def _place(
 
     Many photos are placed all at once first, which takes a fraction of the time.
     """
-    if total > EXHAUSTIVE_LIMIT:
-        models = place_at_once(database, folder, task["seed"], total)
-        model, said = _best_of(folder, database, task, models, "global")
-        enough = model is not None and model.num_reg_images() >= _MIN_REGISTERED_SHARE * total
-        if enough and not check_solution(database, model).is_doubtful:
-            return model, said
-        one_by_one, other = _place_one_by_one(folder, database, task, total, guessed)
-        if model is None or (
-            one_by_one is not None
-            and check_solution(database, one_by_one).agreeing
-            > check_solution(database, model).agreeing
-        ):
-            return one_by_one, other
+    if total <= EXHAUSTIVE_LIMIT:
+        return _place_one_by_one(folder, database, task, total, guessed)
+    models = place_at_once(database, folder, task["seed"], total)
+    model, said = _best_of(folder, database, task, models, "global")
+    enough = model is not None and model.num_reg_images() >= _MIN_REGISTERED_SHARE * total
+    if enough and not check_solution(database, model).is_doubtful:
         return model, said
-    return _place_one_by_one(folder, database, task, total, guessed)
+    one_by_one, other = _place_one_by_one(folder, database, task, total, guessed)
+    if model is None or (
+        one_by_one is not None
+        and check_solution(database, one_by_one).agreeing > check_solution(database, model).agreeing
+    ):
+        return one_by_one, other
+    return model, said
 
 
 def _place_one_by_one(
@@ -529,7 +483,6 @@ def _place_one_by_one(
 ) -> tuple[Any, dict[str, Any]]:
     """Try focal lengths, where EXIF gives none, until most photos can be placed."""
     pycolmap = import_pycolmap()
-
     best: list[Any] = []
     factors = DEFAULT_FOCAL_FACTORS if guessed else DEFAULT_FOCAL_FACTORS[:1]
     attempts = [(factor, False) for factor in factors] + [(factors[0], True)]
@@ -579,8 +532,7 @@ def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) ->
     if groups:
         emit(fraction=MATCH_END, message="separating what turns from what stands still")
         verify_again(database, task, is_turntable=True)
-        turn = are_turning(most_inliers(database, names, pairs))
-        if task["turntable"] == "auto" and not turn:
+        if task["turntable"] == "auto" and not are_turning(most_inliers(database, names, pairs)):
             verify_again(database, task, is_turntable=False)
             groups, names = [], []
     found: dict[str, Any] = {"photos": len(names), "is_masked": False}
@@ -602,7 +554,6 @@ def _leave_out_background(folder: Path, database: Path, task: dict[str, Any]) ->
 
 def _triangulate(folder: Path, task: dict[str, Any]) -> None:
     pycolmap = import_pycolmap()
-
     database = folder / "database.db"
     photos_of_lens: dict[tuple[float, ...], list[str]] = {}
     for photo in task["photos"]:
@@ -611,36 +562,19 @@ def _triangulate(folder: Path, task: dict[str, Any]) -> None:
     names_of_camera: dict[int, list[str]] = {}
     with pycolmap.Database.open(database) as db:
         for (width, height, *params), names in photos_of_lens.items():
-            camera = pycolmap.Camera(
-                model="PINHOLE", width=int(width), height=int(height), params=params
-            )
-            camera.has_prior_focal_length = True
-            names_of_camera[db.write_camera(camera)] = names
+            names_of_camera[_added_camera(db, "PINHOLE", (int(width), int(height)), params)] = names
     extract(folder, database, names_of_camera, task["threads"], _MAX_FEATURES_POSED)
     match(folder, database, task)
     pose_of_name = {p["name"]: np.array(p["cam_from_world"]) for p in task["photos"]}
-    posed = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as db:
-        for camera in db.read_all_cameras():
-            posed.add_camera_with_trivial_rig(camera)
-        for stored in db.read_all_images():
-            image = pycolmap.Image(
-                name=stored.name, camera_id=stored.camera_id, image_id=stored.image_id
-            )
-            pose = pycolmap.Rigid3d(pose_of_name[stored.name])
-            posed.add_image_with_trivial_frame(image, pose)
+        poses = {stored.image_id: pose_of_name[stored.name] for stored in db.read_all_images()}
     emit(fraction=MATCH_END, message="triangulating points")
-    options = mapping_options(task["seed"])
-    # Keep the poses of the input: bundle adjustment may move points only.
-    solved = pycolmap.triangulate_points(
-        posed, database, folder / "images", folder, clear_points=True, options=options
-    )
+    solved = _triangulated(database, folder, folder, task["seed"], poses, lambda stored: stored)
     solved.extract_colors_for_all_images(folder / "images")
     _write(folder, solved)
 
 
 def _write(folder: Path, model: Any) -> None:
-    output = folder / "model"
-    output.mkdir()
-    model.write_binary(output)
+    (folder / "model").mkdir()
+    model.write_binary(folder / "model")
     emit(fraction=1.0, message="cameras are solved")

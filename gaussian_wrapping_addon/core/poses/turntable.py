@@ -14,12 +14,11 @@ from scipy.ndimage import maximum_filter
 
 from ..compiled import kernel
 from ..parallel import even_bounds, run_chunks
-from ..photos.photo_file import read_photo
+from ..photos.photo_file import large_parts, read_photo
 from ..readers.lenses import import_pycolmap
 from .checks import MIN_GROUP, pair_motion, standing_groups
 
 # -- Masks of what turns before a camera that stands still: what differs from the background ------
-
 
 MAX_BACKGROUND_PHOTOS = 32
 """Photos, evenly spread, that the background is found from: memory and time stay bounded."""
@@ -54,20 +53,12 @@ def masks_of_turning(
 ) -> list[np.ndarray]:
     """Return (h, w) bool masks, true where a photo shows the turning object.
 
-    Parameters
-    ----------
-    count : int
-        Number of photos, all of one size and from one place.
-    read : callable
-        The (h, w, 3) uint8 photo of a number.
-    step : callable
-        Told the share that is done.
+    ``count``: number of photos, all of one size and from one place. ``read``: the (h, w, 3) uint8
+    photo of a number. ``step``: told the share that is done.
 
-    Notes
-    -----
     The background of a pixel is the colour that most photos agree on (docs/method.md, section 12):
-    a median would show the object wherever it covers a pixel in more than half of them. Where
-    few agree, the object is always there.
+    a median would show the object wherever it covers a pixel in more than half of them. Where few
+    agree, the object is always there.
     """
     chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_BACKGROUND_PHOTOS)).astype(int))
     stack = []
@@ -106,16 +97,9 @@ def masks_of_turning(
 def steady_colors(photos: np.ndarray, threads: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the colour that most of the photos agree on, for each pixel.
 
-    Parameters
-    ----------
-    photos : (n, h, w, 3) uint8
-
-    Returns
-    -------
-    colors : (h, w, 3) float32
-        Mean of those that agree.
-    support : (h, w) int32
-        How many agree.
+    ``photos``: (n, h, w, 3) uint8.
+    Returns ``colors``: (h, w, 3) float32, mean of those that agree; ``support``: (h, w) int32, how
+    many agree.
     """
     colors = np.empty(photos.shape[1:], np.float32)
     support = np.empty(photos.shape[1:3], np.int32)
@@ -189,12 +173,7 @@ def whole_parts(differs: np.ndarray) -> np.ndarray:
     # Pad, so that what the border cuts is closed like the rest.
     padded = np.pad(ndimage.binary_opening(differs, np.ones((2, 2))), radius, mode="edge")
     closed = ndimage.binary_closing(padded, disc)[radius:-radius, radius:-radius]
-    label, parts = ndimage.label(closed)
-    if parts == 0:
-        return np.asarray(closed)
-    areas = np.bincount(label.ravel())
-    areas[0] = 0
-    return (areas >= SMALLEST_SHARE * areas.max())[label] & closed
+    return large_parts(np.asarray(closed), SMALLEST_SHARE)
 
 
 def without_holes(mask: np.ndarray, often: np.ndarray) -> np.ndarray:
@@ -211,7 +190,6 @@ def without_holes(mask: np.ndarray, often: np.ndarray) -> np.ndarray:
 #
 # Runs in the helper process of :mod:`.solver`.
 
-
 MIN_MATCHES_INSIDE = 0.8
 """Share of the matches that turn which masks must contain; else something that turns looks the same
 from all sides, and the masks would cut it away."""
@@ -225,15 +203,10 @@ pixel."""
 def turntable_groups(database: Path, task: Mapping[str, Any]) -> list[list[str]]:
     """Return names of photos from cameras that stand still before something that turns.
 
-    Parameters
-    ----------
-    database : Path
-        With matches.
-    task : mapping
-        ``turntable`` ("auto", "on" or "off"), ``groups`` of one lens and size, and ``pairs``.
+    ``database``: with matches. ``task``: ``turntable`` ("auto", "on" or "off"), ``groups`` of one
+    lens and size, and ``pairs``.
     """
     pycolmap = import_pycolmap()
-
     if task["turntable"] == "off":
         return []
     if task["turntable"] == "on":
@@ -261,12 +234,7 @@ def turning_masks(
 ) -> dict[str, np.ndarray]:
     """Return a (h, w) bool mask of what turns for each photo of the groups.
 
-    Parameters
-    ----------
-    photos : Path
-        Their folder.
-    step : callable
-        Told the share that is done.
+    ``photos``: their folder. ``step``: told the share that is done.
     """
     masks: dict[str, np.ndarray] = {}
     for number, group in enumerate(groups):
@@ -287,7 +255,6 @@ def most_inliers(
 ) -> list[int]:
     """Return for each of the photos how many verified matches it has with another one, at most."""
     pycolmap = import_pycolmap()
-
     most = dict.fromkeys(names, 0)
     with pycolmap.Database.open(database) as db:
         for first, second, matches in _verified(db, most, pairs):
@@ -304,7 +271,6 @@ def matches_inside(
     0 where there are none.
     """
     pycolmap = import_pycolmap()
-
     inside, total = 0, 0
     with pycolmap.Database.open(database) as db:
         images = {image.name: image.image_id for image in db.read_all_images()}
@@ -342,26 +308,21 @@ def _verified(
 def drop_still_features(database: Path, masks: Mapping[str, np.ndarray]) -> None:
     """Remove the features outside of the masks, and all matches, which number features."""
     pycolmap = import_pycolmap()
-
     with pycolmap.Database.open(database) as db:
-        features = {
-            image.name: (
-                image.image_id, db.read_keypoints(image.image_id),
-                db.read_descriptors(image.image_id),
-            )
+        features = [
+            (image, db.read_keypoints(image.image_id), db.read_descriptors(image.image_id))
             for image in db.read_all_images()
-        }  # fmt: skip
-        for clear in (
-            db.clear_two_view_geometries, db.clear_matches, db.clear_descriptors,
-            db.clear_keypoints,
-        ):  # fmt: skip
-            clear()
-        for name, (image_id, keypoints, descriptors) in features.items():
-            if name in masks:
-                kept = _inside(keypoints, _grown(masks[name]))
+        ]
+        db.clear_two_view_geometries()
+        db.clear_matches()
+        db.clear_descriptors()
+        db.clear_keypoints()
+        for image, keypoints, descriptors in features:
+            if image.name in masks:
+                kept = _inside(keypoints, _grown(masks[image.name]))
                 keypoints, descriptors.data = keypoints[kept], descriptors.data[kept]
-            db.write_keypoints(image_id, keypoints)
-            db.write_descriptors(image_id, descriptors)
+            db.write_keypoints(image.image_id, keypoints)
+            db.write_descriptors(image.image_id, descriptors)
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:

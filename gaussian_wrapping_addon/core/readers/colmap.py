@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -16,7 +17,7 @@ from ..progress import LEFT_OUT_HINT, ReportWarning
 from ..scene.camera import rotation_from_quaternion
 from . import colmap_binary, colmap_text
 from .colmap_binary import RawImage, RawPoints
-from .source_model import LensCamera, PosedPhoto, SourceModel
+from .source_model import COLMAP, LensCamera, PosedPhoto, SourceModel
 
 _LAYOUTS = ("sparse", "colmap/sparse", ".")
 _EXAMPLES = 3
@@ -34,6 +35,11 @@ class ModelFiles:
         """Return the path of ``cameras``, ``images`` or ``points3D``."""
         return self.folder / f"{stem}{self.suffix}"
 
+    @property
+    def reader(self) -> ModuleType:
+        """The module that reads files of this suffix."""
+        return colmap_binary if self.suffix == ".bin" else colmap_text
+
 
 def find_models(source: Path) -> list[ModelFiles]:
     """List the models under ``source``: in ``sparse/0..``, ``sparse`` and ``source`` itself.
@@ -45,14 +51,9 @@ def find_models(source: Path) -> list[ModelFiles]:
         root = source / layout
         if not root.is_dir():
             continue
-        numbered = sorted(
-            (p for p in root.iterdir() if p.name.isdecimal() and p.is_dir()),
-            key=lambda p: int(p.name),
-        )
-        found = [m for folder in numbered if (m := _model_in(folder)) is not None]
-        own = _model_in(root)
-        if own is not None:
-            found.append(own)
+        numbered = [p for p in root.iterdir() if p.name.isdecimal() and p.is_dir()]
+        folders = [*sorted(numbered, key=lambda p: int(p.name)), root]
+        found = [m for folder in folders if (m := _model_in(folder)) is not None]
         if found:
             return found
     return []
@@ -68,47 +69,28 @@ def _model_in(folder: Path) -> ModelFiles | None:
 def read_colmap(source: Path) -> SourceModel:
     """Read the largest usable COLMAP model under ``source``.
 
-    Raises
-    ------
-    DatasetError
-        There is no model, or it has no usable image.
-    ParseError
-        A file is truncated or broken; names the byte or line.
+    Raises DatasetError: there is no model, or it has no usable image; ParseError: a file is
+    truncated or broken; names the byte or line.
     """
     models = find_models(source)
     if not models:
-        raise DatasetError(
-            f"{source.name} holds no COLMAP model.",
-            "Expected: cameras, images and points3D (.bin or .txt) in sparse/0, sparse or here.",
-        )
+        hint = "Expected: cameras, images and points3D (.bin or .txt) in sparse/0, sparse or here."
+        raise DatasetError(f"{source.name} holds no COLMAP model.", hint)
     warnings: list[ReportWarning] = []
     chosen = models[0]
     if len(models) > 1:
         chosen, counts = _largest(models, warnings)
-        listed = ", ".join(
-            f"{m.folder.relative_to(source).as_posix()} ({n})"
-            for m, n in zip(models, counts, strict=True)
-        )
-        name = chosen.folder.relative_to(source).as_posix()
-        warnings.append(
-            ReportWarning(
-                "several-models",
-                f"The input holds {len(models)} models: {listed}; {name} was used.",
-                "Take photos that connect the parts, so that one model holds them all.",
-            )
-        )
+        names = [m.folder.relative_to(source).as_posix() for m in models]
+        listed = ", ".join(f"{name} ({n})" for name, n in zip(names, counts, strict=True))
+        used = chosen.folder.relative_to(source).as_posix()
+        text = f"The input holds {len(models)} models: {listed}; {used} was used."
+        hint = "Take photos that connect the parts, so that one model holds them all."
+        warnings.append(ReportWarning("several-models", text, hint))
     model = read_model(chosen)
     facts = {"model": chosen.folder.relative_to(source).as_posix() or ".", **model.facts}
     if chosen.suffix == ".bin" and (chosen.folder / "images.txt").is_file():
         facts["model_files"] = "binary (text files were also present)"
-    return SourceModel(
-        model.kind,
-        model.photos,
-        model.points,
-        model.point_colors,
-        (*warnings, *model.warnings),
-        facts,
-    )
+    return dataclasses.replace(model, warnings=(*warnings, *model.warnings), facts=facts)
 
 
 def _largest(
@@ -118,7 +100,7 @@ def _largest(
     counts, failure = [], None
     for model in models:
         try:
-            images, _ = _reader(model).read_images(model.path("images"))
+            images, _ = model.reader.read_images(model.path("images"))
             counts.append(len(images))
         except ParseError as error:
             failure = failure or error
@@ -130,40 +112,29 @@ def _largest(
     return models[int(np.argmax(counts))], counts
 
 
-def _reader(model: ModelFiles) -> ModuleType:
-    return colmap_binary if model.suffix == ".bin" else colmap_text
-
-
 def read_model(model: ModelFiles) -> SourceModel:
     """Read one model; unusable images and points are left out with counted warnings.
 
-    Raises
-    ------
-    ParseError, DatasetError
+    Raises ParseError, DatasetError.
     """
-    reader = _reader(model)
+    reader = model.reader
     cameras, warnings = reader.read_cameras(model.path("cameras"))
     images, more = reader.read_images(model.path("images"))
     warnings = [*warnings, *more]
     photos = _usable_photos(model.folder, images, cameras, warnings)
     if not photos:
-        raise DatasetError(
-            f"None of the {len(images)} images of {model.path('images').name} is usable.",
-            " ".join([*(warning.text for warning in warnings[-1:]), "Solve the cameras again."]),
-        )
+        text = f"None of the {len(images)} images of {model.path('images').name} is usable."
+        hint = " ".join([*(warning.text for warning in warnings[-1:]), "Solve the cameras again."])
+        raise DatasetError(text, hint)
     points_path = model.path("points3D")
     if points_path.is_file():
         raw, more = reader.read_points(points_path)
         warnings.extend(more)
     else:
         raw = RawPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0))
-        warnings.append(
-            ReportWarning(
-                "points-missing",
-                f"{points_path.name} is missing; start points are made from the photos.",
-                "Export the COLMAP model together with its points.",
-            )
-        )
+        text = f"{points_path.name} is missing; start points are made from the photos."
+        hint = "Export the COLMAP model together with its points."
+        warnings.append(ReportWarning("points-missing", text, hint))
     finite = np.isfinite(raw.positions).all(1)
     if not finite.all():
         text = f"{int((~finite).sum())} points that are not finite were left out."
@@ -178,14 +149,8 @@ def read_model(model: ModelFiles) -> SourceModel:
     if weights.sum() > 0:
         error_px = float((np.where(measured, raw.errors, 0.0) * weights).sum() / weights.sum())
         facts["mean_reprojection_error_px"] = round(error_px, 3)
-    return SourceModel(
-        "COLMAP model",
-        tuple(photos),
-        raw.positions[finite],
-        raw.colors[finite],
-        tuple(warnings),
-        facts,
-    )
+    points, colors = raw.positions[finite], raw.colors[finite]
+    return SourceModel(COLMAP, tuple(photos), points, colors, tuple(warnings), facts)
 
 
 def _usable_photos(
@@ -217,8 +182,7 @@ def _usable_photos(
         seen_ids.add(image.image_id)
         seen_names.add(name)
         pose = np.concatenate([rotation, image.translation[:, None]], 1)
-        camera = cameras[image.camera_id]
-        photos.append(PosedPhoto(name, camera, pose, observed=image.observed))
+        photos.append(PosedPhoto(name, cameras[image.camera_id], pose, observed=image.observed))
     for reason, names in dropped.items():
         listed = ", ".join(names[:_EXAMPLES]) + (" ..." if len(names) > _EXAMPLES else "")
         text = f"{len(names)} images were left out for {reason}: {listed}."

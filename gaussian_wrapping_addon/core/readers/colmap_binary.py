@@ -19,7 +19,7 @@ from ..files import open_regular
 from ..progress import ReportWarning
 from .source_model import LENS_NAMES, LENS_PARAMETERS, LensCamera
 
-_AGAIN = "Export the model again, or solve the cameras from the photos."
+AGAIN = "Export the model again, or solve the cameras from the photos."
 
 _CAMERA_HEAD_BYTES = 24
 _IMAGE_BYTES = 64 + 1 + 8
@@ -72,9 +72,8 @@ class _Cursor:
             with open_regular(path, follow_links=True) as stream:
                 self.data = stream.read()
         except OSError as error:
-            raise ParseError(
-                path, "whole file", f"cannot be read: {error.strerror}.", _AGAIN
-            ) from None
+            text = f"cannot be read: {error.strerror}."
+            raise ParseError(path, "whole file", text, AGAIN) from None
         self.at = 0
 
     @property
@@ -82,7 +81,7 @@ class _Cursor:
         return len(self.data) - self.at
 
     def fail(self, message: str) -> ParseError:
-        return ParseError(self.path, f"byte {self.at}", message, _AGAIN)
+        return ParseError(self.path, f"byte {self.at}", message, AGAIN)
 
     def take(self, layout: struct.Struct, what: str) -> tuple[float, ...]:
         if self.left < layout.size:
@@ -93,16 +92,16 @@ class _Cursor:
 
     def count(self, record_bytes: int, most: int, what: str) -> int:
         """Read a 64-bit count; raise if the rest of the file cannot hold as many records."""
+        begin = self.at
         (number,) = self.take(_COUNT, f"the number of {what}")
         if number > self.left // record_bytes:
-            self.at -= _COUNT.size
-            raise self.fail(
-                f"{number} {what} are announced, but only {self.left - _COUNT.size} bytes follow."
-            )
-        if number > most:
-            self.at -= _COUNT.size
-            raise self.fail(f"{number} {what} are more than the limit of {most}.")
-        return int(number)
+            text = f"{number} {what} are announced, but only {self.left} bytes follow."
+        elif number > most:
+            text = f"{number} {what} are more than the limit of {most}."
+        else:
+            return int(number)
+        self.at = begin
+        raise self.fail(text)
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.at, self.at + _LONGEST_NAME_BYTES)
@@ -111,9 +110,6 @@ class _Cursor:
         raw = self.data[self.at : end]
         self.at = end + 1
         return raw.decode(errors="surrogateescape")
-
-    def skip(self, size_bytes: int) -> None:
-        self.at += size_bytes
 
 
 _COUNT = struct.Struct("<Q")
@@ -127,16 +123,9 @@ _NO_POINT = -1
 def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[ReportWarning]]:
     """Read ``cameras.bin``.
 
-    Returns
-    -------
-    cameras : dict
-        Camera number to camera.
-    warnings : list of ReportWarning
-
-    Raises
-    ------
-    ParseError
-        With the byte offset: cut file, impossible count, unknown model, unusable parameters.
+    Returns cameras by their numbers, and warnings.
+    Raises ParseError with the byte offset: cut file, impossible count, unknown model, unusable
+    parameters.
     """
     cursor = _Cursor(path)
     number = cursor.count(_CAMERA_HEAD_BYTES + 3 * 8, limits.MAX_IMAGES, "cameras")
@@ -162,21 +151,17 @@ def add_camera(
     cameras: dict[int, LensCamera], camera_id: int, camera: LensCamera, path: Path, place: str
 ) -> None:
     """Add a camera to ``cameras``; raise :class:`ParseError` if it is invalid."""
-    problem = camera.problem()
-    if problem:
+    if problem := camera.problem():
         raise ParseError(path, place, f"{problem}.", "Solve the cameras again.")
     if cameras.get(camera_id, camera) != camera:
-        raise ParseError(path, place, f"camera {camera_id} is defined twice.", _AGAIN)
+        raise ParseError(path, place, f"camera {camera_id} is defined twice.", AGAIN)
     cameras[camera_id] = camera
 
 
 def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
     """Read ``images.bin``; of the 2D points, those with a sparse point are counted.
 
-    Raises
-    ------
-    ParseError
-        With the byte offset where the file ends or a count cannot be true.
+    Raises ParseError with the byte offset where the file ends or a count cannot be true.
     """
     cursor = _Cursor(path)
     number = cursor.count(_IMAGE_BYTES, limits.MAX_IMAGES, "images")
@@ -188,43 +173,28 @@ def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
         points = cursor.count(_POINT2D_BYTES, 2**31, f"2D points of image {name!r}")
         entries = np.frombuffer(cursor.data, _POINT2D, points, cursor.at)
         observed = int((entries["point"] != _NO_POINT).sum())
-        cursor.skip(points * _POINT2D_BYTES)
-        images.append(
-            RawImage(
-                int(values[0]),
-                np.array(values[1:5]),
-                np.array(values[5:8]),
-                int(values[8]),
-                name,
-                f"byte {begin}",
-                observed,
-            )
-        )
+        cursor.at += points * _POINT2D_BYTES
+        quaternion, translation = np.array(values[1:5]), np.array(values[5:8])
+        image_id, camera_id, place = int(values[0]), int(values[8]), f"byte {begin}"
+        images.append(RawImage(image_id, quaternion, translation, camera_id, name, place, observed))
     return images, _rest(cursor)
 
 
 def read_points(path: Path) -> tuple[RawPoints, list[ReportWarning]]:
     """Read ``points3D.bin``; tracks are skipped, their lengths kept.
 
-    Raises
-    ------
-    ParseError
-        With the byte offset where the file ends or a count cannot be true.
+    Raises ParseError with the byte offset where the file ends or a count cannot be true.
     """
     cursor = _Cursor(path)
     number = cursor.count(_POINT_BYTES, limits.MAX_POINTS, "points")
-    positions = np.zeros((number, 3))
-    colors = np.zeros((number, 3), np.uint8)
-    errors = np.zeros(number)
-    lengths = np.zeros(number, np.int64)
+    positions, colors = np.zeros((number, 3)), np.zeros((number, 3), np.uint8)
+    errors, lengths = np.zeros(number), np.zeros(number, np.int64)
     for i in range(number):
         values = cursor.take(_POINT, f"point {i}")
         track = cursor.count(_TRACK_BYTES, 2**31, f"observations of point {i}")
-        cursor.skip(track * _TRACK_BYTES)
-        positions[i] = values[1:4]
-        colors[i] = values[4:7]
-        errors[i] = values[7]
-        lengths[i] = track
+        cursor.at += track * _TRACK_BYTES
+        positions[i], colors[i] = values[1:4], values[4:7]
+        errors[i], lengths[i] = values[7], track
     return RawPoints(positions, colors, errors, lengths), _rest(cursor)
 
 

@@ -14,10 +14,8 @@ from .. import limits
 from ..errors import ParseError
 from ..files import open_regular
 from ..progress import ReportWarning
-from .colmap_binary import RawImage, RawPoints, add_camera
+from .colmap_binary import AGAIN, RawImage, RawPoints, add_camera
 from .source_model import LENS_NAMES, LensCamera
-
-_AGAIN = "Export the model again, or solve the cameras from the photos."
 
 _NUMERIC = re.compile(r"[+-]?[0-9.]+([eE][+-]?[0-9]+)?")
 
@@ -27,14 +25,14 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
         stream = open_regular(path, follow_links=True)
     except OSError as error:
-        raise ParseError(path, "whole file", f"cannot be read: {error.strerror}.", _AGAIN) from None
+        raise ParseError(path, "whole file", f"cannot be read: {error.strerror}.", AGAIN) from None
     with stream:
         number = 0
         while raw := stream.readline(limits.MAX_LINE_BYTES * 64 + 1):
             number += 1
             # The second line of an image lists its 2D points and can be very long.
             if len(raw) > limits.MAX_LINE_BYTES * 64:
-                raise ParseError(path, f"line {number}", "the line is too long.", _AGAIN)
+                raise ParseError(path, f"line {number}", "the line is too long.", AGAIN)
             if number == 1 and raw.startswith(b"\xef\xbb\xbf"):
                 raw = raw[3:]
             text = raw.decode(errors="surrogateescape").rstrip("\r\n")
@@ -49,28 +47,23 @@ def _number(path: Path, line: int, text: str, what: str) -> float:
     except ValueError:
         if re.fullmatch(r"[+-]?(nan|inf)(\(\w*\))?", text.lower()):
             return float("nan")
-        hint = "Write decimals with a point." if "," in text else _AGAIN
-        raise ParseError(
-            path, f"line {line}", f"{text[:40]!r} is not a number ({what}).", hint
-        ) from None
+        hint = "Write decimals with a point." if "," in text else AGAIN
+        message = f"{text[:40]!r} is not a number ({what})."
+        raise ParseError(path, f"line {line}", message, hint) from None
 
 
 def _whole(path: Path, line: int, text: str, what: str) -> int:
     value = _number(path, line, text, what)
     if not (value == value and abs(value) < 2**62 and value == int(value)):
-        raise ParseError(
-            path, f"line {line}", f"{text[:40]!r} is not a whole number ({what}).", _AGAIN
-        )
+        message = f"{text[:40]!r} is not a whole number ({what})."
+        raise ParseError(path, f"line {line}", message, AGAIN)
     return int(value)
 
 
 def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[ReportWarning]]:
     """Read ``cameras.txt``.
 
-    Raises
-    ------
-    ParseError
-        With the line: unknown model, wrong number of parameters, unusable values.
+    Raises ParseError with the line: unknown model, wrong number of parameters, unusable values.
     """
     cameras: dict[int, LensCamera] = {}
     for line, text in _lines(path):
@@ -78,21 +71,19 @@ def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[ReportWarning]
         if not words:
             continue
         if len(words) < 5:
-            raise ParseError(path, f"line {line}", "a camera needs at least 5 entries.", _AGAIN)
+            raise ParseError(path, f"line {line}", "a camera needs at least 5 entries.", AGAIN)
         if words[1] not in LENS_NAMES:
             raise ParseError(
                 path, f"line {line}", f"camera model {words[1][:60]} is not supported.",
                 "Convert the photos to perspective images, or solve the cameras again.",
             )  # fmt: skip
-        camera = LensCamera(
-            words[1],
-            _whole(path, line, words[2], "width"),
-            _whole(path, line, words[3], "height"),
-            tuple(_number(path, line, word, "camera parameter") for word in words[4:]),
-        )
+        width = _whole(path, line, words[2], "width")
+        height = _whole(path, line, words[3], "height")
+        params = tuple(_number(path, line, word, "camera parameter") for word in words[4:])
         if len(cameras) >= limits.MAX_IMAGES:
-            raise ParseError(path, f"line {line}", "there are too many cameras.", _AGAIN)
+            raise ParseError(path, f"line {line}", "there are too many cameras.", AGAIN)
         camera_id = _whole(path, line, words[0], "camera number")
+        camera = LensCamera(words[1], width, height, params)
         add_camera(cameras, camera_id, camera, path, f"line {line}")
     return cameras, []
 
@@ -103,10 +94,7 @@ def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
     Where a second line was left out, the next line is not a list of 2D points (triples of
     numbers); such a file is read with a warning instead of losing every second image.
 
-    Raises
-    ------
-    ParseError
-        With the line.
+    Raises ParseError with the line.
     """
     images: list[RawImage] = []
     without_points = 0
@@ -125,37 +113,29 @@ def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
         images.append(_image(path, line, text))
         expects_points = True
         if len(images) > limits.MAX_IMAGES:
-            raise ParseError(path, f"line {line}", "there are too many images.", _AGAIN)
+            raise ParseError(path, f"line {line}", "there are too many images.", AGAIN)
     if not without_points:
         return images, []
-    lacking = f"{path.name} lacks the line of 2D points of {without_points} images"
-    text = f"{lacking}; they were read without it."
+    text = (
+        f"{path.name} lacks the line of 2D points of {without_points} images; they were read "
+        "without it."
+    )
     return images, [ReportWarning("point-lines-missing", text)]
 
 
 def _image(path: Path, line: int, text: str) -> RawImage:
     words = text.split(maxsplit=9)
     if len(words) < 10:
-        raise ParseError(path, f"line {line}", "an image needs 10 entries.", _AGAIN)
+        raise ParseError(path, f"line {line}", "an image needs 10 entries.", AGAIN)
     values = [_number(path, line, word, "pose") for word in words[1:8]]
-    return RawImage(
-        _whole(path, line, words[0], "image number"),
-        np.array(values[:4]),
-        np.array(values[4:]),
-        _whole(path, line, words[8], "camera number"),
-        words[9].rstrip(),
-        f"line {line}",
-    )
+    image_id = _whole(path, line, words[0], "image number")
+    camera_id = _whole(path, line, words[8], "camera number")
+    quaternion, translation = np.array(values[:4]), np.array(values[4:])
+    return RawImage(image_id, quaternion, translation, camera_id, words[9].rstrip(), f"line {line}")
 
 
 def read_points(path: Path) -> tuple[RawPoints, list[ReportWarning]]:
-    """Read ``points3D.txt``.
-
-    Raises
-    ------
-    ParseError
-        With the line.
-    """
+    """Read ``points3D.txt``. Raises ParseError with the line."""
     positions: list[list[float]] = []
     colors: list[list[int]] = []
     errors: list[float] = []
@@ -165,24 +145,17 @@ def read_points(path: Path) -> tuple[RawPoints, list[ReportWarning]]:
         if not words:
             continue
         if len(words) < 8 or len(words) % 2:
-            raise ParseError(
-                path, f"line {line}", "a point needs 8 entries and pairs after them.", _AGAIN
-            )
+            text = "a point needs 8 entries and pairs after them."
+            raise ParseError(path, f"line {line}", text, AGAIN)
         if len(positions) >= limits.MAX_POINTS:
-            raise ParseError(path, f"line {line}", "there are too many points.", _AGAIN)
+            raise ParseError(path, f"line {line}", "there are too many points.", AGAIN)
         positions.append([_number(path, line, word, "position") for word in words[1:4]])
         color = [_whole(path, line, word, "colour") for word in words[4:7]]
         if not all(0 <= c <= 255 for c in color):
-            raise ParseError(path, f"line {line}", "a colour is not from 0 to 255.", _AGAIN)
+            raise ParseError(path, f"line {line}", "a colour is not from 0 to 255.", AGAIN)
         colors.append(color)
         errors.append(_number(path, line, words[7], "error"))
         lengths.append((len(words) - 8) // 2)
-    return (
-        RawPoints(
-            np.array(positions, np.float64).reshape(-1, 3),
-            np.array(colors, np.uint8).reshape(-1, 3),
-            np.array(errors, np.float64),
-            np.array(lengths, np.int64),
-        ),
-        [],
-    )
+    xyz = np.array(positions, np.float64).reshape(-1, 3)
+    rgb = np.array(colors, np.uint8).reshape(-1, 3)
+    return RawPoints(xyz, rgb, np.array(errors, np.float64), np.array(lengths, np.int64)), []

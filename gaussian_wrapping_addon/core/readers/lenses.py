@@ -17,7 +17,6 @@ from .source_model import SKEWED_BROWN, LensCamera, PosedPhoto
 
 # -- The one place where pycolmap is imported -----------------------------------------------------
 
-
 _importing = threading.Lock()
 
 
@@ -26,10 +25,7 @@ def import_pycolmap() -> Any:
 
     Its own log goes to stderr, not to files.
 
-    Raises
-    ------
-    ImportError
-        It is not installed.
+    Raises ImportError: it is not installed.
     """
     # One thread at a time: another one would take the half imported module, or the handlers that it
     # has just set for those to keep.
@@ -49,7 +45,6 @@ def import_pycolmap() -> Any:
 # With ``r`` the length of the ray's slope (x, y): ``x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4
 # r^8) + 2 p1 x y + p2 (r^2 + 2 x^2)`` and y' likewise with p1 and p2 swapped; ``u = fx x' + skew
 # y' + cx``, ``v = fy y' + cy``. See docs/method.md, section 1.2.
-
 
 _STEPS = 50
 _SHORTEST_STEP = 1e-13
@@ -118,7 +113,6 @@ class SkewedBrown:
 
 # -- Fit the cameras of an input to the sizes of its photos; needs their headers only -------------
 
-
 MIN_PHOTO_SIDE_PX = 16
 
 
@@ -127,33 +121,21 @@ def fit_lens(
 ) -> tuple[LensCamera, bool, bool]:
     """Fit the intrinsics of the input to the size of the photo.
 
-    Returns
-    -------
-    lens : LensCamera
-        Intrinsics for exactly the photo's size.
-    upright : bool
-        Whether the EXIF orientation has to be applied.
-    rescaled : bool
-        Whether the photo is a scaled copy of the one described by the input.
-
-    Raises
-    ------
-    DatasetError
-        The photo's aspect ratio differs from its camera's.
+    Returns ``lens``: intrinsics for exactly the photo's size; ``upright``: whether the EXIF
+    orientation has to be applied; ``rescaled``: whether the photo is a scaled copy of the one
+    described by the input.
+    Raises DatasetError: the photo's aspect ratio differs from its camera's.
     """
     if posed.is_panorama:
-        raise DatasetError(
-            f"{file_name} is a panorama, which has no lens.", "Give photos of pinhole cameras here."
-        )
+        text = f"{file_name} is a panorama, which has no lens."
+        raise DatasetError(text, "Give photos of pinhole cameras here.")
     stored, upright = (header.width, header.height), header.upright_size
     if posed.relative is not None:
         width, height = stored if prefers_stored else upright
         lens = posed.relative.of_size(width, height)
-        problem = lens.problem()
-        if problem:
-            raise DatasetError(
-                f"The camera of {file_name}: {problem}.", "Export the cameras again."
-            )
+        if problem := lens.problem():
+            text = f"The camera of {file_name}: {problem}."
+            raise DatasetError(text, "Export the cameras again.")
         return lens, not prefers_stored, False
     if posed.lens is None:
         assert posed.angle_x is not None
@@ -181,8 +163,7 @@ def fit_lens(
 
 def same_proportions(size: tuple[int, int], lens: LensCamera) -> bool:
     """Whether ``size`` is the camera's size times a factor, up to rounding to whole pixels."""
-    tolerance = lens.width + lens.height
-    return abs(size[0] * lens.height - size[1] * lens.width) < tolerance
+    return abs(size[0] * lens.height - size[1] * lens.width) < lens.width + lens.height
 
 
 # -- Undistort photos: pinhole intrinsics of a lens model and the sampling map into the photo -----
@@ -191,7 +172,6 @@ def same_proportions(size: tuple[int, int], lens: LensCamera) -> bool:
 # validated before, see :meth:`~.source_model.LensCamera.problem`. The pinhole image
 # shows the largest axis-parallel rectangle, in normalised coordinates, that the photo fills
 # without a black border.
-
 
 _MAX_SLOPE = math.tan(math.radians(65.0))
 """Fields of view are limited to 130 degrees: a planar image would waste its pixels on the rim."""
@@ -206,10 +186,7 @@ _ROUND_TRIP_PX = 0.1
 def pinhole_of(camera: LensCamera) -> LensCamera:
     """Return the PINHOLE camera that a photo of ``camera`` is resampled to.
 
-    Raises
-    ------
-    DatasetError
-        The distortion leaves no usable rectangle.
+    Raises DatasetError: the distortion leaves no usable rectangle.
     """
     if camera.is_pinhole:
         (fx, fy), (cx, cy) = camera.focal, camera.principal_point
@@ -229,10 +206,8 @@ def pinhole_of(camera: LensCamera) -> LensCamera:
 def sampling_map(camera: LensCamera, pinhole: LensCamera) -> np.ndarray:
     """Return the photo coordinates of each pixel of the pinhole image.
 
-    Returns
-    -------
-    (height, width, 2) float32
-        Pixel coordinates x, y in the photo of ``camera``, first pixel's centre at (0.5, 0.5).
+    Returns (height, width, 2) float32, pixel coordinates x, y in the photo of ``camera``, first
+    pixel's centre at (0.5, 0.5).
     """
     fx, fy, cx, cy = pinhole.params
     out = np.zeros((pinhole.height, pinhole.width, 2), np.float32)
@@ -243,8 +218,7 @@ def sampling_map(camera: LensCamera, pinhole: LensCamera) -> np.ndarray:
         rays = np.ones((end - begin, pinhole.width, 3))
         rays[..., 0] = x
         rays[..., 1] = ((np.arange(begin, end) + 0.5 - cy) / fy)[:, None]
-        pixels = project(camera, rays.reshape(-1, 3)).reshape(end - begin, pinhole.width, 2)
-        out[begin:end] = pixels
+        out[begin:end] = project(camera, rays.reshape(-1, 3)).reshape(end - begin, pinhole.width, 2)
     if not np.isfinite(out).all():
         raise _unusable(camera)
     return out
@@ -256,8 +230,7 @@ def pinhole_pixels(camera: LensCamera, pinhole: LensCamera, pixels: np.ndarray) 
     if camera.is_pinhole:
         return pixels
     fx, fy, cx, cy = pinhole.params
-    slopes = np.asarray(_native(camera).cam_from_img(pixels), np.float64)
-    return slopes * (fx, fy) + (cx, cy)
+    return np.asarray(_native(camera).cam_from_img(pixels), np.float64) * (fx, fy) + (cx, cy)
 
 
 def project(camera: LensCamera, points: np.ndarray) -> np.ndarray:
@@ -270,7 +243,6 @@ def _native(camera: LensCamera) -> Any:
     if camera.model == SKEWED_BROWN:
         return SkewedBrown(camera)
     pycolmap = import_pycolmap()
-
     return pycolmap.Camera(
         model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
     )
@@ -315,8 +287,7 @@ def _slopes(camera: LensCamera, pixels: np.ndarray) -> np.ndarray:
         found = np.asarray(lens.cam_from_img(trial), np.float64)
         good = np.isfinite(found).all(1) & (np.abs(found).max(1) <= _MAX_SLOPE)
         rays = np.concatenate([np.where(good[:, None], found, 0.0), np.ones((len(found), 1))], 1)
-        back = project(camera, rays)
-        good &= np.abs(back - trial).max(1) <= _ROUND_TRIP_PX
+        good &= np.abs(project(camera, rays) - trial).max(1) <= _ROUND_TRIP_PX
         slopes[open_rows & good] = found[open_rows & good]
         open_rows &= ~good
         if not open_rows.any():

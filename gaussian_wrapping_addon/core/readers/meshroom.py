@@ -14,22 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from .. import limits
-from ..errors import ParseError
 from ..files import read_json
-from .program_values import (
-    AGAIN,
-    PhotoList,
-    checked_lens,
-    fisheye_lens,
-    image_size,
-    number,
-    numbers,
-    pose_at,
-    relative_names,
-    rotation,
-    unsupported,
-)
+from ..scene.camera import pose_at
+from .program_values import CameraFile, PhotoList, fisheye_lens, relative_names
 from .source_model import Brown, LensCamera, SourceModel
 
 KIND = "Meshroom cameras"
@@ -59,26 +46,23 @@ def is_meshroom(path: Path) -> bool:
 def read_meshroom(path: Path) -> SourceModel:
     """Read views with their intrinsics and poses, and landmarks.
 
-    Raises
-    ------
-    ParseError
-        Names the entry, such as ``intrinsics[0].type``.
-    DatasetError
-        No photo is usable.
+    Raises ParseError, which names the entry, such as ``intrinsics[0].type``; DatasetError: no photo
+    is usable.
     """
+    file = CameraFile(path)
     values = read_json(path, most_bytes=_MAX_BYTES, follow_links=True)
     if not isinstance(values, dict) or "views" not in values:
-        raise ParseError(path, "top level", "an object with views was expected.", AGAIN)
+        raise file.wrong("top level", "an object with views was expected.")
     version = tuple(
-        int(number(path, "version", part)) for part in _list(path, values, "version") or (1, 0, 0)
+        int(file.number("version", part)) for part in _list(file, values, "version") or (1, 0, 0)
     )
-    views = _list(path, values, "views")
+    views = _list(file, values, "views")
     photos = PhotoList(path)
     photos.check_count("views", len(views))
-    poses = _poses(path, _list(path, values, "poses"))
+    poses = _poses(file, _list(file, values, "poses"))
     intrinsics = {
         str(entry.get("intrinsicId")): (f"intrinsics[{i}]", entry)
-        for i, entry in enumerate(_list(path, values, "intrinsics"))
+        for i, entry in enumerate(_list(file, values, "intrinsics"))
     }
     lenses: dict[str, LensCamera] = {}
     names = relative_names(str(view.get("path", "")) for view in views)
@@ -89,16 +73,17 @@ def read_meshroom(path: Path) -> SourceModel:
             photos.leave_out(name, "not being placed")
             continue
         if "rigId" in view and str(view["rigId"]) != str(2**32 - 1):
-            raise unsupported(path, f"views[{i}].rigId", "a rig", "Solve without rigs.")
+            raise file.unsupported(f"views[{i}].rigId", "a rig", "Solve without rigs.")
         if lens_id not in lenses:
             if lens_id not in intrinsics:
-                raise ParseError(
-                    path, f"views[{i}].intrinsicId", "not among the intrinsics.", AGAIN
-                )
-            lenses[lens_id] = _lens(path, *intrinsics[lens_id], version)
+                place = f"views[{i}].intrinsicId"
+                raise file.wrong(place, "not among the intrinsics.")
+            lenses[lens_id] = _lens(file, *intrinsics[lens_id], version)
         photos.add(name, lenses[lens_id], poses[pose_id])
     usable = photos.finished()
-    points, colors = _points(path, _list(path, values, "structure"))
+    landmarks = _list(file, values, "structure")
+    named = ((f"structure[{i}]", entry) for i, entry in enumerate(landmarks))
+    points, colors = file.points("structure", named, "X", len(landmarks))
     facts = {
         "views": len(views),
         "camera_models": sorted({lens.model for lens in lenses.values()}),
@@ -107,21 +92,21 @@ def read_meshroom(path: Path) -> SourceModel:
     return SourceModel(KIND, usable, points, colors, tuple(photos.warnings), facts)
 
 
-def _list(path: Path, values: dict[str, Any], key: str) -> list[Any]:
+def _list(file: CameraFile, values: dict[str, Any], key: str) -> list[Any]:
     """Return a list of the file, empty where it is missing or the text that stands for none."""
     found = values.get(key, [])
     if found == "":
         return []
     if not isinstance(found, list):
-        raise ParseError(path, key, "a list was expected.", AGAIN)
+        raise file.wrong(key, "a list was expected.")
     if key != "version":
         for i, entry in enumerate(found):
             if not isinstance(entry, dict):
-                raise ParseError(path, f"{key}[{i}]", "an object was expected.", AGAIN)
+                raise file.wrong(f"{key}[{i}]", "an object was expected.")
     return found
 
 
-def _poses(path: Path, entries: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
+def _poses(file: CameraFile, entries: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
     """Return (3, 4) cam_from_world of each pose's number."""
     poses = {}
     for i, entry in enumerate(entries):
@@ -129,70 +114,54 @@ def _poses(path: Path, entries: Sequence[dict[str, Any]]) -> dict[str, np.ndarra
         pose = entry.get("pose")
         transform = pose.get("transform") if isinstance(pose, dict) else None
         if not isinstance(transform, dict):
-            raise ParseError(path, place, "an object was expected.", AGAIN)
-        written = numbers(path, f"{place}.rotation", transform.get("rotation"), 9)
-        turned = rotation(path, f"{place}.rotation", written.reshape(3, 3).T)
-        center = numbers(path, f"{place}.center", transform.get("center"), 3)
+            raise file.wrong(place, "an object was expected.")
+        written = file.numbers(f"{place}.rotation", transform.get("rotation"), 9)
+        turned = file.rotation(f"{place}.rotation", written.reshape(3, 3).T)
+        center = file.numbers(f"{place}.center", transform.get("center"), 3)
         poses[str(entry.get("poseId"))] = pose_at(turned, center)
     return poses
 
 
-def _lens(path: Path, place: str, entry: dict[str, Any], version: tuple[int, ...]) -> LensCamera:
-    width, height = image_size(path, place, entry.get("width"), entry.get("height"))
+def _lens(
+    file: CameraFile, place: str, entry: dict[str, Any], version: tuple[int, ...]
+) -> LensCamera:
+    width, height = file.image_size(place, entry.get("width"), entry.get("height"))
     written = str(entry.get("type", "pinhole"))
-    kind = (
-        str(entry["distortionType"]) if "distortionType" in entry else _OLD_TYPES.get(written, "")
-    )
+    kind = str(entry.get("distortionType", _OLD_TYPES.get(written, "")))
     if written not in _OLD_TYPES or kind not in _COUNTS:
-        raise unsupported(path, f"{place}.type", f"the lens {written} {kind}".strip(), _OTHER_LENS)
+        raise file.unsupported(f"{place}.type", f"the lens {written} {kind}".strip(), _OTHER_LENS)
     if str(entry.get("undistortionType", "none")) != "none":
-        raise unsupported(path, f"{place}.undistortionType", "a lens grid", _OTHER_LENS)
-    focal = _focal(path, place, entry, version, width)
-    principal = numbers(path, f"{place}.principalPoint", entry.get("principalPoint"), 2)
+        raise file.unsupported(f"{place}.undistortionType", "a lens grid", _OTHER_LENS)
+    focal = _focal(file, place, entry, version, width)
+    principal = file.numbers(f"{place}.principalPoint", entry.get("principalPoint"), 2)
     if version >= (1, 2, 1):
         principal = principal + np.array([0.5 * width, 0.5 * height])
     center = float(principal[0]) + _HALF_PIXEL, float(principal[1]) + _HALF_PIXEL
     params = entry.get("distortionParams") or []
-    k = numbers(path, f"{place}.distortionParams", params, _COUNTS[kind]).tolist()
+    k = file.numbers(f"{place}.distortionParams", params, _COUNTS[kind]).tolist()
     if kind == "fisheye4":
         lens = fisheye_lens(width, height, focal, center, (k[0], k[1], k[2], k[3]))
-    elif kind == "brown":
-        brown = Brown(k[0], k[1], k[2], p1=k[3], p2=k[4])
-        lens = brown.lens(width, height, focal, center)
     else:
-        lens = Brown(*k).lens(width, height, focal, center)
-    return checked_lens(path, place, lens)
+        brown = Brown(k[0], k[1], k[2], p1=k[3], p2=k[4]) if kind == "brown" else Brown(*k)
+        lens = brown.lens(width, height, focal, center)
+    return file.lens(place, lens)
 
 
 def _focal(
-    path: Path, place: str, entry: dict[str, Any], version: tuple[int, ...], width: int
+    file: CameraFile, place: str, entry: dict[str, Any], version: tuple[int, ...], width: int
 ) -> tuple[float, float]:
     """Return the focal lengths in pixels, which versions of the file write in four ways."""
     if version < (1, 2, 2):
         written = entry.get("pxFocalLength")
         if isinstance(written, list):
-            fx, fy = numbers(path, f"{place}.pxFocalLength", written, 2)
+            fx, fy = file.numbers(f"{place}.pxFocalLength", written, 2)
             return float(fx), float(fy)
-        fx = number(path, f"{place}.pxFocalLength", written)
+        fx = file.number(f"{place}.pxFocalLength", written)
         return fx, fx
-    length = number(path, f"{place}.focalLength", entry.get("focalLength"))
-    sensor = number(path, f"{place}.sensorWidth", entry.get("sensorWidth", "36"))
-    ratio = number(path, f"{place}.pixelRatio", entry.get("pixelRatio", "1"))
+    length = file.number(f"{place}.focalLength", entry.get("focalLength"))
+    sensor = file.number(f"{place}.sensorWidth", entry.get("sensorWidth", "36"))
+    ratio = file.number(f"{place}.pixelRatio", entry.get("pixelRatio", "1"))
     if not (length > 0 and sensor > 0 and ratio > 0):
-        raise ParseError(path, f"{place}.focalLength", "a length is not positive.", AGAIN)
+        raise file.wrong(f"{place}.focalLength", "a length is not positive.")
     fx = length / sensor * width
     return fx, fx * ratio if version >= (1, 2, 5) else fx / ratio
-
-
-def _points(path: Path, entries: Sequence[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 3) float64 positions and (n, 3) uint8 colours of the landmarks."""
-    if len(entries) > limits.MAX_POINTS:
-        raise ParseError(path, "structure", f"{len(entries)} points are too many.", AGAIN)
-    points = np.zeros((len(entries), 3))
-    colors = np.full((len(entries), 3), 128, np.uint8)
-    for i, entry in enumerate(entries):
-        points[i] = numbers(path, f"structure[{i}].X", entry.get("X"), 3)
-        if "color" in entry:
-            color = numbers(path, f"structure[{i}].color", entry["color"], 3)
-            colors[i] = color.clip(0, 255).astype(np.uint8)
-    return points, colors

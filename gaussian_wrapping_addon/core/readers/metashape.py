@@ -14,20 +14,14 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ..errors import ParseError
-from ..scene.camera import Similarity
+from ..scene.camera import Similarity, pose_at
 from .program_values import (
-    AGAIN,
+    CameraFile,
     PhotoList,
-    checked_lens,
+    begins_with,
     fisheye_lens,
-    image_size,
-    number,
-    numbers,
     read_xml,
     relative_names,
-    rotation,
-    unsupported,
 )
 from .source_model import PANORAMA, Brown, LensCamera, SourceModel
 
@@ -43,13 +37,7 @@ _NO_LENS = ("p3", "p4")
 
 def is_metashape(path: Path) -> bool:
     """Whether an XML file is of the program: its start names a document with chunks."""
-    if path.suffix.lower() != ".xml" or not path.is_file():
-        return False
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(4096)
-    except OSError:
-        return False
+    start = begins_with(path, ".xml", 4096)
     return b"<document" in start and b"<chunk" in start
 
 
@@ -65,19 +53,16 @@ class _Group:
 def read_metashape(path: Path) -> SourceModel:
     """Read the largest group of cameras in one frame; the file holds no points.
 
-    Raises
-    ------
-    ParseError
-        Names the camera or sensor and the entry.
-    DatasetError
-        No photo is usable.
+    Raises ParseError, which names the camera or sensor and the entry; DatasetError: no photo is
+    usable.
     """
+    file = CameraFile(path)
     root = read_xml(path)
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")
     if root.tag not in ("document", "chunk") or not chunks:
-        raise ParseError(path, "top level", "a document with a chunk was expected.", _CHOOSE)
+        raise file.wrong("top level", "a document with a chunk was expected.", _CHOOSE)
     photos = PhotoList(path)
-    groups = [(chunk, group) for chunk in chunks for group in _groups(path, chunk, photos)]
+    groups = [(chunk, group) for chunk in chunks for group in _groups(file, chunk, photos)]
     if not groups:
         photos.check_count("cameras with a transform", 0)
     chunk, chosen = max(groups, key=lambda pair: len(pair[1].cameras))
@@ -99,13 +84,12 @@ def read_metashape(path: Path) -> SourceModel:
         sensor_id = camera.get("sensor_id", "")
         if sensor_id not in lenses:
             if sensor_id not in sensors:
-                raise ParseError(path, place, "its sensor is not in the file.", AGAIN)
+                raise file.wrong(place, "its sensor is not in the file.")
             sensor = sensors[sensor_id]
             whole = sensor.get("type") == _PANORAMA
-            lenses[sensor_id] = None if whole else _lens(path, sensor)
-        pose = _pose(path, place, camera, chosen.world_from_group)
-        lens = lenses[sensor_id]
-        photos.add(names[label], lens, pose, is_panorama=lens is None)
+            lenses[sensor_id] = None if whole else _lens(file, sensor)
+        pose = _pose(file, place, camera, chosen.world_from_group)
+        photos.add(names[label], lenses[sensor_id], pose)
     usable = photos.finished()
     facts = {
         "group": chosen.label,
@@ -114,7 +98,7 @@ def read_metashape(path: Path) -> SourceModel:
     return SourceModel(KIND, usable, warnings=tuple(photos.warnings), facts=facts)
 
 
-def _groups(path: Path, chunk: Element, photos: PhotoList) -> list[_Group]:
+def _groups(file: CameraFile, chunk: Element, photos: PhotoList) -> list[_Group]:
     """Return the chunk's aligned and enabled cameras by component."""
     chunk_name = chunk.get("label") or "the chunk"
     cameras: dict[str, list[Element]] = {}
@@ -126,7 +110,7 @@ def _groups(path: Path, chunk: Element, photos: PhotoList) -> list[_Group]:
             photos.leave_out(label, "not being aligned")
         else:
             cameras.setdefault(camera.get("component_id", ""), []).append(camera)
-    of_chunk = _similarity(path, f"{chunk_name}, transform", chunk.find("transform"))
+    of_chunk = _similarity(file, f"{chunk_name}, transform", chunk.find("transform"))
     found = []
     for component_id, members in cameras.items():
         label, world_from_group = chunk_name, of_chunk
@@ -135,74 +119,74 @@ def _groups(path: Path, chunk: Element, photos: PhotoList) -> list[_Group]:
                 label = component.get("label") or f"component {component_id}"
                 own = component.find("transform")
                 if own is not None:
-                    world_from_group = _similarity(path, f"{label}, transform", own)
+                    world_from_group = _similarity(file, f"{label}, transform", own)
         found.append(_Group(label[:80], members, world_from_group))
     return found
 
 
-def _similarity(path: Path, place: str, transform: Element | None) -> Similarity:
+def _similarity(file: CameraFile, place: str, transform: Element | None) -> Similarity:
     """Read a transform: rotation, translation and scale, or a 4 x 4 matrix; none is identity."""
     if transform is None:
         return Similarity()
     text = (transform.text or "").strip()
     if text:
-        matrix = numbers(path, place, text, 16).reshape(4, 4)
+        matrix = file.numbers(place, text, 16).reshape(4, 4)
         scale = float(np.cbrt(max(np.linalg.det(matrix[:3, :3]), 0.0)))
         linear, translation = matrix[:3, :3], matrix[:3, 3]
     else:
         values = {name: transform.findtext(name) for name in ("rotation", "translation", "scale")}
-        linear = numbers(path, place, values["rotation"] or "1 0 0 0 1 0 0 0 1", 9).reshape(3, 3)
-        translation = numbers(path, place, values["translation"] or "0 0 0", 3)
-        scale = number(path, f"{place}, scale", values["scale"] or "1")
+        linear = file.numbers(place, values["rotation"] or "1 0 0 0 1 0 0 0 1", 9).reshape(3, 3)
+        translation = file.numbers(place, values["translation"] or "0 0 0", 3)
+        scale = file.number(f"{place}, scale", values["scale"] or "1")
         linear = scale * linear
     if not scale > 0:
-        raise ParseError(path, place, "the scale is not positive, or it mirrors.", AGAIN)
-    return Similarity(scale, rotation(path, place, linear / scale), translation)
+        raise file.wrong(place, "the scale is not positive, or it mirrors.")
+    return Similarity(scale, file.rotation(place, linear / scale), translation)
 
 
-def _pose(path: Path, place: str, camera: Element, world_from_group: Similarity) -> np.ndarray:
+def _pose(
+    file: CameraFile, place: str, camera: Element, world_from_group: Similarity
+) -> np.ndarray:
     """Return (3, 4) cam_from_world."""
-    matrix = numbers(path, f"{place}, transform", camera.findtext("transform") or "", 16)
-    matrix = matrix.reshape(4, 4)
+    place = f"{place}, transform"
+    matrix = file.numbers(place, camera.findtext("transform") or "", 16).reshape(4, 4)
     if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
-        raise ParseError(path, f"{place}, transform", "the last row is not 0 0 0 1.", AGAIN)
-    group_from_camera = rotation(path, f"{place}, transform", matrix[:3, :3])
+        raise file.wrong(place, "the last row is not 0 0 0 1.")
+    group_from_camera = file.rotation(place, matrix[:3, :3])
     cam_from_world = (world_from_group.rotation @ group_from_camera).T
-    center = world_from_group.points(matrix[None, :3, 3])[0]
-    return np.concatenate([cam_from_world, -(cam_from_world @ center)[:, None]], 1)
+    return pose_at(cam_from_world, world_from_group.points(matrix[None, :3, 3])[0])
 
 
-def _lens(path: Path, sensor: Element) -> LensCamera:
+def _lens(file: CameraFile, sensor: Element) -> LensCamera:
     """Return the lens of a sensor: its adjusted calibration, else the initial one."""
     place = f"sensor {(sensor.get('label') or sensor.get('id') or '')[:80]!r}"
     found = sensor.findall("calibration")
     adjusted = [entry for entry in found if entry.get("class", "adjusted") == "adjusted"]
     if not found:
-        raise ParseError(
-            path, place, "it has no calibration.", "Align the photos and export again."
-        )
+        hint = "Align the photos and export again."
+        raise file.wrong(place, "it has no calibration.", hint)
     calibration = (adjusted or found)[0]
     size = calibration.find("resolution")
     if size is None:
         size = sensor.find("resolution")
     if size is None:
-        raise ParseError(path, place, "the resolution is missing.", AGAIN)
-    width, height = image_size(path, place, size.get("width"), size.get("height"))
+        raise file.wrong(place, "the resolution is missing.")
+    width, height = file.image_size(place, size.get("width"), size.get("height"))
 
     def value(name: str) -> float:
-        return number(path, f"{place}, {name}", calibration.findtext(name) or "0")
+        return file.number(f"{place}, {name}", calibration.findtext(name) or "0")
 
     kind = calibration.get("type") or sensor.get("type") or "frame"
     if kind not in ("frame", "fisheye"):
-        raise unsupported(path, place, f"the sensor type {kind}", _CONVERT)
+        raise file.unsupported(place, f"the sensor type {kind}", _CONVERT)
     for name in _NO_LENS:
         if value(name):
-            raise unsupported(path, place, f"the coefficient {name}", "Fit p1 and p2 alone.")
+            raise file.unsupported(place, f"the coefficient {name}", "Fit p1 and p2 alone.")
     focal = value("f")
     if calibration.find("f") is None and calibration.find("fx") is not None:
-        raise unsupported(path, place, "a calibration with fx and fy", _CHOOSE)
+        raise file.unsupported(place, "a calibration with fx and fy", _CHOOSE)
     if focal <= 0:
-        raise ParseError(path, f"{place}, f", "the focal length is not positive.", AGAIN)
+        raise file.wrong(f"{place}, f", "the focal length is not positive.")
     focals = focal + value("b1"), focal
     center = 0.5 * width + value("cx"), 0.5 * height + value("cy")
     k1, k2, k3, k4, p1, p2 = (value(name) for name in _COEFFICIENTS)
@@ -212,7 +196,7 @@ def _lens(path: Path, sensor: Element) -> LensCamera:
         brown = Brown(k1, k2, k3, k4, p1=p2, p2=p1, skew=skew)
         lens = brown.lens(width, height, focals, center)
     elif skew:
-        raise unsupported(path, place, "b2 of a fisheye", "Fit the cameras without b2.")
+        raise file.unsupported(place, "b2 of a fisheye", "Fit the cameras without b2.")
     else:
         lens = fisheye_lens(width, height, focals, center, (k1, k2, k3, k4), (p2, p1))
-    return checked_lens(path, place, lens)
+    return file.lens(place, lens)

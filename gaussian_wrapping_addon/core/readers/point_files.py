@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,23 +15,14 @@ from ..ply import PlyHeader, read_ply_header, read_vertices
 
 # -- Bounded reader of a point cloud in PLY format (the ``ply_file_path`` of transforms.json) -----
 
-
 _AGAIN = "Export the points again as PLY with x, y, z."
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read positions and colours of a PLY's vertices (ASCII or binary).
 
-    Returns
-    -------
-    points : (n, 3) float64
-    colors : (n, 3) uint8
-        Grey where the file has none.
-
-    Raises
-    ------
-    ParseError
-        With the place in the file.
+    Returns ``points``: (n, 3) float64; ``colors``: (n, 3) uint8, grey where the file has none.
+    Raises ParseError with the place in the file.
     """
     header = read_ply_header(path, _AGAIN)
     rows = read_vertices(path, header, _AGAIN, limits.MAX_POINTS)
@@ -67,7 +57,6 @@ def _as_declared(header: PlyHeader, table: np.ndarray) -> np.ndarray:
 
 # -- Tell from its header whether a file is a 3D Gaussian splat, and of which known variant -------
 
-
 MAX_FILE_DEGREE = 4
 """Highest degree of the harmonics that files are known to have."""
 
@@ -76,14 +65,10 @@ EXPECTED = (
     "rot_0..3, as Inria's code, gsplat, nerfstudio and SuperSplat (uncompressed) write them."
 )
 
+_NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
 _UNPACK = "Open it in a splat editor, such as SuperSplat, and export it as an uncompressed PLY."
 
-OTHER_FORMATS = {
-    ".spz": "SPZ",
-    ".splat": "antimatter15 .splat",
-    ".ksplat": "KSPLAT",
-    ".sog": "SOG",
-}
+OTHER_FORMATS = {".spz": "SPZ", ".splat": "antimatter15 .splat", ".ksplat": "KSPLAT", ".sog": "SOG"}
 """Splats in formats that are not read, by suffix."""
 
 
@@ -113,29 +98,20 @@ class SplatHeader:
 def is_splat_path(path: Path) -> bool:
     """Tell by its suffix whether a file may be a splat; raise for unsupported splat formats.
 
-    Raises
-    ------
-    DatasetError
-        A splat in a compressed or other format.
+    Raises DatasetError: a splat in a compressed or other format.
     """
     suffix = path.suffix.lower()
     if suffix in OTHER_FORMATS:
-        raise DatasetError(
-            f"{path.name} is a splat in {OTHER_FORMATS[suffix]} format, which is not supported.",
-            _UNPACK,
-        )
+        text = f"{path.name} is a splat in {OTHER_FORMATS[suffix]} format, which is not supported."
+        raise DatasetError(text, _UNPACK)
     return suffix == ".ply"
 
 
 def read_splat_header(path: Path) -> SplatHeader:
     """Read the header of a splat PLY, with its properties in any order and others beside them.
 
-    Raises
-    ------
-    ParseError
-        The file is not a splat (names the missing property), or a compressed variant.
-    DatasetError
-        The suffix is that of another splat format, or there are no Gaussians.
+    Raises ParseError: the file is not a splat (names the missing property), or a compressed
+    variant; DatasetError: the suffix is that of another splat format, or there are no Gaussians.
     """
     is_splat_path(path)
     ply = read_ply_header(path, EXPECTED)
@@ -147,22 +123,17 @@ def read_splat_header(path: Path) -> SplatHeader:
     if ply.elements[0].name != "vertex":
         raise ParseError(path, "header", "the vertices do not come first.", EXPECTED)
     names = set(elements["vertex"].names)
-    if "f_dc_0" not in names and {"red", "green", "blue"} <= names:
-        colors: tuple[str, ...] = ("red", "green", "blue")
-    else:
-        colors = ("f_dc_0", "f_dc_1", "f_dc_2")
-    wanted = [
-        *("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"),
-        *colors,
-    ]
-    missing = [name for name in wanted if name not in names]
+    plain = "f_dc_0" not in names and {"red", "green", "blue"} <= names
+    colors = ("red", "green", "blue") if plain else ("f_dc_0", "f_dc_1", "f_dc_2")
+    missing = [name for name in (*_NEEDED, *colors) if name not in names]
     if missing:
+        is_cloud = {"x", "y", "z"} <= names
+        what = "a mesh" if "face" in elements else "a point cloud" if is_cloud else "another PLY"
         raise ParseError(
-            path, "header", f"not a splat but {_described(elements, names)}: property "
+            path, "header", f"not a splat but {what}: property "
             f"{', '.join(missing[:3])} is missing.", EXPECTED,
         )  # fmt: skip
-    axes = 3 if "scale_2" in names else 2
-    header = SplatHeader(ply, _degree(path, names), axes, colors)
+    header = SplatHeader(ply, _degree(path, names), 3 if "scale_2" in names else 2, colors)
     if header.count == 0:
         raise DatasetError(f"{path.name} holds no Gaussians.", "Export the splat again.")
     return header
@@ -179,10 +150,3 @@ def _degree(path: Path, names: set[str]) -> int:
         f"{MAX_FILE_DEGREE} (0, 9, 24, 45 or 72 of them, numbered from 0).",
         "Export the splat again.",
     )  # fmt: skip
-
-
-def _described(elements: Container[str], names: set[str]) -> str:
-    """Describe a PLY without Gaussians."""
-    if "face" in elements:
-        return "a mesh"
-    return "a point cloud" if {"x", "y", "z"} <= names else "another PLY"

@@ -8,6 +8,7 @@ world (y up); ``fx``, ``fy``, ``cx``, ``cy`` are pixels of a photo of ``width`` 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,8 @@ from .. import limits
 from ..errors import ParseError
 from ..files import read_json
 from ..photos.formats import PHOTO_SUFFIXES
-from .program_values import AGAIN, PhotoList, checked_lens, image_size, number, pose_at, rotation
+from ..scene.camera import pose_at
+from .program_values import OPENGL_FROM_COLMAP, CameraFile, PhotoList
 from .source_model import LensCamera, SourceModel
 
 KIND = "Polycam keyframes"
@@ -28,7 +30,6 @@ _PAIRS = (
 """Folders of cameras and of their photos below ``keyframes``, the best first: corrected by the
 program's own optimisation."""
 _MAX_BYTES = 1024 * 1024
-_OPENGL_FROM_COLMAP = np.diag([1.0, -1.0, -1.0])
 
 
 def polycam_folders(source: Path) -> tuple[Path, Path] | None:
@@ -45,12 +46,7 @@ def polycam_folders(source: Path) -> tuple[Path, Path] | None:
 def read_polycam(cameras: Path, photo_folder: Path) -> SourceModel:
     """Read one camera a file; there are no points.
 
-    Raises
-    ------
-    ParseError
-        Names the file and the entry.
-    DatasetError
-        No photo is usable.
+    Raises ParseError, which names the file and the entry; DatasetError: no photo is usable.
     """
     files = []
     for path in cameras.iterdir():
@@ -60,19 +56,20 @@ def read_polycam(cameras: Path, photo_folder: Path) -> SourceModel:
                 raise ParseError(cameras, "files", "there are too many.", "Split the capture.")
     photos = PhotoList(photo_folder / cameras.name)
     for path in sorted(files):
+        file = CameraFile(path)
         values = read_json(path, most_bytes=_MAX_BYTES, follow_links=True)
         if not isinstance(values, dict):
-            raise ParseError(path, "top level", "an object was expected.", AGAIN)
+            raise file.wrong("top level", "an object was expected.")
 
-        def value(name: str, path: Path = path, values: dict[str, object] = values) -> float:
-            return number(path, name, values.get(name))
+        def value(name: str, file: CameraFile = file, values: dict[str, Any] = values) -> float:
+            return file.number(name, values.get(name))
 
         matrix = np.array([[value(f"t_{row}{column}") for column in range(4)] for row in range(3)])
-        world_from_camera = rotation(path, "t_00 to t_22", matrix[:, :3])
-        pose = pose_at((world_from_camera @ _OPENGL_FROM_COLMAP).T, matrix[:, 3])
-        width, height = image_size(path, "photo", values.get("width"), values.get("height"))
+        world_from_camera = file.rotation("t_00 to t_22", matrix[:, :3])
+        pose = pose_at((world_from_camera @ OPENGL_FROM_COLMAP).T, matrix[:, 3])
+        width, height = file.image_size("photo", values.get("width"), values.get("height"))
         params = value("fx"), value("fy"), value("cx"), value("cy")
-        lens = checked_lens(path, "photo", LensCamera("PINHOLE", width, height, params))
+        lens = file.lens("photo", LensCamera("PINHOLE", width, height, params))
         photos.add(_photo_name(photo_folder, path.stem), lens, pose)
     photos.check_count("files", len(files))
     usable = photos.finished()
@@ -82,7 +79,5 @@ def read_polycam(cameras: Path, photo_folder: Path) -> SourceModel:
 
 def _photo_name(folder: Path, stem: str) -> str:
     """Return the name of the photo of a camera file; its stem where there is none."""
-    for suffix in PHOTO_SUFFIXES:
-        if (folder / f"{stem}{suffix}").is_file():
-            return f"{stem}{suffix}"
-    return stem
+    names = (f"{stem}{suffix}" for suffix in PHOTO_SUFFIXES)
+    return next((name for name in names if (folder / name).is_file()), stem)

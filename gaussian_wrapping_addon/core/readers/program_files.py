@@ -23,19 +23,12 @@ class _Format:
 
 
 _FORMATS = (
-    _Format(
-        opensfm.KIND, opensfm.is_opensfm, opensfm.read_opensfm, (".", "opensfm")
-    ),
+    _Format(opensfm.KIND, opensfm.is_opensfm, opensfm.read_opensfm, (".", "opensfm")),
     _Format(meshroom.KIND, meshroom.is_meshroom, meshroom.read_meshroom),
     _Format(metashape.KIND, metashape.is_metashape, metashape.read_metashape),
-    _Format(
-        realityscan.KIND, realityscan.is_csv_of_cameras, realityscan.read_csv
-    ),
-    _Format(
-        opensfm.SHOTS_KIND, opensfm.is_shots, opensfm.read_shots,
-        (".", "odm_report"),
-    ),
-)  # fmt: skip
+    _Format(realityscan.KIND, realityscan.is_csv_of_cameras, realityscan.read_csv),
+    _Format(opensfm.SHOTS_KIND, opensfm.is_shots, opensfm.read_shots, (".", "odm_report")),
+)
 
 CAMERA_FILE_SUFFIXES = (".json", ".sfm", ".xml", ".csv", ".geojson", ".xmp")
 """Of files that are inputs themselves."""
@@ -51,12 +44,7 @@ class ProgramCameras:
     photo_folders: tuple[Path, ...]
 
     def read(self) -> SourceModel:
-        """Read them.
-
-        Raises
-        ------
-        ParseError, DatasetError
-        """
+        """Read them. Raises ParseError, DatasetError."""
         if self.kind == polycam.KIND:
             return polycam.read_polycam(self.path, self.photo_folders[0])
         if self.kind == realityscan.XMP_KIND:
@@ -67,10 +55,7 @@ class ProgramCameras:
 def find_program_cameras(source: Path) -> ProgramCameras | None:
     """Return the cameras of a program that ``source`` is or holds, or ``None``.
 
-    Raises
-    ------
-    DatasetError
-        A folder holds several files of one format.
+    Raises DatasetError: a folder holds several files of one format.
     """
     if source.is_file():
         if source.suffix.lower() == ".xmp":
@@ -87,10 +72,8 @@ def find_program_cameras(source: Path) -> ProgramCameras | None:
             found = _files(source / name, form)
             if len(found) > 1:
                 listed = ", ".join(path.name for path in found[:3])
-                raise DatasetError(
-                    f"{source.name} holds {len(found)} files of kind {form.kind}: {listed}.",
-                    "Give one of these files instead of the folder.",
-                )
+                text = f"{source.name} holds {len(found)} files of kind {form.kind}: {listed}."
+                raise DatasetError(text, "Give one of these files instead of the folder.")
             if found:
                 return ProgramCameras(form.kind, found[0], _photo_folders(found[0].parent))
     return _xmp(source)
@@ -116,16 +99,8 @@ def _photo_folders(folder: Path) -> tuple[Path, ...]:
 
     OpenDroneMap writes its files into folders beside the one of the photos.
     """
-    parent = _project_photos(folder)
-    own = photo_root(folder)
-    return tuple(dict.fromkeys([*([parent] if parent else []), own, folder]))
-
-
-def _project_photos(folder: Path) -> Path | None:
-    """Return the photos' folder of an OpenDroneMap project, given its folder of camera files."""
-    if folder.name not in ("opensfm", "odm_report"):
-        return None
-    for name in PHOTO_FOLDERS:
-        if (folder.parent / name).is_dir():
-            return folder.parent / name
-    return None
+    of_project = []
+    if folder.name in ("opensfm", "odm_report"):
+        beside = [folder.parent / name for name in PHOTO_FOLDERS]
+        of_project = [path for path in beside if path.is_dir()][:1]
+    return tuple(dict.fromkeys([*of_project, photo_root(folder), folder]))

@@ -23,8 +23,9 @@ from .source_model import LensCamera, PosedPhoto, RelativeLens
 
 # -- Checked values of camera files: numbers, vectors, rotations, sizes ---------------------------
 
-
 AGAIN = "Export the cameras again."
+OPENGL_FROM_COLMAP = np.diag([1.0, -1.0, -1.0])
+"""From x right, y down, z forward to x right, y up, z back."""
 
 ROTATION_TOLERANCE = 1e-2
 """How far a matrix may be from a rotation; exporters write as few as 4 digits."""
@@ -32,97 +33,106 @@ _LARGEST = 1e15
 """Of a number in a file: the squares of larger ones leave no digits for a camera."""
 
 
-def number(path: Path, place: str, value: Any) -> float:
-    """Return a finite number, also where the file writes it as text.
+@dataclass(frozen=True)
+class CameraFile:
+    """A file of another program, with checked values of it; errors name their place there."""
 
-    Raises
-    ------
-    ParseError
-    """
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise ParseError(path, place, "a number was expected.", AGAIN)
+    path: Path
+
+    def wrong(self, place: str, text: str, hint: str = AGAIN) -> ParseError:
+        """Return the error for what is wrong at a place."""
+        return ParseError(self.path, place, text, hint)
+
+    def number(self, place: str, value: Any) -> float:
+        """Return a finite number, also where the file writes it as text. Raises ParseError."""
+        if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+            raise self.wrong(place, "a number was expected.")
+        try:
+            result = float(value)
+        except (ValueError, OverflowError):
+            raise self.wrong(place, "a number was expected.") from None
+        if not math.isfinite(result) or abs(result) > _LARGEST:
+            raise self.wrong(place, "the number is not finite, or too large.")
+        return result
+
+    def numbers(self, place: str, values: Any, count: int) -> np.ndarray:
+        """Return (count,) float64 of a list of numbers, or of a text with blanks between them.
+
+        Raises ParseError.
+        """
+        if isinstance(values, str):
+            values = values.split()
+        if not isinstance(values, Sequence) or len(values) != count:
+            raise self.wrong(place, f"{count} numbers were expected.")
+        return np.array([self.number(f"{place}[{i}]", value) for i, value in enumerate(values)])
+
+    def _whole(self, place: str, value: Any) -> int:
+        """Return a whole number of at most 10 digits. Raises ParseError."""
+        result = self.number(place, value)
+        if result != round(result) or abs(result) > 1e10:
+            raise self.wrong(place, "a whole number was expected.")
+        return round(result)
+
+    def image_size(self, place: str, width: Any, height: Any) -> tuple[int, int]:
+        """Return a photo's width and height in pixels. Raises ParseError."""
+        size = self._whole(f"{place}.width", width), self._whole(f"{place}.height", height)
+        if not all(0 < side <= limits.MAX_IMAGE_SIDE_PX for side in size):
+            raise self.wrong(place, f"image size {size[0]} x {size[1]} is out of range.")
+        return size
+
+    def rotation(self, place: str, matrix: np.ndarray) -> np.ndarray:
+        """Return the rotation nearest to a (3, 3) matrix that is one but for the digits written.
+
+        Raises ParseError: the matrix is not orthonormal, or it mirrors.
+        """
+        u, sizes, vt = np.linalg.svd(matrix)
+        nearest: np.ndarray = u @ vt
+        if np.abs(sizes - 1.0).max() > ROTATION_TOLERANCE:
+            raise self.wrong(place, "the matrix is not a rotation.")
+        if np.linalg.det(nearest) < 0:
+            raise self.wrong(place, "the matrix mirrors; a rotation was expected.")
+        return nearest
+
+    def lens(self, place: str, lens: LensCamera) -> LensCamera:
+        """Return the lens, or raise :class:`ParseError` with what makes it unusable."""
+        if problem := lens.problem():
+            raise self.wrong(place, f"{problem}.")
+        return lens
+
+    def points(
+        self, place: str, entries: Iterable[tuple[str, Any]], position: str, count: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return (n, 3) float64 positions and (n, 3) uint8 colours of the file's ``count`` points.
+
+        ``entries``: the place and the object of each, whose position has the name ``position``.
+        """
+        if count > limits.MAX_POINTS:
+            raise self.wrong(place, f"{count} points are too many.")
+        points = np.zeros((count, 3))
+        colors = np.full((count, 3), 128, np.uint8)
+        for i, (here, entry) in enumerate(entries):
+            if not isinstance(entry, dict):
+                raise self.wrong(here, "an object was expected.")
+            points[i] = self.numbers(f"{here}.{position}", entry.get(position), 3)
+            if "color" in entry:
+                color = self.numbers(f"{here}.color", entry["color"], 3)
+                colors[i] = color.clip(0, 255).astype(np.uint8)
+        return points, colors
+
+    def unsupported(self, place: str, what: str, hint: str) -> ParseError:
+        """Return the error for a lens or an option that no model here can express."""
+        return self.wrong(place, f"{what[:80]} is not supported.", hint)
+
+
+def begins_with(path: Path, suffix: str, most_bytes: int) -> bytes:
+    """Return the beginning of a file of a suffix; empty where it is none, or cannot be read."""
+    if path.suffix.lower() != suffix or not path.is_file():
+        return b""
     try:
-        result = float(value)
-    except (ValueError, OverflowError):
-        raise ParseError(path, place, "a number was expected.", AGAIN) from None
-    if not math.isfinite(result) or abs(result) > _LARGEST:
-        raise ParseError(path, place, "the number is not finite, or too large.", AGAIN)
-    return result
-
-
-def numbers(path: Path, place: str, values: Any, count: int) -> np.ndarray:
-    """Return (count,) float64 of a list of numbers, or of a text with blanks between them.
-
-    Raises
-    ------
-    ParseError
-    """
-    if isinstance(values, str):
-        values = values.split()
-    if not isinstance(values, Sequence) or len(values) != count:
-        raise ParseError(path, place, f"{count} numbers were expected.", AGAIN)
-    return np.array([number(path, f"{place}[{i}]", value) for i, value in enumerate(values)])
-
-
-def whole(path: Path, place: str, value: Any) -> int:
-    """Return a whole number of at most 10 digits.
-
-    Raises
-    ------
-    ParseError
-    """
-    result = number(path, place, value)
-    if result != round(result) or abs(result) > 1e10:
-        raise ParseError(path, place, "a whole number was expected.", AGAIN)
-    return round(result)
-
-
-def image_size(path: Path, place: str, width: Any, height: Any) -> tuple[int, int]:
-    """Return a photo's width and height in pixels.
-
-    Raises
-    ------
-    ParseError
-    """
-    size = whole(path, f"{place}.width", width), whole(path, f"{place}.height", height)
-    if not all(0 < side <= limits.MAX_IMAGE_SIDE_PX for side in size):
-        raise ParseError(path, place, f"image size {size[0]} x {size[1]} is out of range.", AGAIN)
-    return size
-
-
-def rotation(path: Path, place: str, matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to a (3, 3) matrix that is one but for the digits written.
-
-    Raises
-    ------
-    ParseError
-        The matrix is not orthonormal, or it mirrors.
-    """
-    u, sizes, vt = np.linalg.svd(matrix)
-    nearest: np.ndarray = u @ vt
-    if np.abs(sizes - 1.0).max() > ROTATION_TOLERANCE:
-        raise ParseError(path, place, "the matrix is not a rotation.", AGAIN)
-    if np.linalg.det(nearest) < 0:
-        raise ParseError(path, place, "the matrix mirrors; a rotation was expected.", AGAIN)
-    return nearest
-
-
-def pose_at(cam_from_world: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Return the (3, 4) pose of a camera with rotation (3, 3) and centre (3,)."""
-    return np.concatenate([cam_from_world, -(cam_from_world @ center)[:, None]], 1)
-
-
-def checked_lens(path: Path, place: str, lens: LensCamera) -> LensCamera:
-    """Return the lens, or raise :class:`ParseError` with what makes it unusable."""
-    problem = lens.problem()
-    if problem:
-        raise ParseError(path, place, f"{problem}.", AGAIN)
-    return lens
-
-
-def unsupported(path: Path, place: str, what: str, hint: str) -> ParseError:
-    """Return the error for a lens or an option that no model here can express."""
-    return ParseError(path, place, f"{what[:80]} is not supported.", hint)
+        with path.open("rb") as stream:
+            return stream.read(most_bytes)
+    except OSError:
+        return b""
 
 
 # -- Fisheye lenses of other programs as COLMAP's models ------------------------------------------
@@ -149,7 +159,6 @@ def fisheye_lens(
 
 # -- Bounded reader of XML: no document types, no entities, limits on size, depth and elements ----
 
-
 MAX_XML_BYTES = 64 * 1024 * 1024
 """A camera of a Metashape project takes about 1 kB: 64 MB are 60 000 of them."""
 _MAX_ELEMENTS = 4_000_000
@@ -164,18 +173,14 @@ class _RefusedError(Exception):
 def read_xml(path: Path, most_bytes: int = MAX_XML_BYTES) -> Element:
     """Read an XML file and return its root; names with a namespace are ``{uri}name``.
 
-    Raises
-    ------
-    ParseError
-        Not XML, larger or deeper than the limits, or with a document type or entities, which a
-        hostile file uses to expand without bounds or to name other files.
+    Raises ParseError: not XML, larger or deeper than the limits, or with a document type or
+    entities, which a hostile file uses to expand without bounds or to name other files.
     """
     try:
         data = read_bounded(path, most_bytes, follow_links=True)
     except PermissionError as error:
-        raise ParseError(
-            path, "whole file", f"cannot be read: {error.strerror}.", "Check its permissions."
-        ) from error
+        text = f"cannot be read: {error.strerror}."
+        raise ParseError(path, "whole file", text, "Check its permissions.") from error
     parser = expat.ParserCreate(namespace_separator="}")
     parser.buffer_text = True
     builder = TreeBuilder()
@@ -212,9 +217,8 @@ def read_xml(path: Path, most_bytes: int = MAX_XML_BYTES) -> Element:
     except (expat.ExpatError, ValueError, LookupError) as error:
         # Besides its own errors expat raises those of Python's decoders.
         reason = expat.errors.messages.get(getattr(error, "code", -1), str(error))
-        raise ParseError(
-            path, f"line {parser.CurrentLineNumber}", f"not XML: {reason}.", _AGAIN
-        ) from None
+        place = f"line {parser.CurrentLineNumber}"
+        raise ParseError(path, place, f"not XML: {reason}.", _AGAIN) from None
     return builder.close()
 
 
@@ -224,7 +228,6 @@ def _full(name: str) -> str:
 
 
 # -- Photos of a camera file, collected: names made relative, unusable ones counted and left out
-
 
 _EXAMPLES = 3
 """Names quoted in a warning about several photos."""
@@ -261,15 +264,10 @@ def relative_names(names: Iterable[str]) -> dict[str, str]:
 
 @dataclass
 class PhotoList:
-    """Collects the photos that a camera file poses.
-
-    Parameters
-    ----------
-    path : Path
-        The camera file.
-    """
+    """Collects the photos that a camera file poses."""
 
     path: Path
+    """The camera file."""
     photos: list[PosedPhoto] = field(default_factory=list)
     warnings: list[ReportWarning] = field(default_factory=list)
     offered: int = 0
@@ -289,10 +287,11 @@ class PhotoList:
         lens: LensCamera | None,
         cam_from_world: np.ndarray,
         relative: RelativeLens | None = None,
-        *,
-        is_panorama: bool = False,
     ) -> None:
-        """Take a photo over, unless its name is unsafe or was used before."""
+        """Take a photo over, unless its name is unsafe or was used before.
+
+        One without a lens of either kind is a panorama.
+        """
         if not is_safe_name(self.path.parent, name):
             self.leave_out(name, "a name that is empty, too long or leads outside the folder")
         elif name in self._names:
@@ -300,37 +299,28 @@ class PhotoList:
         else:
             self.offered += 1
             self._names.add(name)
-            self.photos.append(
-                PosedPhoto(name, lens, cam_from_world, relative=relative, is_panorama=is_panorama)
-            )
+            self.photos.append(PosedPhoto(name, lens, cam_from_world, relative=relative))
 
     def leave_out(self, name: str, reason: str) -> None:
         """Count a photo that is not used."""
         self.offered += 1
         self._left_out.setdefault(reason, []).append(repr(name[:80]))
 
-    def warn(self, code: str, text: str, hint: str = "") -> None:
+    def warn(self, code: str, text: str, hint: str) -> None:
         """Add a warning."""
         self.warnings.append(ReportWarning(code, text, hint))
 
     def finished(self) -> tuple[PosedPhoto, ...]:
         """Return the photos; what was left out becomes warnings.
 
-        Raises
-        ------
-        DatasetError
-            None is usable.
+        Raises DatasetError: None is usable.
         """
         for reason, names in self._left_out.items():
             listed = ", ".join(names[:_EXAMPLES]) + (" ..." if len(names) > _EXAMPLES else "")
-            self.warn(
-                "images-left-out",
-                f"{len(names)} photos were left out for {reason}: {listed}.",
-                LEFT_OUT_HINT,
-            )
+            text = f"{len(names)} photos were left out for {reason}: {listed}."
+            self.warn("images-left-out", text, LEFT_OUT_HINT)
         if not self.photos:
-            raise DatasetError(
-                f"None of the {self.offered} photos of {self.path.name} is usable.",
-                " ".join([*(warning.text for warning in self.warnings[:3]), AGAIN]),
-            )
+            text = f"None of the {self.offered} photos of {self.path.name} is usable."
+            hint = " ".join([*(warning.text for warning in self.warnings[:3]), AGAIN])
+            raise DatasetError(text, hint)
         return tuple(self.photos)

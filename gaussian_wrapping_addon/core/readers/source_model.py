@@ -20,27 +20,23 @@ LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "FULL_OPENCV": (
-        *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-        *("k3", "k4", "k5", "k6"),
-    ),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "FOV": ("fx", "fy", "cx", "cy", "omega"),
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
     "THIN_PRISM_FISHEYE": (
-        *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-        *("k3", "k4", "sx1", "sy1"),
+        "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1",
     ),
     "RAD_TAN_THIN_PRISM_FISHEYE": (
-        *("fx", "fy", "cx", "cy", "k0", "k1", "k2", "k3"),
-        *("k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"),
+        "fx", "fy", "cx", "cy", "k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2",
+        "s3",
     ),
     "SIMPLE_DIVISION": ("f", "cx", "cy", "k"),
     "DIVISION": ("fx", "fy", "cx", "cy", "k"),
     "SIMPLE_FISHEYE": ("f", "cx", "cy"),
     "FISHEYE": ("fx", "fy", "cx", "cy"),
     "EUCM": ("fx", "fy", "cx", "cy", "alpha", "beta"),
-}
+}  # fmt: skip
 """COLMAP's lens models in the order of their numbers, then our own."""
 
 LENS_NAMES = tuple(LENS_PARAMETERS)
@@ -49,9 +45,8 @@ LENS_NAMES = tuple(LENS_PARAMETERS)
 SKEWED_BROWN = "SKEWED_BROWN"
 """Brown's polynomial with a fourth radial coefficient and skew, which COLMAP has no model for."""
 LENS_PARAMETERS[SKEWED_BROWN] = (
-    *("fx", "fy", "cx", "cy", "skew"),
-    *("k1", "k2", "k3", "k4", "p1", "p2"),
-)
+    "fx", "fy", "cx", "cy", "skew", "k1", "k2", "k3", "k4", "p1", "p2",
+)  # fmt: skip
 
 PANORAMA = "EQUIRECTANGULAR"
 """What panoramas are called among lens models; no :class:`LensCamera` has it."""
@@ -137,13 +132,13 @@ class LensCamera:
     def resized(self, width: int, height: int) -> LensCamera:
         """Return the camera of the same photo resampled to ``width`` x ``height`` pixels."""
         sx, sy = width / self.width, height / self.height
-        model, names, params = self.model, LENS_PARAMETERS[self.model], list(self.params)
-        if names[1] != "fy" and not math.isclose(sx, sy, rel_tol=1e-12):
-            model, names, params = _with_two_focal_lengths(self)
-        two = names[1] == "fy"
+        model, params = self.model, list(self.params)
+        if LENS_PARAMETERS[model][1] != "fy" and not math.isclose(sx, sy, rel_tol=1e-12):
+            model, params = _with_two_focal_lengths(self)
+        names = LENS_PARAMETERS[model]
         at = names.index("cx")
         params[0] *= sx
-        if two:
+        if names[1] == "fy":
             params[1] *= sy
         params[at] *= sx
         params[at + 1] *= sy
@@ -152,11 +147,11 @@ class LensCamera:
         return LensCamera(model, int(width), int(height), tuple(params))
 
 
-def _with_two_focal_lengths(camera: LensCamera) -> tuple[str, tuple[str, ...], list[float]]:
+def _with_two_focal_lengths(camera: LensCamera) -> tuple[str, list[float]]:
     """Rewrite a one-focal-length model as the model that can be stretched, where there is one."""
     f, cx, cy, *k = camera.params
     k = [*k, 0.0, 0.0, 0.0, 0.0]
-    model, params = {
+    return {
         "SIMPLE_PINHOLE": ("PINHOLE", [f, f, cx, cy]),
         "SIMPLE_RADIAL": ("OPENCV", [f, f, cx, cy, k[0], 0.0, 0.0, 0.0]),
         "RADIAL": ("OPENCV", [f, f, cx, cy, k[0], k[1], 0.0, 0.0]),
@@ -165,7 +160,6 @@ def _with_two_focal_lengths(camera: LensCamera) -> tuple[str, tuple[str, ...], l
         "SIMPLE_DIVISION": ("DIVISION", [f, f, cx, cy, k[0]]),
         "SIMPLE_FISHEYE": ("FISHEYE", [f, f, cx, cy]),
     }[camera.model]
-    return model, LENS_PARAMETERS[model], params
 
 
 @dataclass(frozen=True)
@@ -185,16 +179,17 @@ class Brown:
         self, width: int, height: int, focal: tuple[float, float], center: tuple[float, float]
     ) -> LensCamera:
         """Return the simplest model that holds all of it exactly."""
+        four = (self.k1, self.k2, self.p1, self.p2)
+        model = "PINHOLE"
+        terms: tuple[float, ...] = ()
         if self.skew or self.k4:
+            model = SKEWED_BROWN
             terms = (self.skew, self.k1, self.k2, self.k3, self.k4, self.p1, self.p2)
-            return LensCamera(SKEWED_BROWN, width, height, (*focal, *center, *terms))
-        if self.k3:
-            full = (self.k1, self.k2, self.p1, self.p2, self.k3, 0.0, 0.0, 0.0)
-            return LensCamera("FULL_OPENCV", width, height, (*focal, *center, *full))
-        if self.k1 or self.k2 or self.p1 or self.p2:
-            four = (self.k1, self.k2, self.p1, self.p2)
-            return LensCamera("OPENCV", width, height, (*focal, *center, *four))
-        return LensCamera("PINHOLE", width, height, (*focal, *center))
+        elif self.k3:
+            model, terms = "FULL_OPENCV", (*four, self.k3, 0.0, 0.0, 0.0)
+        elif any(four):
+            model, terms = "OPENCV", four
+        return LensCamera(model, width, height, (*focal, *center, *terms))
 
 
 @dataclass(frozen=True)
@@ -236,8 +231,11 @@ class PosedPhoto:
     """Sparse points that were found in it, where the input tells."""
     relative: RelativeLens | None = None
     """Intrinsics of a photo of any size."""
-    is_panorama: bool = False
-    """Whether the photo is equirectangular: it has no lens, and is cut into views when loaded."""
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether the photo is equirectangular: it has no lens, and is cut into views."""
+        return self.lens is None and self.angle_x is None and self.relative is None
 
 
 @dataclass(frozen=True)

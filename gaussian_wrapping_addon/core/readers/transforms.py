@@ -19,24 +19,19 @@ from .. import limits
 from ..errors import DatasetError, ParseError
 from ..files import read_json, resolve_inside
 from ..progress import LEFT_OUT_HINT, ReportWarning
+from ..scene.camera import pose_at
 from .colmap import is_safe_name
 from .point_files import read_point_ply
+from .program_values import OPENGL_FROM_COLMAP, ROTATION_TOLERANCE
 from .source_model import LENS_PARAMETERS, PANORAMA, LensCamera, PosedPhoto, SourceModel
 
 NAMES = ("transforms.json", "transforms_train.json")
 
-_OPENGL_FROM_COLMAP = np.diag([1.0, -1.0, -1.0])
-_ROTATION_TOLERANCE = 1e-2
-"""How far a matrix may be from scale x rotation; exporters write as few as 4 digits."""
 _LENSES = {
-    "SIMPLE_PINHOLE": "PINHOLE",
-    "PINHOLE": "PINHOLE",
-    "SIMPLE_RADIAL": "OPENCV",
-    "RADIAL": "OPENCV",
-    "OPENCV": "OPENCV",
-    "FULL_OPENCV": "FULL_OPENCV",
+    "SIMPLE_PINHOLE": "PINHOLE", "PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV", "OPENCV": "OPENCV", "FULL_OPENCV": "FULL_OPENCV",
     "OPENCV_FISHEYE": "OPENCV_FISHEYE",
-}
+}  # fmt: skip
 _AGAIN = "Export the file again."
 
 
@@ -44,21 +39,14 @@ def find_transforms(source: Path) -> Path | None:
     """Return the transforms file that ``source`` is or holds."""
     if source.is_file():
         return source if source.suffix.lower() == ".json" else None
-    for name in NAMES:
-        if (source / name).is_file():
-            return source / name
-    return None
+    return next((source / name for name in NAMES if (source / name).is_file()), None)
 
 
 def read_transforms(path: Path) -> SourceModel:
     """Read poses, intrinsics and the start points that the file names.
 
-    Raises
-    ------
-    ParseError
-        An entry is invalid; names it, such as ``frames[3].transform_matrix``.
-    DatasetError
-        No usable frame.
+    Raises ParseError: an entry is invalid; names it, such as ``frames[3].transform_matrix``;
+    DatasetError: no usable frame.
     """
     values = read_json(path, follow_links=True)
     if not isinstance(values, dict):
@@ -93,7 +81,7 @@ def read_transforms(path: Path) -> SourceModel:
         mask = frame.get("mask_path")
         if mask is not None:
             mask = _name(path, f"{place}.mask_path", mask)
-        photos.append(PosedPhoto(name, lens, pose, mask, angle_x, is_panorama=is_panorama))
+        photos.append(PosedPhoto(name, lens, pose, mask, angle_x))
     if unsafe:
         text = (
             f"{len(unsafe)} frames were left out because their file_path is too long or leads "
@@ -107,10 +95,8 @@ def read_transforms(path: Path) -> SourceModel:
         text = f"{scaled} matrices held a scale, which was removed."
         warnings.append(ReportWarning("scale-removed", text))
     if not photos:
-        raise DatasetError(
-            f"None of the {len(frames)} frames of {path.name} is usable.",
-            " ".join([*(warning.text for warning in warnings), _AGAIN]),
-        )
+        text = f"None of the {len(frames)} frames of {path.name} is usable."
+        raise DatasetError(text, " ".join([*(warning.text for warning in warnings), _AGAIN]))
     points, colors = _start_points(path, values.get("ply_file_path"), warnings)
     facts: dict[str, Any] = {
         "frames": len(frames),
@@ -130,21 +116,6 @@ def _name(path: Path, place: str, value: Any) -> str:
     while name.startswith("./"):
         name = name[2:]
     return name
-
-
-def _number(path: Path, place: str, values: dict[str, Any], key: str) -> float | None:
-    value = values.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ParseError(path, f"{place}.{key}", "a number was expected.", _AGAIN)
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise ParseError(path, f"{place}.{key}", "the number is not finite.", _AGAIN)
-    return number
 
 
 def _pose(path: Path, place: str, value: Any) -> tuple[np.ndarray, bool]:
@@ -169,11 +140,10 @@ def _pose(path: Path, place: str, value: Any) -> tuple[np.ndarray, bool]:
         raise ParseError(path, place, "the matrix has no rotation.", _AGAIN)
     u, _, vt = np.linalg.svd(linear / scale)
     rotation = u @ vt  # nearest rotation, (3, 3)
-    if np.abs(rotation - linear / scale).max() > _ROTATION_TOLERANCE:
+    if np.abs(rotation - linear / scale).max() > ROTATION_TOLERANCE:
         raise ParseError(path, place, "the matrix is not a rotation.", _AGAIN)
-    cam_from_world = (rotation @ _OPENGL_FROM_COLMAP).T
-    pose = np.concatenate([cam_from_world, -(cam_from_world @ matrix[:3, 3])[:, None]], 1)
-    return pose, abs(scale - 1.0) > _ROTATION_TOLERANCE
+    pose = pose_at((rotation @ OPENGL_FROM_COLMAP).T, matrix[:3, 3])
+    return pose, abs(scale - 1.0) > ROTATION_TOLERANCE
 
 
 def _intrinsics(
@@ -182,7 +152,18 @@ def _intrinsics(
     """Return the lens, or ``None`` and the angle if the photo's size is needed to complete it."""
 
     def number(key: str) -> float | None:
-        return _number(path, place, values, key)
+        value = values.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ParseError(path, f"{place}.{key}", "a number was expected.", _AGAIN)
+        try:
+            found = float(value)
+        except OverflowError:
+            found = math.inf
+        if not math.isfinite(found):
+            raise ParseError(path, f"{place}.{key}", "the number is not finite.", _AGAIN)
+        return found
 
     stated = str(values.get("camera_model", ""))
     if stated and stated not in _LENSES:
@@ -223,19 +204,13 @@ def _intrinsics(
             fy = 0.5 * height / math.tan(0.5 * angle_y)
     fx, fy = fx or fy, fy or fx
     cx, cy = number("cx"), number("cy")
-    known = {
-        **k,
-        "fx": fx,
-        "fy": fy,
-        "cx": 0.5 * width if cx is None else cx,
-        "cy": 0.5 * height if cy is None else cy,
-    }
+    cx, cy = 0.5 * width if cx is None else cx, 0.5 * height if cy is None else cy
+    known = {**k, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
     params = tuple(float(known[name] or 0.0) for name in LENS_PARAMETERS[model])
     if not (1 <= width <= limits.MAX_IMAGE_SIDE_PX and 1 <= height <= limits.MAX_IMAGE_SIDE_PX):
         raise ParseError(path, place, f"image size {width:g} x {height:g} is out of range.", _AGAIN)
     lens = LensCamera(model, round(width), round(height), params)
-    problem = lens.problem()
-    if problem:
+    if problem := lens.problem():
         raise ParseError(path, place, f"{problem}.", _AGAIN)
     return lens, None
 
@@ -248,12 +223,8 @@ def _start_points(
         return nothing
     found = resolve_inside(path.parent, name) if isinstance(name, str) and name else None
     if found is None or not os.path.isfile(found):
-        warnings.append(
-            ReportWarning(
-                "point-file-missing",
-                f"ply_file_path {json.dumps(name)[:80]} was not found in the folder.",
-                "Put the file where transforms.json says it is.",
-            )
-        )
+        text = f"ply_file_path {json.dumps(name)[:80]} was not found in the folder."
+        hint = "Put the file where transforms.json says it is."
+        warnings.append(ReportWarning("point-file-missing", text, hint))
         return nothing
     return read_point_ply(found)

@@ -23,13 +23,11 @@ def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray | None:
         return None
     q = q / largest  # the squares of a huge quaternion would overflow
     w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
 
 
 def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
@@ -39,16 +37,19 @@ def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
     precision near half turns.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
-    matrix = np.array(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ]
-    )
+    matrix = np.array([
+        [a + e + i, h - f, c - g, d - b],
+        [h - f, a - e - i, b + d, c + g],
+        [c - g, b + d, e - a - i, f + h],
+        [d - b, c + g, f + h, i - a - e],
+    ])  # fmt: skip
     quaternion = np.linalg.eigh(matrix)[1][:, -1]
     return quaternion if quaternion[0] >= 0 else -quaternion
+
+
+def pose_at(cam_from_world: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Return the (3, 4) pose of a camera with rotation (3, 3) and centre (3,)."""
+    return np.concatenate([cam_from_world, -(cam_from_world @ center)[:, None]], 1)
 
 
 # -- Similarity transforms in float64: scale, rotation, translation -------------------------------
@@ -117,10 +118,8 @@ class Similarity:
     def from_json(cls, values: dict[str, Any]) -> Similarity:
         """Build from :meth:`to_json`'s values.
 
-        Raises
-        ------
-        KeyError, TypeError, ValueError
-            An entry is missing, of another kind, or beyond float64.
+        Raises KeyError, TypeError, ValueError: an entry is missing, of another kind, or beyond
+        float64.
         """
         try:
             return cls(
@@ -185,32 +184,20 @@ class Camera:
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project (n, 3) world points.
 
-        Returns
-        -------
-        pixels : (n, 2) float64
-            Pixel coordinates; meaningless where ``depth <= 0``.
-        depth : (n,) float64
-            z-depth, world units.
+        Returns ``pixels``, (n, 2) float64, meaningless where ``depth <= 0``, and ``depth``, (n,)
+        float64, the z-depth in world units.
         """
         local = self.to_camera(points)
         depth = local[:, 2]
         safe = np.where(np.abs(depth) > 1e-300, depth, 1e-300)
-        pixels = np.stack(
-            [self.fx * local[:, 0] / safe + self.cx, self.fy * local[:, 1] / safe + self.cy], 1
-        )
-        return pixels, depth
+        x, y = self.fx * local[:, 0] / safe + self.cx, self.fy * local[:, 1] / safe + self.cy
+        return np.stack([x, y], 1), depth
 
     def shown(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Look (n, 3) world points up in the image.
 
-        Returns
-        -------
-        indices : (m,) int64
-            Of the points that project into the image.
-        row, column : (m,) int64
-            Their pixels.
-        depth : (m,) float64
-            Their z-depths, > 0, world units.
+        Returns ``indices``, (m,) int64, of the points that project into the image; ``row`` and
+        ``column``, (m,) int64, of their pixels; ``depth``, (m,) float64, z-depths > 0, world units.
         """
         pixels, depth = self.project(points)
         size = (self.width, self.height)
@@ -223,8 +210,7 @@ class Camera:
         u = (np.arange(self.width) + 0.5 - self.cx) / self.fx
         v = (np.arange(self.height) + 0.5 - self.cy) / self.fy
         out = np.ones((self.height, self.width, 3))
-        out[..., 0] = u[None, :]
-        out[..., 1] = v[:, None]
+        out[..., 0], out[..., 1] = u[None, :], v[:, None]
         return out
 
     def rays_at(self, pixels: np.ndarray) -> np.ndarray:
@@ -238,20 +224,14 @@ class Camera:
         """Return the camera of the same photo resampled to ``width`` x ``height`` pixels."""
         sx, sy = width / self.width, height / self.height
         return dataclasses.replace(
-            self,
-            width=int(width),
-            height=int(height),
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
-        )
+            self, width=int(width), height=int(height), fx=self.fx * sx, fy=self.fy * sy,
+            cx=self.cx * sx, cy=self.cy * sy,
+        )  # fmt: skip
 
     def moved(self, new_from_old: Similarity) -> Camera:
         """Return the same camera expressed in another world frame (depths scale along)."""
         rotation = self.rotation @ new_from_old.rotation.T
-        center = new_from_old.points(self.center[None])[0]
-        pose = np.concatenate([rotation, -(rotation @ center)[:, None]], 1)
+        pose = pose_at(rotation, new_from_old.points(self.center[None])[0])
         return dataclasses.replace(self, cam_from_world=pose)
 
     def to_json(self) -> dict[str, Any]:
@@ -264,10 +244,8 @@ class Camera:
     def from_json(cls, values: dict[str, Any]) -> Camera:
         """Build from :meth:`to_json`'s values.
 
-        Raises
-        ------
-        KeyError, TypeError, ValueError
-            An entry is missing, of another kind, or such as no camera has.
+        Raises KeyError, TypeError, ValueError: an entry is missing, of another kind, or such as no
+        camera has.
         """
         values = dict(values)
         try:

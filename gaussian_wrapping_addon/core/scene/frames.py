@@ -14,7 +14,13 @@ import numpy as np
 from ..errors import DatasetError, UsageError
 from ..limits import MIN_IMAGES, SCENE_RADIUS
 from ..names import EXPORT_FORMATS
-from .camera import Camera, Similarity, quaternion_from_rotation, rotation_from_quaternion
+from .camera import (
+    Camera,
+    Similarity,
+    pose_at,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from .placement import COINCIDENT, Plane
 
 # -- Round the scene to a grid, so that every similarity of an input gives the same bits ----------
@@ -23,7 +29,6 @@ from .placement import COINCIDENT, Plane
 # rounding errors, and would get another mesh (docs/method.md, section 1.7). The steps below are
 # far coarser than rounding errors of float64 in the input and far finer than the errors of solved
 # cameras.
-
 
 CENTER_STEP = 2.0**-17
 """Step of camera centres in scene units. Moves a camera by at most 7e-6: 0.01 pixels for a focal
@@ -59,8 +64,7 @@ def snapped_rotation(rotation: np.ndarray, step: float) -> np.ndarray:
 def snapped_camera(camera: Camera) -> Camera:
     """Return a camera of the scene frame with centre and rotation on the grid."""
     rotation = snapped_rotation(camera.rotation, ROTATION_STEP)
-    center = snapped(camera.center, CENTER_STEP)
-    pose = np.concatenate([rotation, -(rotation @ center)[:, None]], 1)
+    pose = pose_at(rotation, snapped(camera.center, CENTER_STEP))
     return dataclasses.replace(camera, cam_from_world=pose)
 
 
@@ -71,7 +75,6 @@ def snapped_length(length: float) -> float:
 
 
 # -- Compute the scene frame: Z up, mean camera centre at 0, cameras within a fixed radius --------
-
 
 RADIUS_MARGIN = 1.1
 """The largest camera distance times this becomes ``SCENE_RADIUS`` (docs/method.md, section 1.7)."""
@@ -116,49 +119,30 @@ def find_scene_frame(
 ) -> SceneFrame:
     """Compute the scene frame of posed cameras.
 
-    Parameters
-    ----------
-    rotations : (n, 3, 3) float64
-        ``cam_from_world`` rotations, camera axes x right, y down, z forward.
-    centers : (n, 3) float64
-        Camera centres, world frame; may be far from the origin.
-    z_up : bool
-        Whether the world's z is known to point up.
-
-    Returns
-    -------
-    SceneFrame
-
-    Raises
-    ------
-    DatasetError
-        All cameras coincide, or too few remain.
+    ``rotations``: (n, 3, 3) float64, ``cam_from_world`` rotations, camera axes x right, y down, z
+        forward.
+    ``centers``: (n, 3) float64, camera centres, world frame; may be far from the origin.
+    ``z_up``: whether the world's z is known to point up.
+    Raises DatasetError: all cameras coincide, or too few remain.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         keep = near_cameras(centers)
         vast = bool(keep.any()) and np.abs(centers[keep]).max() > MAX_COORDINATE
     if vast:
-        raise DatasetError(
-            f"The cameras lie farther than {MAX_COORDINATE:g} units from the origin.",
-            "Solve the cameras again.",
-        )
+        text = f"The cameras lie farther than {MAX_COORDINATE:g} units from the origin."
+        raise DatasetError(text, "Solve the cameras again.")
     if int(keep.sum()) < MIN_IMAGES:
-        raise DatasetError(
-            f"Only {int(keep.sum())} cameras are near each other; {MIN_IMAGES} are needed.",
-            "Solve the cameras again.",
-        )
+        text = f"Only {int(keep.sum())} cameras are near each other; {MIN_IMAGES} are needed."
+        raise DatasetError(text, "Solve the cameras again.")
     kept = centers[keep]
     middle = np.median(kept, axis=0)
     offsets = kept - middle  # subtract first: coordinates may be huge
     mean = middle + offsets.mean(0)
     offsets = kept - mean
     reach = float(np.linalg.norm(offsets, axis=1).max())
-    size = float(np.abs(centers[keep]).max())
-    if reach <= _COINCIDENT * max(size, 1e-300):
-        raise DatasetError(
-            "All photos were taken from one place, so that no depth can be measured.",
-            "Walk around the object while taking photos.",
-        )
+    if reach <= _COINCIDENT * max(float(np.abs(kept).max()), 1e-300):
+        text = "All photos were taken from one place, so that no depth can be measured."
+        raise DatasetError(text, "Walk around the object while taking photos.")
     if z_up:
         up, rule = np.array([0.0, 0.0, 1.0]), KNOWN_UP
     else:
@@ -167,12 +151,8 @@ def find_scene_frame(
     first = rotations[keep][0]
     rotation = snapped_rotation(_rotation_to_z(up, rotations[keep]) @ first.T, FRAME_STEP) @ first
     spread = np.linalg.svd(offsets, compute_uv=False)
-    return SceneFrame(
-        Similarity(RADIUS_MARGIN * reach / SCENE_RADIUS, rotation.T, mean).inverse(),
-        keep,
-        rule,
-        bool(spread[1] < 1e-3 * spread[0]),
-    )
+    world_from_scene = Similarity(RADIUS_MARGIN * reach / SCENE_RADIUS, rotation.T, mean)
+    return SceneFrame(world_from_scene.inverse(), keep, rule, bool(spread[1] < 1e-3 * spread[0]))
 
 
 def near_cameras(centers: np.ndarray) -> np.ndarray:
@@ -196,20 +176,12 @@ def up_direction(rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray
     most nearly orthogonal to all of these is preferred; then the normal of a planar camera path.
     Both are used only if they are well determined and agree with the first guess.
 
-    Parameters
-    ----------
-    rotations : (n, 3, 3) float64, cam_from_world
-    offsets : (n, 3) float64
-        Camera centres relative to their mean.
-
-    Returns
-    -------
-    up : (3,) float64, unit length, world frame
-    rule : str
-        ``"level cameras"``, ``"plane camera path"`` or ``"mean camera up"``.
+    ``rotations``: (n, 3, 3) float64, cam_from_world. ``offsets``: (n, 3) float64, camera centres
+    relative to their mean.
+    Returns ``up``: (3,) float64, unit length, world frame; ``rule``: ``"level cameras"``, ``"plane
+    camera path"`` or ``"mean camera up"``.
     """
-    ups = -rotations[:, 1, :]  # (n, 3): y points down
-    guess = _robust_mean(ups)
+    guess = _robust_mean(-rotations[:, 1, :])  # (n, 3): y points down
     rights = rotations[:, 0, :]  # (n, 3)
     level, values = _least_aligned(rights)
     tilt = float(np.median(np.abs(rights @ level)))
@@ -220,10 +192,8 @@ def up_direction(rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray
         return _signed(level, guess), "level cameras"
     if len(offsets) >= 8:
         normal, values = _least_aligned(offsets)
-        flat = (
-            values[0] < _MAX_PLANE_THICKNESS**2 * values[1]
-            and values[1] > _MIN_SPREAD_RATIO * values[2]
-        )
+        flat = values[0] < _MAX_PLANE_THICKNESS**2 * values[1]
+        flat = flat and values[1] > _MIN_SPREAD_RATIO * values[2]
         if flat and abs(normal @ guess) > _MIN_AGREEMENT_COS:
             return _signed(normal, guess), "plane camera path"
     return guess, MEAN_UP
@@ -275,12 +245,10 @@ def _rotation_to_z(up: np.ndarray, rotations: np.ndarray) -> np.ndarray:
         first = rotations[0, 2, :] if abs(rotations[0, 2, :] @ up) < 0.99 else -rotations[0, 1, :]
         ahead = first - up * (up @ first)
     ahead = ahead / np.linalg.norm(ahead)
-    right = np.cross(ahead, up)
-    return np.stack([right, ahead, up])
+    return np.stack([np.cross(ahead, up), ahead, up])
 
 
 # -- Estimate the up direction from cameras that may be rolled by quarter turns -------------------
-
 
 MIN_AGREEING_SHARE = 0.7
 """Share of the cameras that must agree with an up direction: about three quarters of hand-held
@@ -317,23 +285,11 @@ def camera_up(rotations: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, s
     orientation): then up is the direction for which most cameras have a roll near a multiple of a
     quarter turn. Its sign is that of upright cameras, or else the side from which they look down.
 
-    Parameters
-    ----------
-    rotations : (n, 3, 3) float64
-        ``cam_from_world`` rotations, camera axes x right, y down, z forward.
-    centers : (n, 3) float64
-        Camera centres.
-
-    Returns
-    -------
-    up : (3,) float64, unit length
-    rule : str
-        A rule of ``up_direction``, or ``"cameras turned by quarters"``.
-
-    Raises
-    ------
-    UsageError
-        There is no camera, or the cameras contradict each other.
+    ``rotations``: (n, 3, 3) float64, ``cam_from_world`` rotations, camera axes x right, y down, z
+    forward. ``centers``: (n, 3) float64, camera centres.
+    Returns ``up``: (3,) float64, unit length; ``rule``: a rule of ``up_direction``, or ``"cameras
+    turned by quarters"``.
+    Raises UsageError: there is no camera, or the cameras contradict each other.
     """
     rotations = np.asarray(rotations, np.float64).reshape(-1, 3, 3)
     centers = np.asarray(centers, np.float64).reshape(-1, 3)
@@ -397,11 +353,8 @@ def _upright_share(rotations: np.ndarray, up: np.ndarray, limit_deg: float) -> f
 def _quarter_turn_share(rotations: np.ndarray, up: np.ndarray) -> float:
     """Return the share of all cameras near a quarter turn, excluding those looking along ``up``."""
     roll, seen = _roll_and_projection(rotations, up)
-    return float(
-        (
-            (_angle_to_quarter_turn(roll) < np.radians(QUARTER_DEG)) & (seen > _MIN_PROJECTED_UP)
-        ).mean()
-    )
+    near = _angle_to_quarter_turn(roll) < np.radians(QUARTER_DEG)
+    return float((near & (seen > _MIN_PROJECTED_UP)).mean())
 
 
 def _candidates(rotations: np.ndarray) -> np.ndarray:
@@ -444,7 +397,6 @@ def _sign(rotations: np.ndarray, up: np.ndarray) -> float:
 
 # -- Find the ground plane of a scene from its surface --------------------------------------------
 
-
 LEVEL_DEG = 20.0
 """Largest tilt of ground faces: the up direction from cameras is off by a few degrees at most."""
 BAND_SHARE = 0.02
@@ -461,18 +413,10 @@ def find_ground_plane(
 ) -> Plane | None:
     """Find the level plane that contains most of the low, upward-facing surface.
 
-    Parameters
-    ----------
-    centers, normals : (f, 3) float64
-        Centres and outward unit normals of a mesh's faces.
-    areas : (f,) float64
-    up : (3,) float64
-        Unit vector, accurate to :data:`LEVEL_DEG`.
-
-    Returns
-    -------
-    Plane or None
-        None if no plane is distinct.
+    ``centers``, ``normals``: (f, 3) float64, centres and outward unit normals of a mesh's faces.
+    ``areas``: (f,) float64.
+    ``up``: (3,) float64, unit vector, accurate to :data:`LEVEL_DEG`.
+    Returns None if no plane is distinct.
     """
     good = np.isfinite(centers).all(1) & np.isfinite(normals).all(1) & (areas > 0.0)
     centers, normals, areas = centers[good], normals[good], areas[good]
@@ -507,9 +451,8 @@ def find_ground_plane(
         normal = axes[:, 0] if axes[:, 0] @ up >= 0.0 else -axes[:, 0]
         offset = float(mean @ normal)
     near = np.abs(points @ normal - offset) <= band
-    if not near.any() or weights[near].sum() < CLEAR_SHARE * weights.sum():
-        return None
-    if normal @ up < np.cos(np.radians(LEVEL_DEG)):
+    is_clear = near.any() and weights[near].sum() >= CLEAR_SHARE * weights.sum()
+    if not is_clear or normal @ up < np.cos(np.radians(LEVEL_DEG)):
         return None
     mean = np.average(points[near], axis=0, weights=weights[near])
     return Plane(middle + mean, normal)
@@ -522,14 +465,12 @@ def _fullest_band(heights: np.ndarray, weights: np.ndarray, width: float) -> flo
     order = np.argsort(heights, kind="stable")
     heights, total = heights[order], np.concatenate([[0.0], np.cumsum(weights[order])])
     last = np.searchsorted(heights, heights + width, side="right")  # (k,)
-    first = int(np.argmax(total[last] - total[:-1]))
-    return float(heights[first] + 0.5 * width)
+    return float(heights[int(np.argmax(total[last] - total[:-1]))] + 0.5 * width)
 
 
 # -- Coordinate frame of an exported file: target frame, axes and offset --------------------------
 #
 # Files of Y-up formats hold (x, z, -y) of the Z-up coordinates, as Blender's own exporters write.
-
 
 FAR_FROM_ORIGIN = 100.0
 """Further than this many sizes from the origin, float32 rounding exceeds 1e-5 of the size."""
@@ -560,25 +501,23 @@ class FileFrame:
 
     def file_from_scene(self) -> Similarity:
         """Return the transform from the scene frame to the file's coordinates."""
-        turned = Similarity(1.0, self.turn, -(self.turn @ self.offset))
-        return turned.after(self.target_from_scene)
+        return Similarity(1.0, self.turn, -(self.turn @ self.offset)).after(self.target_from_scene)
 
     def to_json(
         self, world_from_scene: Similarity, blender_from_scene: Similarity
     ) -> dict[str, Any]:
         """Return the entries of a sidecar: all transforms from the file's frame, in float64."""
         scene_from_file = self.file_from_scene().inverse()
-        up = "+Y" if EXPORT_FORMATS[self.format].y_up else "+Z"
+        y_up = EXPORT_FORMATS[self.format].y_up
         return {
-            "up": up,
-            "front": "+Z" if up == "+Y" else "-Y",
+            "up": "+Y" if y_up else "+Z", "front": "+Z" if y_up else "-Y",
             "offset": np.asarray(self.offset, np.float64).tolist(),
             "world_from_file": world_from_scene.after(scene_from_file).to_json(),
             "blender_from_file": blender_from_scene.after(scene_from_file).to_json(),
             "scene_from_file": scene_from_file.to_json(),
             "world_from_scene": world_from_scene.to_json(),
             "blender_from_scene": blender_from_scene.to_json(),
-        }
+        }  # fmt: skip
 
 
 def file_offset(world: np.ndarray) -> np.ndarray:

@@ -18,7 +18,6 @@ from .camera import Similarity
 # Everything is computed about the centroids, so that coordinates of millions of units (a
 # cadastral frame) cost no digits beyond those already lost in the input.
 
-
 COLLINEAR_SHARE = 1e-6
 """Ratio of second to first extent below which points count as collinear: the rotation about their
 line would depend on a millionth of the scene, less than the error of any pose estimate."""
@@ -47,52 +46,36 @@ def umeyama(source: np.ndarray, target: np.ndarray, *, with_scale: bool) -> Simi
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
     PAMI 1991. The rotation is proper even where a reflection would fit better.
 
-    Parameters
-    ----------
-    source, target : (n, 3) float64
-        Corresponding points, n >= 3, not collinear.
-    with_scale : bool
-        Also fit the scale; otherwise it is 1.
-
-    Raises
-    ------
-    DatasetError
-        Fewer than three pairs, values that are not finite, or collinear points.
+    ``source``, ``target``: (n, 3) float64, corresponding points, n >= 3, not collinear.
+    ``with_scale``: also fit the scale; otherwise it is 1.
+    Raises DatasetError: fewer than three pairs, values that are not finite, or collinear points.
     """
-    source, target = _pairs(source, target)
-    for points, name in ((source, "source"), (target, "target")):
-        require_plane(points, name)
-    return fit_similarity(source, target, with_scale)
+    return fit_similarity(*_pairs(source, target), with_scale)
 
 
 def _pairs(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
-        raise DatasetError(
-            f"Points of shapes {source.shape} and {target.shape} do not match.",
-            "Give two (n, 3) arrays of the same length.",
-        )
+        text = f"Points of shapes {source.shape} and {target.shape} do not match."
+        raise DatasetError(text, "Give two (n, 3) arrays of the same length.")
     if len(source) < 3:
-        raise DatasetError(
-            f"{len(source)} pairs of points do not determine an alignment.",
-            "At least 3 are needed.",
-        )
+        text = f"{len(source)} pairs of points do not determine an alignment."
+        raise DatasetError(text, "At least 3 are needed.")
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise DatasetError("The points to align are not all finite.", "Remove NaN and infinities.")
+    for points, name in ((source, "source"), (target, "target")):
+        require_plane(points, name)
     return source, target
 
 
 def require_plane(points: np.ndarray, name: str) -> None:
     local = points - points.mean(0)
-    variances = np.linalg.eigvalsh(local.T @ local / len(local))[::-1]
-    extents = np.sqrt(np.maximum(variances, 0.0))
+    extents = np.sqrt(np.maximum(np.linalg.eigvalsh(local.T @ local / len(local))[::-1], 0.0))
     rounding = 8 * np.finfo(np.float64).eps * np.abs(points).max()
     if extents[1] <= max(COLLINEAR_SHARE * extents[0], rounding):
         what = "in one place" if extents[0] <= rounding else "on one line"
-        raise DatasetError(
-            f"The {len(points)} {name} points lie {what}, so the rotation is undetermined.",
-            "Use cameras or points that span at least a plane.",
-        )
+        text = f"The {len(points)} {name} points lie {what}, so the rotation is undetermined."
+        raise DatasetError(text, "Use cameras or points that span at least a plane.")
 
 
 def fit_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool) -> Similarity:
@@ -121,22 +104,12 @@ def umeyama_ransac(
     one is refitted to its inliers until these no longer change. Drawing ends early once an
     outlier-free triple was drawn with a probability of ``RANSAC_CONFIDENCE``.
 
-    Parameters
-    ----------
-    source, target : (n, 3) float64
-    threshold : float
-        Largest distance of an inlier, units of the target.
-    iterations : int
-        Maximum number of triples.
-
-    Raises
-    ------
-    DatasetError
-        Degenerate pairs (see :func:`umeyama`), or no triple with at least three inliers.
+    ``source``, ``target``: (n, 3) float64. ``threshold``: largest distance of an inlier, units of
+    the target. ``iterations``: maximum number of triples.
+    Raises DatasetError: degenerate pairs (see :func:`umeyama`), or no triple with at least three
+    inliers.
     """
     source, target = _pairs(source, target)
-    for points, name in ((source, "source"), (target, "target")):
-        require_plane(points, name)
     source_mean, target_mean = source.mean(0), target.mean(0)
     a, b = source - source_mean, target - target_mean
     rng = np.random.default_rng(seed)
@@ -159,10 +132,9 @@ def umeyama_ransac(
             elif clean > 0.0:
                 needed = np.log(1.0 - RANSAC_CONFIDENCE) / np.log1p(-clean)
     if best_count < 3:
-        raise DatasetError(
-            f"No alignment brings three of {len(a)} pairs within {threshold:g}.",
-            "The pairs do not correspond, or the threshold is far too small.",
-        )
+        text = f"No alignment brings three of {len(a)} pairs within {threshold:g}."
+        hint = "The pairs do not correspond, or the threshold is far too small."
+        raise DatasetError(text, hint)
     for _ in range(RANSAC_POLISH):
         require_plane(a[best], "agreeing source")
         fit = fit_similarity(a[best], b[best], with_scale)
@@ -171,11 +143,8 @@ def umeyama_ransac(
         if within.sum() < 3 or (within == best).all():
             break
         best = within
-    transform = Similarity(
-        fit.scale,
-        fit.rotation,
-        fit.translation + target_mean - fit.scale * (fit.rotation @ source_mean),
-    )
+    shift = fit.translation + target_mean - fit.scale * (fit.rotation @ source_mean)
+    transform = Similarity(fit.scale, fit.rotation, shift)
     inliers = distances <= threshold
     rmse = float(np.sqrt((distances[inliers] ** 2).mean())) if inliers.any() else float("inf")
     return RansacResult(transform, inliers, rmse)
@@ -207,7 +176,6 @@ def _score_triples(
 # Each step is a similarity applied after the present placement. Scaling is always uniform, and
 # steps are idempotent: a step from points that are placed already is the identity.
 
-
 COINCIDENT = 1e-6
 """Distance over size of the coordinates below which two points coincide: in Blender's single
 precision such a distance has hardly one significant digit."""
@@ -237,22 +205,14 @@ def scale_step(points: np.ndarray, length: float) -> Similarity:
 
     A ground at z = 0 and a chosen origin stay where they are.
 
-    Parameters
-    ----------
-    points : (2, 3) float64
-    length : float
-        True distance, in the unit of the placed scene.
-
-    Raises
-    ------
-    UsageError
-        There are not exactly two points, they coincide, or the length is not positive.
+    ``points``: (2, 3) float64. ``length``: true distance, in the unit of the placed scene.
+    Raises UsageError: there are not exactly two points, they coincide, or the length is not
+    positive.
     """
     points = _finite(points)
     if len(points) != 2:
-        raise UsageError(
-            f"{_count(len(points))} picked.", "Pick two points whose distance you know."
-        )
+        hint = "Pick two points whose distance you know."
+        raise UsageError(f"{_count(len(points))} picked.", hint)
     if not (math.isfinite(length) and length > 0.0):
         raise UsageError(f"{length:g} is not a distance.", "Enter a length greater than zero.")
     distance = float(np.linalg.norm(points[1] - points[0]))
@@ -264,32 +224,21 @@ def scale_step(points: np.ndarray, length: float) -> Similarity:
 def plane_through(points: np.ndarray, above: np.ndarray) -> Plane:
     """Return the plane through three points, or the least-squares plane of more.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    above : (k, 3) float64
-        Points above the plane, such as camera centres. Without any, or with as many below as
-        above, up is the side nearer to +Z.
-
-    Raises
-    ------
-    UsageError
-        Fewer than three points, or all of them on one line.
+    ``points``: (n, 3) float64. ``above``: (k, 3) float64, points above the plane, such as camera
+    centres. Without any, or with as many below as above, up is the side nearer to +Z.
+    Raises UsageError: fewer than three points, or all of them on one line.
     """
     points = _finite(points)
     if len(points) < 3:
-        raise UsageError(
-            f"{_count(len(points))} picked.", "Pick three points or more on the ground."
-        )
+        hint = "Pick three points or more on the ground."
+        raise UsageError(f"{_count(len(points))} picked.", hint)
     center = points.mean(0)
-    offsets = points - center
-    _, extents, axes = np.linalg.svd(offsets, full_matrices=False)  # (3,), (3, 3)
+    _, extents, axes = np.linalg.svd(points - center, full_matrices=False)  # (3,), (3, 3)
     if extents[0] <= COINCIDENT * float(np.abs(points).max()):
         raise UsageError("The points coincide.", "Pick three points that are far apart.")
     if extents[1] <= COLLINEAR * extents[0]:
-        raise UsageError(
-            "The points lie on one line.", "Pick a third point well to the side of the line."
-        )
+        hint = "Pick a third point well to the side of the line."
+        raise UsageError("The points lie on one line.", hint)
     normal = np.cross(axes[0], axes[1])
     side = float(np.median((np.asarray(above, np.float64) - center) @ normal)) if len(above) else 0
     if abs(side) <= COINCIDENT * extents[0]:
@@ -331,16 +280,9 @@ def _least_turn(direction: np.ndarray) -> np.ndarray:
 def similarity_of_matrix(matrix: np.ndarray, name: str) -> Similarity:
     """Convert a (4, 4) matrix to a similarity.
 
-    Parameters
-    ----------
-    matrix : (4, 4) float64
-    name : str
-        Name of the object, for the message.
-
-    Raises
-    ------
-    UsageError
-        The matrix is not finite, is singular, mirrors, or scales its axes differently.
+    ``matrix``: (4, 4) float64. ``name``: name of the object, for the message.
+    Raises UsageError: the matrix is not finite, is singular, mirrors, or scales its axes
+    differently.
     """
     matrix = np.asarray(matrix, np.float64)
     linear = matrix[:3, :3]
@@ -359,15 +301,11 @@ def similarity_of_matrix(matrix: np.ndarray, name: str) -> Similarity:
 def check_scale(placement: Similarity) -> None:
     """Raise if the scale of a placement is too small or large for single precision.
 
-    Raises
-    ------
-    UsageError
-        The scale lies outside of :data:`SMALLEST_SCALE` to :data:`LARGEST_SCALE`.
+    Raises UsageError: the scale lies outside of :data:`SMALLEST_SCALE` to :data:`LARGEST_SCALE`.
     """
     if not SMALLEST_SCALE <= placement.scale <= LARGEST_SCALE:
-        raise UsageError(
-            f"The scene would be scaled by {placement.scale:.3g}.", "Check the distance entered."
-        )
+        text = f"The scene would be scaled by {placement.scale:.3g}."
+        raise UsageError(text, "Check the distance entered.")
 
 
 def _count(number: int) -> str:
@@ -383,7 +321,6 @@ def _finite(points: np.ndarray) -> np.ndarray:
 
 # -- Read and write ``placement.json``: the transform of Blender's parent empty in float64 --------
 
-
 FILE_NAME = "placement.json"
 VERSION = 1
 _ORTHONORMAL = 1e-9
@@ -395,43 +332,26 @@ def write_placement(
 ) -> None:
     """Write a placement together with its scene frame.
 
-    Raises
-    ------
-    UsageError
-        The file cannot be written.
+    Raises UsageError: the file cannot be written.
     """
     values = {
-        "version": VERSION,
-        "blender_from_scene": blender_from_scene.to_json(),
+        "version": VERSION, "blender_from_scene": blender_from_scene.to_json(),
         "world_from_scene": world_from_scene.to_json(),
-    }
+    }  # fmt: skip
     try:
         write_json(path, values)
     except OSError as error:
-        raise UsageError(
-            f"{path} cannot be written: {error.strerror}.", "Check the folder's permissions."
-        ) from None
+        text = f"{path} cannot be written: {error.strerror}."
+        raise UsageError(text, "Check the folder's permissions.") from None
 
 
 def read_placement(path: Path, world_from_scene: Similarity) -> Similarity | None:
     """Read ``blender_from_scene``.
 
-    Parameters
-    ----------
-    path : Path
-    world_from_scene : Similarity
-        Scene frame of the result that the placement applies to.
-
-    Returns
-    -------
-    Similarity or None
-        None if the file was written for another scene frame (the cameras were solved again), in
-        which its lengths and directions differ.
-
-    Raises
-    ------
-    ParseError
-        The file holds no placement.
+    ``world_from_scene``: scene frame of the result that the placement applies to.
+    Returns None if the file was written for another scene frame (the cameras were solved again), in
+    which its lengths and directions differ.
+    Raises ParseError: the file holds no placement.
     """
     hint = "Delete the file; the scene is then placed as it was trained."
     try:

@@ -106,7 +106,6 @@ class Scene:
 
 # -- Which views of a scene are held out, which are trained on, and a few of many -----------------
 
-
 FEW_PHOTOS = 8
 """Below this number of photos, only one is held out."""
 
@@ -131,9 +130,8 @@ def held_out_views(scene: Scene, every: int) -> list[int]:
 def training_views(scene: Scene, photos: PhotoSource, every: int) -> list[int]:
     """Return the views that are trained on: not held out, and not covered by their mask."""
     held_out = set(held_out_views(scene, every))
-    return [
-        i for i in range(len(scene.views)) if i not in held_out and _has_visible_pixels(photos, i)
-    ]
+    rest = [i for i in range(len(scene.views)) if i not in held_out]
+    return [i for i in rest if (mask := photos.mask(i, 1)) is None or bool(mask.any())]
 
 
 def evenly_spaced(items: Sequence[_Item], most: int) -> list[_Item]:
@@ -142,13 +140,7 @@ def evenly_spaced(items: Sequence[_Item], most: int) -> list[_Item]:
     return [items[position] for position in positions.tolist()]
 
 
-def _has_visible_pixels(photos: PhotoSource, index: int) -> bool:
-    mask = photos.mask(index, 1)
-    return mask is None or bool(mask.any())
-
-
 # -- Save and load a :class:`~.scene.Scene`: ``scene.json`` and ``points.npz``, no pickles --------
-
 
 VERSION = 1
 SCENE_NAME = "scene.json"
@@ -160,63 +152,42 @@ _AGAIN = "Run the cameras stage again."
 
 def save_scene(scene: Scene, folder: Path) -> None:
     """Write ``scene.json`` and ``points.npz`` into ``folder``."""
+    points, colors = np.asarray(scene.points, np.float64), np.asarray(scene.point_colors, np.uint8)
     buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        points=np.asarray(scene.points, np.float64),
-        point_colors=np.asarray(scene.point_colors, np.uint8),
-    )
+    np.savez_compressed(buffer, points=points, point_colors=colors)
     write_bytes(folder / POINTS_NAME, buffer.getvalue())
-    write_json(folder / SCENE_NAME, scene_to_json(scene, folder))
+    write_json(folder / SCENE_NAME, _scene_to_json(scene, folder))
 
 
-def load_saved_scene(folder: Path) -> Scene:
-    """Read what :func:`save_scene` wrote.
-
-    Raises
-    ------
-    ParseError
-        A file is missing, damaged or of another version.
-    DatasetError
-        A photo no longer exists.
-    """
-    path = folder / SCENE_NAME
-    if not path.is_file():
-        raise ParseError(path, "whole file", "the file is missing.", _AGAIN)
-    return scene_from_json(read_json(path), folder)
-
-
-def scene_to_json(scene: Scene, folder: Path | None = None) -> dict[str, Any]:
+def _scene_to_json(scene: Scene, folder: Path) -> dict[str, Any]:
     """Return the scene without its points as plain JSON values.
 
     Paths inside ``folder``, or in a folder beside it, are written relative to it, so that a job
     folder can be moved; and those inside the folder that several computers share
     (``names.SHARED_VARIABLE``), which each sees elsewhere.
     """
+    views = []
+    for view in scene.views:
+        mask = None if view.mask_path is None else _written(view.mask_path, folder)
+        photo = _written(view.photo_path, folder)
+        views.append({"camera": view.camera.to_json(), "photo": photo, "mask": mask})
     return {
-        "version": VERSION,
-        "world_from_scene": scene.world_from_scene.to_json(),
+        "version": VERSION, "world_from_scene": scene.world_from_scene.to_json(),
         "warnings": [warning.to_json() for warning in scene.warnings],
-        "facts": scene.facts,
-        "views": [
-            {
-                "camera": view.camera.to_json(),
-                "photo": _written(view.photo_path, folder),
-                "mask": None if view.mask_path is None else _written(view.mask_path, folder),
-            }
-            for view in scene.views
-        ],
-    }
+        "facts": scene.facts, "views": views,
+    }  # fmt: skip
 
 
-def scene_from_json(values: Any, folder: Path) -> Scene:
-    """Build a scene from :func:`scene_to_json`'s values and ``points.npz`` of ``folder``.
+def load_saved_scene(folder: Path) -> Scene:
+    """Read what :func:`save_scene` wrote.
 
-    Raises
-    ------
-    ParseError, DatasetError
+    Raises ParseError: a file is missing, damaged or of another version; DatasetError: a photo no
+    longer exists.
     """
     path = folder / SCENE_NAME
+    if not path.is_file():
+        raise ParseError(path, "whole file", "the file is missing.", _AGAIN)
+    values = read_json(path)
     if not isinstance(values, dict) or values.get("version") != VERSION:
         raise ParseError(path, "version", f"version {VERSION} was expected.", _AGAIN)
     try:
@@ -235,27 +206,22 @@ def scene_from_json(values: Any, folder: Path) -> Scene:
     for view in views:
         for file in (view.photo_path, view.mask_path):
             if file is not None and not os.path.isfile(file):  # false for over-long names as well
-                raise DatasetError(
-                    f"Photo {file} no longer exists.", "Put it back, or start the job anew."
-                )
+                hint = "Put it back, or start the job anew."
+                raise DatasetError(f"Photo {file} no longer exists.", hint)
     points, colors = _read_points(folder / POINTS_NAME)
     return Scene(views, points, colors, world_from_scene, warnings, facts)
 
 
-def _written(path: Path, folder: Path | None) -> str:
-    if folder is not None and path.is_relative_to(folder):
+def _written(path: Path, folder: Path) -> str:
+    if path.is_relative_to(folder):
         return path.relative_to(folder).as_posix()
-    if folder is not None and path.is_relative_to(folder.parent):  # frames of a video
+    if path.is_relative_to(folder.parent):  # frames of a video
         return f"../{path.relative_to(folder.parent).as_posix()}"
-    shared = os.environ.get(SHARED_VARIABLE)
-    if folder is not None and shared and _both_in(Path(shared), path, folder):
-        return Path(os.path.relpath(path, folder)).as_posix()
+    if shared := os.environ.get(SHARED_VARIABLE):
+        root = Path(shared).resolve()
+        if path.is_relative_to(root) and folder.resolve().is_relative_to(root):
+            return Path(os.path.relpath(path, folder)).as_posix()
     return str(path)
-
-
-def _both_in(shared: Path, path: Path, folder: Path) -> bool:
-    root = shared.resolve()
-    return path.is_relative_to(root) and folder.resolve().is_relative_to(root)
 
 
 def _read(written: str, folder: Path) -> Path:
@@ -264,25 +230,17 @@ def _read(written: str, folder: Path) -> Path:
 
 
 def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    arrays = read_arrays(
-        path, ("points", "point_colors"), most_bytes=MOST_POINTS_BYTES, hint=_AGAIN
-    )
-    points, colors = arrays["points"], arrays["point_colors"]
-    good = (
-        points.dtype == np.float64
-        and colors.dtype == np.uint8
-        and points.ndim == 2
-        and points.shape[1:] == (3,)
-        and points.shape == colors.shape
-        and bool(np.isfinite(points).all())
-    )
-    if not good:
+    names = ("points", "point_colors")
+    arrays = read_arrays(path, names, most_bytes=MOST_POINTS_BYTES, hint=_AGAIN)
+    points, colors = (arrays[name] for name in names)
+    of_kind = points.dtype == np.float64 and colors.dtype == np.uint8
+    of_shape = points.ndim == 2 and points.shape[1:] == (3,) and points.shape == colors.shape
+    if not (of_kind and of_shape and np.isfinite(points).all()):
         raise ParseError(path, "arrays", "not (n, 3) finite points and colours.", _AGAIN)
     return points, colors
 
 
 # -- A saved scene with the camera poses that training refined ------------------------------------
-
 
 POSES_NAME = "camera_poses.npz"
 ROTATION_TOLERANCE = 1e-6
@@ -308,17 +266,9 @@ def save_poses(folder: Path, poses: np.ndarray | None) -> None:
 def load_refined_scene(cameras: Path, training: Path) -> Scene:
     """Read a scene as its training left it: with refined poses, where there are any.
 
-    Parameters
-    ----------
-    cameras, training : Path
-        Folders of the two stages.
-
-    Raises
-    ------
-    ParseError
-        A file is missing, truncated or of another version, or the poses are none.
-    DatasetError
-        A photo no longer exists.
+    ``cameras``, ``training``: folders of the two stages.
+    Raises ParseError: a file is missing, truncated or of another version, or the poses are none;
+    DatasetError: a photo no longer exists.
     """
     scene = load_saved_scene(cameras)
     path = training / POSES_NAME

@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DatasetError, ParseError
-from ..scene.camera import Camera, Similarity
+from ..scene.camera import Camera
 from ..scene.placement import umeyama
 from .georeference import (
     GeoPoint,
@@ -24,10 +24,10 @@ from .georeference import (
     refined_similarity,
     robust_similarity,
     rounded,
+    utm_epsg,
 )
 
 # -- Triangulate a point that several posed photos show, some of them perhaps wrongly -------------
-
 
 MIN_ANGLE_DEG = 1.5
 """Between two rays: at one degree, a pixel of error moves the point by 50 pixels along them."""
@@ -55,20 +55,10 @@ def triangulate(
 ) -> TriangulatedPoint | None:
     """Find the point that most observations agree with, then minimise their squared distances.
 
-    Parameters
-    ----------
-    cameras : sequence of n Camera
-    pixels : (n, 2) float64
-        Where each camera shows the point.
-    threshold_px : float
-        Observations further away are wrong.
-    noise_px : float
-        Smallest error of an observation to reckon with.
-
-    Returns
-    -------
-    TriangulatedPoint or None
-        None if no two photos agree whose rays meet under :data:`MIN_ANGLE_DEG`.
+    ``pixels``: (n, 2) float64, where each camera shows the point.
+    ``threshold_px``: observations further away are wrong.
+    ``noise_px``: smallest error of an observation to reckon with.
+    Returns None if no two photos agree whose rays meet under :data:`MIN_ANGLE_DEG`.
     """
     pixels = np.asarray(pixels, np.float64).reshape(-1, 2)
     centers = np.array([c.center for c in cameras]).reshape(-1, 3)
@@ -79,8 +69,7 @@ def triangulate(
     best: tuple[int, float, np.ndarray, np.ndarray] | None = None
     pairs = list(itertools.combinations(range(len(cameras)), 2))
     for i, j in pairs[:: max(1, math.ceil(len(pairs) / MAX_PAIRS))]:
-        sine = np.linalg.norm(np.cross(rays[i], rays[j]))
-        if sine < math.sin(math.radians(MIN_ANGLE_DEG)):
+        if np.linalg.norm(np.cross(rays[i], rays[j])) < math.sin(math.radians(MIN_ANGLE_DEG)):
             continue
         point = _nearest(centers[[i, j]], rays[[i, j]])
         distances = _distances(cameras, pixels, point)
@@ -149,15 +138,13 @@ def _least_squares(
         squared = float((errors**2).sum())
         if np.linalg.norm(step) <= 1e-12 * (1.0 + np.linalg.norm(point)):
             break
-    freedom = max(2 * len(chosen) - 3, 1)
-    variance = max(squared / freedom, noise_px**2)
+    variance = max(squared / max(2 * len(chosen) - 3, 1), noise_px**2)
     return point, variance * np.linalg.inv(normal)
 
 
 # -- Read control points: known places, and where photos show them (docs/file-formats.md) ---------
 #
 # The first line names the coordinates, each further one is a place seen in a photo.
-
 
 LOCAL = "local"
 """Name of coordinates in metres in a frame of their own."""
@@ -183,17 +170,12 @@ class CoordinateSystem:
     """0: not UTM."""
     north: bool = True
 
-    @property
-    def is_local(self) -> bool:
-        """Whether coordinates are metres in a frame of their own, z up."""
-        return self.name == LOCAL
-
     def to_metric(self, places: np.ndarray) -> tuple[np.ndarray, GeoPoint | None]:
         """Return (n, 3) metric coordinates and the place of their origin, None if local.
 
         Geographic and UTM coordinates become metres east, north and up of the median place.
         """
-        if self.is_local:
+        if self.name == LOCAL:
             return places, None
         if self.utm_zone:
             geographic = geographic_from_utm(places, self.utm_zone, self.north)
@@ -229,21 +211,16 @@ class ControlFile:
 def read_control_file(path: Path) -> ControlFile:
     """Read a file of control points.
 
-    Raises
-    ------
-    DatasetError
-        The file does not exist or is too large.
-    ParseError
-        Names the line that is wrong.
+    Raises DatasetError: the file does not exist or is too large; ParseError, which names the line
+    that is wrong.
     """
     try:
         with path.open("rb") as stream:
             raw = stream.read(MAX_FILE_BYTES + 1)
     except OSError as error:
-        raise DatasetError(
-            f"Control points {path} cannot be read: {error.strerror or error}.",
-            "Put the file back and resume the job, or start anew without control points.",
-        ) from None
+        text = f"Control points {path} cannot be read: {error.strerror or error}."
+        hint = "Put the file back and resume the job, or start anew without control points."
+        raise DatasetError(text, hint) from None
     if len(raw) > MAX_FILE_BYTES:
         raise DatasetError(f"{path} is larger than {MAX_FILE_BYTES >> 20} MiB.", _HINT)
     try:
@@ -256,10 +233,7 @@ def read_control_file(path: Path) -> ControlFile:
 def parse_control_file(text: str, path: Path) -> ControlFile:
     """Parse the text of a file of control points; ``path`` is for messages.
 
-    Raises
-    ------
-    ParseError
-        Names the line that is wrong.
+    Raises ParseError, which names the line that is wrong.
     """
     system: CoordinateSystem | None = None
     seen: dict[str, list[tuple[np.ndarray, str, tuple[float, float], int]]] = {}
@@ -290,7 +264,7 @@ def _system(text: str, path: Path, line: int) -> CoordinateSystem:
         if code in (4326, 4979):
             return CoordinateSystem(f"EPSG:{code}")
         if 1 <= code % 100 <= 60 and code // 100 in (326, 327):
-            return CoordinateSystem(f"EPSG:{code}", code % 100, code // 100 == 326)
+            return _utm(code % 100, code // 100 == 326)
         raise ParseError(path, f"line {line}", f"EPSG:{code} is not known here.", _HINT)
     if words.startswith("+proj="):
         if re.match(r"\+proj=(longlat|latlong|lonlat)\b", words):
@@ -305,7 +279,7 @@ def _system(text: str, path: Path, line: int) -> CoordinateSystem:
 
 
 def _utm(zone: int, north: bool) -> CoordinateSystem:
-    return CoordinateSystem(f"EPSG:{(32600 if north else 32700) + zone}", zone, north)
+    return CoordinateSystem(f"EPSG:{utm_epsg(zone, north)}", zone, north)
 
 
 def _observation(
@@ -338,25 +312,17 @@ def _point(
     photos: dict[str, int] = {}
     for place, photo, _, line in entries:
         if np.abs(place - first).max() > SAME_PLACE * max(1.0, float(np.abs(first).max())):
-            raise ParseError(
-                path, f"line {line}", f"{name} has other coordinates than in line {entries[0][3]}."
-            )
+            text = f"{name} has other coordinates than in line {entries[0][3]}."
+            raise ParseError(path, f"line {line}", text)
         if photo in photos:
-            raise ParseError(
-                path, f"line {line}", f"{name} is in {photo} already, in line {photos[photo]}."
-            )
+            text = f"{name} is in {photo} already, in line {photos[photo]}."
+            raise ParseError(path, f"line {line}", text)
         photos[photo] = line
-    return ControlPoint(
-        name,
-        first,
-        tuple(photos),
-        np.array([pixel for _, _, pixel, _ in entries]),
-        tuple(photos.values()),
-    )
+    pixels = np.array([pixel for _, _, pixel, _ in entries])
+    return ControlPoint(name, first, tuple(photos), pixels, tuple(photos.values()))
 
 
 # -- Similarity from the cameras' frame to control points: triangulate, fit, name what is wrong
-
 
 PIXEL_THRESHOLD_PX = 10.0
 """Clicks further from the point that most photos agree about are wrong; people hit a mark within a
@@ -377,10 +343,10 @@ MAX_TILT_DEG = 5.0
 class ControlFit:
     """Cameras fitted to control points."""
 
-    metric_from_world: Similarity
     origin: GeoPoint | None
     """None: the points' coordinates are local."""
     fit: RobustFit
+    """Whose target is the metric frame."""
     details: dict[str, Any]
 
 
@@ -396,44 +362,20 @@ class Observations:
     """(n, 2) in the pinhole images of these cameras."""
 
 
-def observations(
-    content: ControlFile, pixels: Mapping[tuple[str, int], tuple[int, np.ndarray]]
-) -> list[Observations]:
-    """Gather the observations of each point.
-
-    Parameters
-    ----------
-    pixels : mapping
-        Camera and pinhole pixel of each observation whose photo was placed, by the point's name
-        and the index of the observation.
-    """
-    out = []
-    for point in content.points:
-        keys = [(point.name, i) for i in range(len(point.photos))]
-        found = [pixels[key] for key in keys if key in pixels]
-        places = np.array([pixel for _, pixel in found]).reshape(-1, 2)
-        out.append(Observations(point.name, point.position, tuple(c for c, _ in found), places))
-    return out
-
-
 def fit_control_points(
     content: ControlFile, cameras: Sequence[Camera], seen: Sequence[Observations]
 ) -> ControlFit:
     """Triangulate the points and fit a similarity.
 
-    Raises
-    ------
-    DatasetError
-        Fewer than three points are seen well, they lie on one line, or they disagree.
+    Raises DatasetError: fewer than three points are seen well, they lie on one line, or they
+    disagree.
     """
     names, known, found, errors_px, skipped = [], [], [], [], []
     for point in seen:
         place = triangulate(
-            [cameras[i] for i in point.cameras],
-            point.pixels,
-            threshold_px=PIXEL_THRESHOLD_PX,
+            [cameras[i] for i in point.cameras], point.pixels, threshold_px=PIXEL_THRESHOLD_PX,
             noise_px=PIXEL_NOISE_PX,
-        )
+        )  # fmt: skip
         if place is None:
             skipped.append(point.name)
             continue
@@ -465,25 +407,18 @@ def fit_control_points(
             f"{fit.tilt_error_deg:.2g} degrees.",
             "Add a point well to the side.",
         )
+    told = zip(names, fit.residuals.tolist(), errors_px, fit.used.tolist(), strict=True)
     points = [
-        {
-            "name": name,
-            "residual_m": rounded(float(fit.residuals[i])),
-            "error_px": rounded(errors_px[i]),
-            "used": bool(fit.used[i]),
-        }
-        for i, name in enumerate(names)
+        {"name": n, "residual_m": rounded(apart), "error_px": rounded(error_px), "used": used}
+        for n, apart, error_px, used in told
     ]
     details = {
         "control_points": {
-            "system": content.system.name,
-            "used": int(fit.used.sum()),
+            "system": content.system.name, "used": int(fit.used.sum()),
             "left_out": [n for n, good in zip(names, fit.used, strict=True) if not good],
-            "not_seen": skipped,
-            "median_m": rounded(fit.median),
+            "not_seen": skipped, "median_m": rounded(float(np.median(fit.residuals))),
             "max_m": rounded(float(fit.residuals.max())),
-            "tilt_error_deg": rounded(fit.tilt_error_deg),
-            "points": points,
+            "tilt_error_deg": rounded(fit.tilt_error_deg), "points": points,
         }
-    }
-    return ControlFit(fit.target_from_source, origin, fit, details)
+    }  # fmt: skip
+    return ControlFit(origin, fit, details)

@@ -20,7 +20,6 @@ from ..scene.placement import fit_similarity, umeyama_ransac
 #
 # Formulas and their orders: docs/method.md, section 13.1. Heights are above the ellipsoid.
 
-
 SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY_2 = FLATTENING * (2.0 - FLATTENING)
@@ -44,40 +43,20 @@ class GeoPoint:
     longitude_deg: float
     altitude_m: float
 
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
-        return {
-            "latitude_deg": self.latitude_deg,
-            "longitude_deg": self.longitude_deg,
-            "altitude_m": self.altitude_m,
-        }
-
 
 def ecef_from_geographic(places: np.ndarray) -> np.ndarray:
     """Return earth-centred, earth-fixed coordinates.
 
-    Parameters
-    ----------
-    places : (n, 3) float64
-        Latitude and longitude in degrees, height in metres.
-
-    Returns
-    -------
-    (n, 3) float64, metres
+    ``places``: (n, 3) float64, latitude and longitude in degrees, height in metres.
+    Returns (n, 3) float64, metres.
     """
     places = np.asarray(places, np.float64).reshape(-1, 3)
     latitude, longitude = np.radians(places[:, 0]), np.radians(places[:, 1])
     height = places[:, 2]
     normal = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_2 * np.sin(latitude) ** 2)
     across = (normal + height) * np.cos(latitude)
-    return np.stack(
-        [
-            across * np.cos(longitude),
-            across * np.sin(longitude),
-            (normal * (1.0 - ECCENTRICITY_2) + height) * np.sin(latitude),
-        ],
-        1,
-    )
+    x, y = across * np.cos(longitude), across * np.sin(longitude)
+    return np.stack([x, y, (normal * (1.0 - ECCENTRICITY_2) + height) * np.sin(latitude)], 1)
 
 
 def geographic_from_ecef(points: np.ndarray) -> np.ndarray:
@@ -103,20 +82,19 @@ def geographic_from_ecef(points: np.ndarray) -> np.ndarray:
 def enu_axes(origin: GeoPoint) -> np.ndarray:
     """Return the (3, 3) rotation whose rows are east, north and up at a place, in ECEF axes."""
     latitude, longitude = math.radians(origin.latitude_deg), math.radians(origin.longitude_deg)
-    sl, cl, so, co = (
-        math.sin(latitude), math.cos(latitude), math.sin(longitude), math.cos(longitude),
-    )  # fmt: skip
+    sl, cl, so, co = (f(angle) for angle in (latitude, longitude) for f in (math.sin, math.cos))
     return np.array([[-so, co, 0.0], [-sl * co, -sl * so, cl], [cl * co, cl * so, sl]])
 
 
 def enu_from_geographic(places: np.ndarray, origin: GeoPoint) -> np.ndarray:
     """Return (n, 3) metres east, north and up of ``origin`` of (n, 3) geographic places."""
-    return (ecef_from_geographic(places) - _ecef(origin)) @ enu_axes(origin).T
+    return (ecef_from_geographic(places) - ecef_from_geographic(_row(origin))) @ enu_axes(origin).T
 
 
 def geographic_from_enu(points: np.ndarray, origin: GeoPoint) -> np.ndarray:
     """Return (n, 3) latitude, longitude (degrees) and height of (n, 3) points about ``origin``."""
-    return geographic_from_ecef(np.asarray(points, np.float64) @ enu_axes(origin) + _ecef(origin))
+    points = np.asarray(points, np.float64) @ enu_axes(origin)
+    return geographic_from_ecef(points + ecef_from_geographic(_row(origin)))
 
 
 def utm_zone(latitude_deg: float, longitude_deg: float) -> int | None:
@@ -154,14 +132,9 @@ def utm_from_geographic(places: np.ndarray, zone: int, north: bool) -> np.ndarra
     for j, a in enumerate(alpha, 1):
         northing += a * np.sin(2 * j * xi) * np.cosh(2 * j * eta)
         easting += a * np.cos(2 * j * xi) * np.sinh(2 * j * eta)
-    return np.stack(
-        [
-            UTM_FALSE_EASTING_M + UTM_SCALE * radius * easting,
-            UTM_SCALE * radius * northing + (0.0 if north else UTM_FALSE_NORTHING_M),
-            places[:, 2],
-        ],
-        1,
-    )
+    easting = UTM_FALSE_EASTING_M + UTM_SCALE * radius * easting
+    northing = UTM_SCALE * radius * northing + (0.0 if north else UTM_FALSE_NORTHING_M)
+    return np.stack([easting, northing, places[:, 2]], 1)
 
 
 def geographic_from_utm(points: np.ndarray, zone: int, north: bool) -> np.ndarray:
@@ -191,19 +164,15 @@ def utm_of(origin: GeoPoint) -> dict[str, Any] | None:
     if zone is None:
         return None
     north = origin.latitude_deg >= 0.0
-    place = [[origin.latitude_deg, origin.longitude_deg, origin.altitude_m]]
-    easting, northing, _ = utm_from_geographic(np.array(place), zone, north)[0]
+    easting, northing, _ = utm_from_geographic(_row(origin), zone, north)[0]
     return {
-        "zone": f"{zone}{'N' if north else 'S'}",
-        "epsg": utm_epsg(zone, north),
-        "easting_m": float(easting),
-        "northing_m": float(northing),
-    }
+        "zone": f"{zone}{'N' if north else 'S'}", "epsg": utm_epsg(zone, north),
+        "easting_m": float(easting), "northing_m": float(northing),
+    }  # fmt: skip
 
 
-def _ecef(origin: GeoPoint) -> np.ndarray:
-    place = [[origin.latitude_deg, origin.longitude_deg, origin.altitude_m]]
-    return ecef_from_geographic(np.array(place))[0]
+def _row(place: GeoPoint) -> np.ndarray:
+    return np.array([[place.latitude_deg, place.longitude_deg, place.altitude_m]])
 
 
 def _meridian_deg(zone: int) -> float:
@@ -237,7 +206,6 @@ def _series() -> tuple[float, tuple[float, ...], tuple[float, ...]]:
 # Errors of GPS are not known beforehand: the inlier threshold is halved for as long as enough
 # pairs agree (docs/method.md, section 13.2).
 
-
 MIN_AGREEING_SHARE = 2.0 / 3.0
 """Share of the pairs that a threshold has to keep: with fewer, most of a set may be wrong alike."""
 INLIER_SIGMAS = 3.0
@@ -270,34 +238,18 @@ class RobustFit:
     lever: float
     """The same from the line through them that they lie closest to."""
 
-    @property
-    def median(self) -> float:
-        """Median residual of all pairs, units of the target."""
-        return float(np.median(self.residuals))
-
 
 def robust_similarity(
-    source: np.ndarray,
-    target: np.ndarray,
-    *,
-    largest_error: float,
-    noise: float,
+    source: np.ndarray, target: np.ndarray, *, largest_error: float, noise: float
 ) -> RobustFit:
     """Fit a similarity to pairs of which up to a third are wrong.
 
-    Parameters
-    ----------
-    source, target : (n, 3) float64
-    largest_error : float
-        Error, units of the target, beyond which a pair is wrong in any case.
-    noise : float
-        Smallest standard deviation of a target coordinate to reckon with, units of the target:
-        residuals of few pairs may be small by chance.
-
-    Raises
-    ------
-    DatasetError
-        Fewer than three pairs, all on one line or in one place, or no agreement of two thirds.
+    ``source``, ``target``: (n, 3) float64.
+    ``largest_error``: error, units of the target, beyond which a pair is wrong in any case.
+    ``noise``: smallest standard deviation of a target coordinate to reckon with, units of the
+        target: residuals of few pairs may be small by chance.
+    Raises DatasetError: fewer than three pairs, all on one line or in one place, or no agreement of
+    two thirds.
     """
     needed = max(3, math.ceil(MIN_AGREEING_SHARE * len(source)))
     threshold, best = largest_error, None
@@ -329,17 +281,16 @@ def refined_similarity(
 
     Parameters as of :func:`robust_similarity`; ``used`` (n,) bool is where to begin.
     """
-    for _ in range(_FIT_ROUNDS):
+    for round_ in range(_FIT_ROUNDS + 1):
         fit = fit_similarity(source[used], target[used], True)
         residuals = np.linalg.norm(fit.points(source) - target, axis=1)
-        sigma = _sigma(residuals[used], noise)
+        # Of one coordinate.
+        freedom = max(3 * int(used.sum()) - _PARAMETERS, 1)
+        sigma = max(math.sqrt(float((residuals[used] ** 2).sum()) / freedom), noise)
         within = residuals <= INLIER_SIGMAS * math.sqrt(3.0) * sigma
-        if (within == used).all() or within.sum() < 3:
+        if (within == used).all() or within.sum() < 3 or round_ == _FIT_ROUNDS:
             break
         used = within
-    fit = fit_similarity(source[used], target[used], True)
-    residuals = np.linalg.norm(fit.points(source) - target, axis=1)
-    sigma = _sigma(residuals[used], noise)
     local = fit.points(source[used])
     local = local - local.mean(0)
     extents = np.linalg.eigvalsh(local.T @ local)  # ascending
@@ -352,14 +303,7 @@ def refined_similarity(
     return RobustFit(fit, used, residuals, sigma, sigma / reach, tilt, reach / root, lever / root)
 
 
-def _sigma(residuals: np.ndarray, noise: float) -> float:
-    """Return the standard deviation of one coordinate, from (n,) distances."""
-    freedom = max(3 * len(residuals) - _PARAMETERS, 1)
-    return max(math.sqrt(float((residuals**2).sum()) / freedom), noise)
-
-
 # -- The record of how a scene got its metres, as it goes with results and exports ----------------
-
 
 VERSION = 1
 GPS, MARKERS, CONTROL_POINTS = "gps", "markers", "control points"
@@ -405,20 +349,15 @@ class RealUnits:
         elif self.z_up:
             frame = "local coordinates of the control points"
         return {
-            "version": VERSION,
-            "sources": list(self.sources),
-            "unit": "metre",
-            "frame": frame,
-            "z_up": self.z_up,
-            "applied": self.applied,
-            "origin": None if self.origin is None else self.origin.to_json(),
+            "version": VERSION, "sources": list(self.sources), "unit": "metre", "frame": frame,
+            "z_up": self.z_up, "applied": self.applied,
+            "origin": None if self.origin is None else dataclasses.asdict(self.origin),
             "crs": None if self.origin is None else GEOGRAPHIC_CRS,
             "utm": None if self.origin is None else utm_of(self.origin),
             "metric_from_world": (world if self.applied else metric).to_json(),
             "world_from_input": (metric if self.applied else world).to_json(),
-            "scale_error": self.scale_error,
-            **self.details,
-        }
+            "scale_error": self.scale_error, **self.details,
+        }  # fmt: skip
 
 
 def metric_from_world(record: Any) -> Similarity | None:
@@ -443,11 +382,7 @@ def blender_start(record: Any, world_from_scene: Similarity) -> Similarity | Non
     Where z is up in the metric frame, the scene is placed in that frame, far coordinates less whole
     metres; else it keeps its own axes and origin, in metres.
 
-    Parameters
-    ----------
-    record : object
-        The entry ``georeference``, perhaps None.
-    world_from_scene : Similarity
+    ``record``: the entry ``georeference``, perhaps None.
     """
     metric = metric_from_world(record)
     if metric is None or not record.get("applied"):
@@ -465,13 +400,12 @@ def listed(names: list[str]) -> list[str]:
     return sorted(names)[:MOST_LISTED]
 
 
-def rounded(value: float, digits: int = 4) -> float | None:
-    """Return a measured number with few significant digits, None where it is not finite."""
-    return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+def rounded(value: float) -> float | None:
+    """Return a measured number with four significant digits, None where it is not finite."""
+    return float(f"{value:.4g}") if math.isfinite(value) else None
 
 
 # -- Place solved cameras on the earth by the GPS positions of their photos -----------------------
-
 
 MIN_POSITIONS = 5
 """Photos with a position: with three or four, nothing tells a wrong one."""
@@ -551,24 +485,11 @@ def georeference(
 ) -> Georeference:
     """Fit the cameras' centres to the GPS positions of their photos.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        In any common frame ("world").
-    positions : mapping
-        By the cameras' names; photos without one are left out.
-    needs : Needs
-        What the positions have to determine.
-
-    Returns
-    -------
-    Georeference
-        The origin is the median of the positions.
-
-    Raises
-    ------
-    DatasetError
-        Too few positions, or they do not determine scale and up direction; says why.
+    ``cameras``: in any common frame ("world"). ``positions``: by the cameras' names; photos without
+    one are left out. ``needs``: what the positions have to determine.
+    The origin is the median of the positions.
+    Raises DatasetError: too few positions, or they do not determine scale and up direction; says
+    why.
     """
     known = [c for c in cameras if c.name in positions]
     check_positions([positions[c.name] for c in known], len(cameras))
@@ -580,20 +501,16 @@ def georeference(
     far = np.linalg.norm(enu, axis=1) > MAX_EXTENT_M
     kept = [c for c, out in zip(used, far, strict=True) if not out]
     if len(kept) < MIN_POSITIONS:
-        raise DatasetError(
-            "The GPS positions are spread over more than 50 km.", "Remove photos of other places."
-        )
+        text = "The GPS positions are spread over more than 50 km."
+        raise DatasetError(text, "Remove photos of other places.")
     centers, target = np.array([c.center for c in kept]), enu[~far]
     largest = max([LARGEST_ERROR_M, *(3.0 * p.error_m for p in gps if p.error_m is not None)])
     fit = robust_similarity(
         centers, target, largest_error=min(largest, 4 * LARGEST_ERROR_M), noise=GPS_NOISE_M
     )
-    missing = _doubt(fit, needs)
-    if missing:
-        raise DatasetError(
-            missing,
-            "Take photos from places further apart, not all on one line; or measure a distance.",
-        )
+    if missing := _doubt(fit, needs):
+        hint = "Take photos from places further apart, not all on one line; or measure a distance."
+        raise DatasetError(missing, hint)
     wrong = [c.name for c, good in zip(kept, fit.used, strict=True) if not good]
     wrong += [c.name for c, out in zip(used, far, strict=True) if out]
     dops = [p.dop for p in gps if p.dop is not None]
@@ -601,17 +518,15 @@ def georeference(
     levels = {p.altitude_reference for p in gps}
     details = {
         "gps": {
-            "photos": len(cameras),
-            "photos_with_position": len(used),
-            "used": int(fit.used.sum()),
-            "left_out": listed(wrong),
+            "photos": len(cameras), "photos_with_position": len(used),
+            "used": int(fit.used.sum()), "left_out": listed(wrong),
             **_residuals(fit.target_from_source, centers, target, fit.used),
             "tilt_error_deg": rounded(fit.tilt_error_deg),
             "altitude_reference": levels.pop() if len(levels) == 1 else "mixed",
             "dop_median": rounded(float(np.median(dops))) if dops else None,
             "stated_error_median_m": rounded(float(np.median(errors))) if errors else None,
         }
-    }
+    }  # fmt: skip
     return Georeference(
         origin, fit.target_from_source, fit.scale_error, centers, target, fit.used, details,
         _doubt(fit, GOOD),
@@ -623,10 +538,9 @@ def check_positions(known: Sequence[GpsPosition], photos: int) -> None:
     used = sum(position.altitude_m is not None for position in known)
     if used < MIN_POSITIONS:
         what = "GPS altitude" if len(known) >= MIN_POSITIONS else "GPS position"
-        raise DatasetError(
-            f"{used} of {photos} photos have a {what}; {MIN_POSITIONS} are needed.",
-            "Use photos as they come from the camera, with its location switched on.",
-        )
+        text = f"{used} of {photos} photos have a {what}; {MIN_POSITIONS} are needed."
+        hint = "Use photos as they come from the camera, with its location switched on."
+        raise DatasetError(text, hint)
 
 
 def _origin(places: np.ndarray) -> GeoPoint:
@@ -634,9 +548,8 @@ def _origin(places: np.ndarray) -> GeoPoint:
     first = places[0, 1]
     longitude = first + np.median((places[:, 1] - first + 180.0) % 360.0 - 180.0)
     longitude = (longitude + 180.0) % 360.0 - 180.0
-    return GeoPoint(
-        float(np.median(places[:, 0])), float(longitude), float(np.median(places[:, 2]))
-    )
+    latitude, altitude = np.median(places[:, 0]), np.median(places[:, 2])
+    return GeoPoint(float(latitude), float(longitude), float(altitude))
 
 
 def _doubt(fit: RobustFit, needs: Needs) -> str:

@@ -31,7 +31,6 @@ from .georeference import listed, rounded
 # A corner is rounded by the lens and the pixels, which moves it inwards; edges are not
 # (docs/method.md, section 13.3).
 
-
 MIN_MODULE_PX = 2.5
 """Size of a bit of the marker below which the profile across an edge would reach the bits."""
 _END_SHARE = 0.12
@@ -52,22 +51,15 @@ _MAX_MOVE_PX = 2.5
 def refined_corners(grey: np.ndarray, corners: np.ndarray, modules: int) -> np.ndarray | None:
     """Return the marker's corners as intersections of its edges.
 
-    Parameters
-    ----------
-    grey : (h, w) uint8
-    corners : (4, 2) float64
-        Corners to a pixel or so, around the marker; the first pixel's centre is (0.5, 0.5).
-    modules : int
-        Bits of the marker along a side, the black border included.
-
-    Returns
-    -------
-    (4, 2) float64 or None
-        None if the marker is too small in the photo, or an edge is not clear.
+    ``grey``: (h, w) uint8.
+    ``corners``: (4, 2) float64, corners to a pixel or so, around the marker; the first pixel's
+        centre is (0.5, 0.5).
+    ``modules``: bits of the marker along a side, the black border included.
+    Returns (4, 2) float64; None if the marker is too small in the photo, or an edge is not
+    clear.
     """
     corners = np.asarray(corners, np.float64)
-    sides = np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=1)
-    module = float(sides.min()) / modules
+    module = float(np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=1).min()) / modules
     if module < MIN_MODULE_PX:
         return None
     half = min(_MODULE_SHARE * module, _MAX_HALF_WIDTH_PX)
@@ -112,8 +104,7 @@ def _edge_line(
         return None
     # Slopes of noise count as well: only those near the steepest place belong to the edge.
     offset = (rise * between).sum(1) / np.maximum(total, 1e-9)
-    points = (base + offset[:, None] * normal)[good]
-    return _line(points)
+    return _line((base + offset[:, None] * normal)[good])
 
 
 def _sampled(grey: np.ndarray, places: np.ndarray) -> np.ndarray | None:
@@ -158,7 +149,6 @@ def _crossing(
 # In: ``task.json`` with the dictionary and paths of photos. Out: ``markers.json``, for each photo
 # the numbers and corners of its markers. Photos are decoded by our own reader.
 
-
 TASK, RESULT = "task.json", "markers.json"
 MARKERS_EXTRA = "markers"
 BORDER_BITS = 1
@@ -179,7 +169,8 @@ def main(folder: Path) -> None:
     found: list[list[dict[str, Any]]] = []
     photos = task["photos"]
     for i, path in enumerate(photos):
-        grey = _grey(read_photo(Path(path)).color)
+        red, green, blue = np.moveaxis(read_photo(Path(path)).color.astype(np.uint16), 2, 0)
+        grey = np.ascontiguousarray(((77 * red + 150 * green + 29 * blue) >> 8).astype(np.uint8))
         corners, numbers, _ = detector.detectMarkers(grey)
         found.append(_markers(grey, corners, numbers, modules))
         emit(fraction=(i + 1) / len(photos), message=f"markers of photo {i + 1} of {len(photos)}")
@@ -192,31 +183,18 @@ def _number(cv2: Any, name: str) -> int:
     return next(getattr(cv2.aruco, n) for n in dir(cv2.aruco) if n.lower() == wanted)
 
 
-def _grey(color: np.ndarray) -> np.ndarray:
-    """Return (h, w) uint8 luma of (h, w, 3) uint8."""
-    red, green, blue = (color[..., k].astype(np.uint16) for k in range(3))
-    return np.ascontiguousarray(((77 * red + 150 * green + 29 * blue) >> 8).astype(np.uint8))
-
-
 def _markers(grey: np.ndarray, corners: Any, numbers: Any, modules: int) -> list[dict[str, Any]]:
     out = []
     for number, quad in zip(np.ravel(numbers if numbers is not None else []), corners, strict=True):
         # OpenCV's first pixel has its centre at (0, 0).
         rough = np.asarray(quad, np.float64).reshape(4, 2) + 0.5
         exact = refined_corners(grey, rough, modules)
-        refined = exact is not None
-        out.append(
-            {
-                "number": int(number),
-                "corners_px": (exact if exact is not None else rough).tolist(),
-                "refined": refined,
-            }
-        )
+        corners_px = (rough if exact is None else exact).tolist()
+        out.append({"number": int(number), "corners_px": corners_px, "refined": exact is not None})
     return out[:MAX_MARKERS_A_PHOTO]
 
 
 # -- Scale of a scene from markers of known size: detect, triangulate their corners, compare sides
-
 
 CORNER_THRESHOLD_PX = 3.0
 """Corners further from their common point are of another marker, or the photo's pose is wrong."""
@@ -260,21 +238,16 @@ def find_markers(
 
     A number that a photo shows twice is left out there.
 
-    Raises
-    ------
-    DatasetError
-        A photo cannot be read.
-    WorkerError
-        OpenCV is not installed, or it crashed.
+    Raises DatasetError: a photo cannot be read; WorkerError: OpenCV is not installed, or it
+    crashed.
     """
     folder = work_folder / "markers"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     task = {
-        "dictionary": spec.dictionary,
-        "threads": max(threads, 1),
+        "dictionary": spec.dictionary, "threads": max(threads, 1),
         "photos": [str(path) for path in photos],
-    }
+    }  # fmt: skip
     try:
         write_json(folder / TASK, task)
         run_helper(_HELPER, folder, progress)
@@ -299,17 +272,9 @@ def scale_from_markers(
 ) -> MarkerScale:
     """Compare the triangulated sides of markers with their known side.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Pinhole cameras of the photos that the markers were found in.
-    seen : dict
-        As :func:`find_markers` returns.
-
-    Raises
-    ------
-    DatasetError
-        No marker was found, or none in two photos that show it well.
+    ``cameras``: pinhole cameras of the photos that the markers were found in. ``seen``: as
+    :func:`find_markers` returns.
+    Raises DatasetError: no marker was found, or none in two photos that show it well.
     """
     hint = (
         f"Check the dictionary ({spec.dictionary}), that markers are sharp and at least 30 pixels "
@@ -317,31 +282,21 @@ def scale_from_markers(
     )
     if not seen:
         raise DatasetError(f"No {spec.dictionary} marker was found in the photos.", hint)
-    sizes, errors, numbers, bad = [], [], [], []
-    observations = 0
-    for number, views in sorted(seen.items()):
-        size = _measured_side(cameras, views)
-        if size is None:
-            bad.append(number)
-            continue
-        sizes.append(size[0])
-        errors.append(size[1])
-        numbers.append(number)
-        observations += size[2]
-    if not sizes:
-        raise DatasetError(
-            f"{len(seen)} markers were found, but no two photos agree about one of them.", hint
-        )
-    side, error = np.array(sizes), np.array(errors)
+    sizes = {n: _measured_side(cameras, views) for n, views in sorted(seen.items())}
+    bad = [n for n, size in sizes.items() if size is None]
+    known = {n: size for n, size in sizes.items() if size is not None}
+    if not known:
+        text = f"{len(seen)} markers were found, but no two photos agree about one of them."
+        raise DatasetError(text, hint)
+    observations = sum(size[2] for size in known.values())
+    side, error = (np.array([size[k] for size in known.values()]) for k in (0, 1))
     middle = float(np.median(side))
     apart = np.abs(side / middle - 1.0)
     good = apart <= np.maximum(MAX_SIZE_ERROR, 3.0 * error / middle)
     if not good.any():
-        raise DatasetError(
-            f"The markers differ in size by {100 * float(np.ptp(side)) / middle:.2g} %.",
-            "Print all of them in the same size.",
-        )
-    other = [n for n, ok in zip(numbers, good, strict=True) if not ok]
+        text = f"The markers differ in size by {100 * float(np.ptp(side)) / middle:.2g} %."
+        raise DatasetError(text, "Print all of them in the same size.")
+    other = [n for n, ok in zip(known, good, strict=True) if not ok]
     weights = 1.0 / error[good] ** 2
     # Least squares of known = scale * measured.
     scale = spec.side_m * float((weights * side[good]).sum() / (weights * side[good] ** 2).sum())
@@ -355,17 +310,14 @@ def scale_from_markers(
     relative = max(formal, scatter)
     details = {
         "markers": {
-            "dictionary": spec.dictionary,
-            "side_m": spec.side_m,
-            "found": len(seen),
-            "used": count,
-            "observations": observations,
+            "dictionary": spec.dictionary, "side_m": spec.side_m, "found": len(seen),
+            "used": count, "observations": observations,
             "not_measured": [str(n) for n in bad][:50],
             "left_out": listed([str(n) for n in other]),
             "scale_error": rounded(relative),
             "largest_deviation": rounded(float(np.abs(ratios - 1.0).max())),
         }
-    }
+    }  # fmt: skip
     return MarkerScale(scale, relative, details)
 
 
@@ -398,5 +350,4 @@ def _measured_side(
     # The side is linear in the corners along the fitted square's arms; they sum to |arm|^2 = 2.
     arms = fit.directions(_SQUARE)
     variance = sum(float(a @ c @ a) for a, c in zip(arms, covariances, strict=True))
-    total = float((_SQUARE**2).sum())
-    return fit.scale, math.sqrt(variance) / total, agreeing
+    return fit.scale, math.sqrt(variance) / float((_SQUARE**2).sum()), agreeing
