@@ -36,6 +36,7 @@ from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity, quater
 from gaussian_wrapping_addon.core.scene.frames import CENTER_STEP, POINT_STEP
 from gaussian_wrapping_addon.core.scene.scene import (
     Scene,
+    View,
     evenly_spaced,
     held_out_views,
     load_saved_scene,
@@ -518,9 +519,10 @@ def points_where(
     monkeypatch.setattr(load_module, "triangulate_points", fail)
     pose = np.hstack([np.eye(3), [[0.0], [0.0], [4.0]]])
     cameras = [Camera(f"{k}.png", 80, 60, 80.0, 80.0, 40.0, 30.0, pose) for k in range(3)]
+    views = [View(camera, tmp_path / camera.name) for camera in cameras]
     warnings: list[ReportWarning] = []
     points, colors, origin = load_module.make_start_points(
-        cameras, [], [], tmp_path, Progress(), warnings, seed=0, threads=1
+        views, tmp_path, Progress(), warnings, seed=0, threads=1
     )
     assert len(points) == len(colors) > 1000
     return origin, warnings

@@ -16,6 +16,7 @@ from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.limits import SCENE_RADIUS
 from gaussian_wrapping_addon.core.loading.load import (
+    RANDOM_POINTS,
     count_observing_views,
     load_scene,
     random_points,
@@ -157,11 +158,11 @@ def test_random_points_lie_where_cameras_look() -> None:
         look_at(np.array([4 * np.cos(a), 4 * np.sin(a), 1.0]), np.zeros(3), "x", 64, 48, 60.0)
         for a in np.linspace(0, 6, 9)
     ]
-    points = random_points(cameras, seed=0, count=500)
-    assert points.shape == (500, 3)
+    points = random_points(cameras, seed=0)
+    assert points.shape == (RANDOM_POINTS, 3)
     assert (count_observing_views(cameras, points) >= 2).all()
     assert np.linalg.norm(points, axis=1).max() < SCENE_RADIUS
-    np.testing.assert_array_equal(points, random_points(cameras, seed=0, count=500))
+    np.testing.assert_array_equal(points, random_points(cameras, seed=0))
 
 
 def _texture_free(folder: Path) -> Path:

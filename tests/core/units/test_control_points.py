@@ -226,7 +226,7 @@ def test_exact_points_give_the_exact_frame(count: int) -> None:
     marks = MARKS[:count]
     found = fit_control_points(LOCAL, cameras, seen(cameras, marks, TRUTH.points(marks)))
     np.testing.assert_allclose(
-        found.metric_from_world.matrix(), TRUTH.matrix(), rtol=1e-9, atol=1e-9
+        found.fit.target_from_source.matrix(), TRUTH.matrix(), rtol=1e-9, atol=1e-9
     )
     assert found.origin is None
     assert found.details["control_points"]["used"] == count
@@ -237,7 +237,7 @@ def test_a_wrong_point_is_named_with_its_error() -> None:
     places = TRUTH.points(MARKS)
     places[2] += [0.0, 1.5, 0.0]
     found = fit_control_points(LOCAL, cameras, seen(cameras, MARKS, places))
-    np.testing.assert_allclose(found.metric_from_world.matrix(), TRUTH.matrix(), atol=1e-6)
+    np.testing.assert_allclose(found.fit.target_from_source.matrix(), TRUTH.matrix(), atol=1e-6)
     details = found.details["control_points"]
     assert details["left_out"] == ["m2"]
     assert details["points"][2] == {

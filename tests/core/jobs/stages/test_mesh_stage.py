@@ -473,7 +473,8 @@ def mesh_here(folder: Path):
     points /= np.linalg.norm(points, axis=1)[:, None]
     return meshing.mesh_by_pivots_in_stage(
         folder, Field(ShapeField(sphere(), 0.05), cast(Any, None), 1),
-        gaussians_on(sphere(), cube(1.5), 800, 0.05), cube(1.5), MeshingSettings(method="pivots"), Progress(), seed=0,
+        gaussians_on(sphere(), cube(1.5), 800, 0.05), cube(1.5),
+        MeshingSettings(method="pivots"), Progress(), seed=0,
         depth_samples=DepthSamples(points, -points, np.full(500, 0.02)),
     )  # fmt: skip
 

@@ -27,6 +27,7 @@ from gaussian_wrapping_addon.core.jobs.stages.training import (
     IMAGE_FACTOR,
     MIN_GAUSSIANS,
     MIN_IMAGE_PX,
+    TrainingStages,
     killed_hint,
     reduced_settings,
     train_with_oom_retry,
