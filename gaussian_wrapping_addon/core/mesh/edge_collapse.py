@@ -22,8 +22,7 @@ COUNTERS = 5  # length of ``counts``
 DONE, EMPTY, FULL, PAUSED = 0, 1, 2, 3
 """Why a collapse kernel returned: target reached, heap empty, heap full, budget spent."""
 
-HEAP_ROOM = 128
-"""Free heap entries required before a collapse: more than one collapse adds."""
+HEAP_ROOM = 128  # free heap entries required before a collapse: more than one collapse adds
 
 
 # -- Binary heap over columns, so that a long run can pause, grow the heap and resume (numba) -----
@@ -444,11 +443,8 @@ def place_merged(u, v, kind, mesh, caps, scratch):
 # level (v,) float64 (the highest cost so far when it merged) and the highest cost so far, (1,)
 # float64. The last three are filled.
 
-MAX_RING = 64
-"""Most neighbours of a vertex that can be removed."""
-
-HEAP_COLUMNS = 2
-"""Integer columns of the heap: vertices and stamps."""
+MAX_RING = 64  # most neighbours of a vertex that can be removed
+HEAP_COLUMNS = 2  # integer columns of the heap: vertices and stamps
 
 
 @part(fast=False)
@@ -605,11 +601,8 @@ POINT_WEIGHT = 1e-7
 optimum unique on flat patches; 1e-4 would make collapses across a thin plate cheaper than along it.
 """
 
-OPTIMAL_MAX_RING = 48
-"""Most faces around a merged vertex: fans of needles bake and subdivide badly."""
-
-OPTIMAL_HEAP_COLUMNS = 5
-"""Integer columns of the heap."""
+OPTIMAL_MAX_RING = 48  # most faces around a merged vertex: fans of needles bake and subdivide badly
+OPTIMAL_HEAP_COLUMNS = 5  # integer columns of the heap
 
 
 class Limits(NamedTuple):

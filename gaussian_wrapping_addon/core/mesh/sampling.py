@@ -16,16 +16,14 @@ POINTS_PER_SQUARE = 0.56
 """Points per squared radius of area after thinning, with as many candidates as surface_points uses
 (measured on a sphere; the densest random packing has 0.70)."""
 
-EDGE_PER_RADIUS = 1.5
-"""Mean edge of the triangulated points, in radii (same measurement)."""
+EDGE_PER_RADIUS = 1.5  # mean edge of the triangulated points, in radii (same measurement)
 
 SAME_SIDE_COSINE = -0.2
 OTHER_SIDE_SHARE = 0.1
 """Two points on opposite sides of a thin wall do not conflict, unless they are closer than this
 share of the radius."""
 
-LEVEL_STEP = 2.0
-"""Ratio between the cell sides of successive levels of thinning."""
+LEVEL_STEP = 2.0  # ratio between the cell sides of successive levels of thinning
 
 
 def sample_triangles(

@@ -41,8 +41,7 @@ from .surface_mesh import edge_keys, half_edges, normals_and_areas, vertices_of_
 
 # -- State of a simplification run, and the driver loop of its collapse kernels -------------------
 
-Heap = tuple[np.ndarray, ...]
-"""See :mod:`.edge_collapse`."""
+Heap = tuple[np.ndarray, ...]  # see :mod:`.edge_collapse`
 
 
 class Simplification:
@@ -110,8 +109,7 @@ SHAPE_WEIGHT = 1e-6
 LEAST_ROUNDNESS = 0.03
 """Least height over longest edge of a changed triangle, unless it was narrower before."""
 
-LEAST_COSINE = 0.3
-"""Least cosine between the normals of a triangle before and after a change."""
+LEAST_COSINE = 0.3  # least cosine between the normals of a triangle before and after a change
 
 _NO_LIMIT = np.iinfo(np.int64).max
 
@@ -215,11 +213,8 @@ def left_of(into: np.ndarray, level: np.ndarray, most: float) -> np.ndarray:
 #
 # Libraries that do the same break thin parts (their collapses join sheets) or fold faces over.
 
-MIN_TARGET = 4
-"""Faces of a tetrahedron: no closed surface has fewer."""
-
-EDGES_PER_CALL = 100_000
-"""Edges processed between two checks for cancellation: about 0.2 s."""
+MIN_TARGET = 4  # faces of a tetrahedron: no closed surface has fewer
+EDGES_PER_CALL = 100_000  # edges processed between two checks for cancellation: about 0.2 s
 
 LIMITS = Limits(0.0, -0.97, 1e-4)
 """Bends up to 166 degrees, and no face turns over (90 degrees). Tighter bounds measured worse: they
@@ -321,14 +316,12 @@ def _on_boundary(faces: np.ndarray, count: int) -> np.ndarray:
 # Half-edge collapses leave the edges in arbitrary directions. Flipping some of them lowers the
 # surface error of an adaptive mesh by a tenth, with the same vertices.
 
-PASSES = 6
-"""Nearly all flips happen in the first two; the third and fourth find a few more."""
+PASSES = 6  # nearly all flips happen in the first two; the third and fourth find a few more
 
 LEAST_GAIN = 0.02
 """Share of the error of two triangles that a flip must save; below it, rounding would decide."""
 
-FLAT_HEIGHT = 1e-4
-"""Errors below this share of the edges are ignored: flat parts are not changed."""
+FLAT_HEIGHT = 1e-4  # errors below this share of the edges are ignored: flat parts are not changed
 
 
 def flip_edges(

@@ -17,8 +17,7 @@ from .surface_mesh import SurfaceMesh
 # -- UDIM tiles: several textures side by side in one UV map. Needs numpy only --------------------
 
 TILE_COLUMNS, TILE_ROWS = 10, 100
-FIRST_UDIM = 1001
-"""UDIM tiles are 1001 + column + 10 row."""
+FIRST_UDIM = 1001  # UDIM tiles are 1001 + column + 10 row
 LAST_UDIM = FIRST_UDIM + TILE_COLUMNS * TILE_ROWS - 1
 
 
@@ -107,8 +106,7 @@ class TexturedMesh:
 
 POLYGONS_FILE = "polygons.npz"
 MAX_BYTES = 4 * 2**30
-SAME_UV = 1e-6
-"""UVs of one corner in two triangles that differ by less are the same."""
+SAME_UV = 1e-6  # UVs of one corner in two triangles that differ by less are the same
 _HINT = "Bake the photos again."
 
 

@@ -111,8 +111,7 @@ ON_PLANE_SHARE = 1e-7
 """Tolerance for a vertex on the plane of a region's face, in diagonals of the region: float32
 resolves no less."""
 
-MAX_LISTED_PARTS = 20
-"""The report lists this many of the largest parts."""
+MAX_LISTED_PARTS = 20  # the report lists this many of the largest parts
 
 
 @dataclass(frozen=True)

@@ -194,10 +194,8 @@ def boundary_faces(
 ROUNDS = (1, 3, 6)
 """Interior samples added in each round: the centroid, then random points (10 in all, as in PAM)."""
 
-DECIDED_MARGIN = 0.3
-"""A mean vacancy this far from 0.5 needs no further samples, ..."""
-DISAGREEING_NEIGHBOURS = 3
-"""... unless this many neighbours have the other label."""
+DECIDED_MARGIN = 0.3  # a mean vacancy this far from 0.5 needs no further samples, ...
+DISAGREEING_NEIGHBOURS = 3  # ... unless this many neighbours have the other label
 MIXED_DEVIATION = 0.1
 """Samples near 0.5 whose standard deviation is below this come from a sliver on the surface: more
 samples add nothing, and the minimum cut decides."""
@@ -216,8 +214,7 @@ thin tube saves much area. From 0.1 to 0.05 the mean distances of wheel, fence a
 truth fall or stay, and fewer spokes break; with 0 the torus gets small noisy components."""
 DATA_WEIGHT = 1.0
 """Cost of a label against the samples, in units of the tetrahedron's own mean face area."""
-CAPACITY_STEPS = 4096.0
-"""Integer steps of the median face area in the minimum cut."""
+CAPACITY_STEPS = 4096.0  # integer steps of the median face area in the minimum cut
 LARGEST_CAPACITY = 2**27
 """In the same steps, 32 768 median areas: larger faces are clamped to it. Flow along an arc can
 double the residual capacity of its reverse, which must fit into 32 bits."""

@@ -352,8 +352,7 @@ def split_fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 # -- Volume-preserving Taubin smoothing of closed meshes; off by default --------------------------
 
-SHRINK = 0.5
-"""Share of the way to the mean of the neighbours in the first half of a step."""
+SHRINK = 0.5  # share of the way to the mean of the neighbours in the first half of a step
 
 GROW = -1.0 / (2.0 - 0.1)
 """Share of the second half: it undoes the shrinking of waves longer than about ten edges (the pass
@@ -366,8 +365,7 @@ corners: no folds arise, and wires of three or four faces around are not crushed
 MIN_AREA_SHARE = 0.2
 """The same for a face that would be left with less than this share of its initial area."""
 
-VOLUME_ROUNDS = 5
-"""Newton steps along the normals that restore the volume of each part."""
+VOLUME_ROUNDS = 5  # Newton steps along the normals that restore the volume of each part
 
 MAX_VOLUME_CHANGE = 0.01
 """A part whose volume cannot be restored to 1 % is not smoothed: it has too few faces for its

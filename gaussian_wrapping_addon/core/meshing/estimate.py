@@ -60,17 +60,13 @@ JOINED_VERTEX_BYTES = 1_200
 (measured: 1 000)."""
 GATHERED_POINT_BYTES = 300
 """Peak per dense point while the points of all tiles are thinned together (measured: 210)."""
-SURROUNDINGS = 2.0
-"""Points in and around a tile, as a multiple of its own."""
+SURROUNDINGS = 2.0  # points in and around a tile, as a multiple of its own
 BASE_BYTES = 800 << 20
 """Python, compiled kernels, the Gaussians projected into each camera, the candidate surface."""
 
-EVALUATIONS_PER_POINT = 45.0
-"""Evaluations of vacancy per point of the mesh, over all steps."""
-POINT_S = 60e-6
-"""Everything else, per point: triangulation, thinning, repair."""
-FIXED_S = 6.0
-"""Pivots and candidate surface."""
+EVALUATIONS_PER_POINT = 45.0  # evaluations of vacancy per point of the mesh, over all steps
+POINT_S = 60e-6  # everything else, per point: triangulation, thinning, repair
+FIXED_S = 6.0  # pivots and candidate surface
 SECONDS_LOW, SECONDS_HIGH = 0.5, 2.0
 
 PROBES = 20_000
@@ -293,8 +289,7 @@ long and more of them meet in a point (8.1 to 14.3 for spheres and tori)."""
 FACES_LOW, FACES_HIGH = 0.5, 3.0
 """Per pivot of the Gaussians (1.2 with nine pivots, most of which lie off the surface, to 2.4 with
 two; fewer at the region's boundary)."""
-FACES_ALONE_HIGH = 6.0
-"""The same with the pivots alone (up to 3.3: a torus, two pivots)."""
+FACES_ALONE_HIGH = 6.0  # the same with the pivots alone (up to 3.3: a torus, two pivots)
 PAIR_FACES_LOW, PAIR_FACES_HIGH = 3.0, 7.0
 """Per point from depth samples, all next to the surface (5 to 6 on a trained scene)."""
 
@@ -305,8 +300,7 @@ EVALUATIONS_LOW, EVALUATIONS_HIGH = 2.0, 22.0
 """Evaluations of vacancy per point, bisection of edges included (5.9 to 21.5). An evaluation may
 take as little as a quarter of the time that is measured at the surface."""
 
-POINT_LOW_S, PIVOT_S = 15e-6, 120e-6
-"""Everything else, per point."""
+POINT_LOW_S, PIVOT_S = 15e-6, 120e-6  # everything else, per point
 
 PAIRED_LOW, PAIRED_HIGH = 1.0, 4.0
 """Points per depth sample of the estimate: two where the inside is found behind it; a job uses more

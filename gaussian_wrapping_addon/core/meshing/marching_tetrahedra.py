@@ -150,8 +150,7 @@ def _prism_parts(first: int) -> tuple[tuple[list[int], list[int], tuple[list[int
 #
 # See docs/method.md, section 6.3.
 
-IsEmpty = Callable[[np.ndarray], np.ndarray]
-"""Maps (n, 3) points to (n,) bool: on the empty side."""
+IsEmpty = Callable[[np.ndarray], np.ndarray]  # maps (n, 3) points to (n,) bool: on the empty side
 
 MAX_BISECTIONS = 40
 

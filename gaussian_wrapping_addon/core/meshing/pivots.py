@@ -14,8 +14,7 @@ from ..regions.shapes import Region
 PivotRule = Callable[[GaussianArrays, np.ndarray], np.ndarray]
 """Maps Gaussians and (k,) indices of some of them to the (p, 3) float64 pivots of these."""
 
-PIVOT_SIGMAS = 3.0
-"""Outer pivots lie at this many standard deviations along a direction."""
+PIVOT_SIGMAS = 3.0  # outer pivots lie at this many standard deviations along a direction
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 

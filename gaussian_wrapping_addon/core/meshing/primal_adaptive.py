@@ -41,8 +41,7 @@ from .surface_points import (
 
 _logger = logging.getLogger(__name__)
 
-KIND_SPLIT = 3
-"""Moved slightly off the isosurface to separate parts that would touch."""
+KIND_SPLIT = 3  # moved slightly off the isosurface to separate parts that would touch
 
 DEGENERATE_SHARE = 1e-3
 """Faces narrower than this share of the spacing are removed: collinear points on the region's edges

@@ -23,8 +23,7 @@ from ..regions.shapes import Region
 
 MAX_PASSES = 14
 
-SHORT_HEIGHTS = 2.0
-"""Edges shorter than this many heights are collapsed."""
+SHORT_HEIGHTS = 2.0  # edges shorter than this many heights are collapsed
 
 PATIENT_PASSES = 5
 MAX_SHORT_HEIGHTS = 64.0

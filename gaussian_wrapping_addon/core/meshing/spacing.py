@@ -24,8 +24,7 @@ AUTOMATIC_POINTS = 24_000
 """Surface points without a request: about 50 thousand faces (48 to 55 thousand in jobs; caps add
 some where the region cuts the solid)."""
 
-MIN_VERTICES = 100
-"""Least number of vertices of an adaptive mesh."""
+MIN_VERTICES = 100  # least number of vertices of an adaptive mesh
 
 COARSEST_SHARE = 1 / 8
 """Edges longer than this share of the diagonal would not show a region's contents."""
@@ -40,8 +39,7 @@ VERTICES_PER_UNIFORM = 0.5
 """Vertices of an adaptive mesh, as a share of the uniform mesh with the requested edge length; both
 have the same distance to the surface (benchmarks/meshing_tables.py)."""
 
-FINEST_SHARE = 1e-6
-"""Edges shorter than this share of the diagonal are refused outright."""
+FINEST_SHARE = 1e-6  # edges shorter than this share of the diagonal are refused outright
 
 
 @dataclass(frozen=True)

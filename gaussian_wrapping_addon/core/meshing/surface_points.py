@@ -45,11 +45,8 @@ MAX_CANDIDATES = 1_500_000
 """Most samples of the region's boundary; finer requests get coarser caps, which are flat anyway."""
 
 OVERSAMPLING = 5.0
-RIM_TOLERANCE_SHARE = 1e-3
-"""Length of the bracket around the rim of a cap, in edge lengths."""
-
-INNER_RADII = 2.0
-"""Spacing inside a cap, in local radii: caps are flat."""
+RIM_TOLERANCE_SHARE = 1e-3  # length of the bracket around the rim of a cap, in edge lengths
+INNER_RADII = 2.0  # spacing inside a cap, in local radii: caps are flat
 
 # Corners first, then edges, rims and the interior: the points that define the shape are kept.
 PRIORITY_CORNER, PRIORITY_EDGE, PRIORITY_RIM, PRIORITY_INNER = 0.0, 1.0, 2.0, 4.0
@@ -342,16 +339,12 @@ KIND_SURFACE, KIND_CAP, KIND_JUMP = 0, 1, 2
 """On the isosurface; on the region's boundary; where vacancy jumps across 0.5 (at the limit of what
 the cameras see)."""
 
-PRIORITY_SURFACE = 3.0
-"""Between the rims and the inner part of the caps; see region_caps."""
-
-POINT_OVERSAMPLING = 20.0
-"""Candidates per point before the first thinning."""
+PRIORITY_SURFACE = 3.0  # between the rims and the inner part of the caps
+POINT_OVERSAMPLING = 20.0  # candidates per point before the first thinning
 FIRST_THINNING = 0.4
 """Candidates closer than this share of the radius are not projected. These two constants determine
-how even the points are (and surface_sampling.POINTS_PER_SQUARE)."""
-MAX_BLOCK = 2_000_000
-"""Candidates drawn at a time, to limit memory."""
+how even the points are (and sampling.POINTS_PER_SQUARE)."""
+MAX_BLOCK = 2_000_000  # candidates drawn at a time, to limit memory
 FOOTPRINT_SAMPLES = 20_000
 """Samples of the candidate surface at which the photos' pixel footprint is evaluated."""
 REPORTED_SHARE = 0.1
@@ -363,8 +356,7 @@ MAX_PROJECTION_STEPS = 14
 
 SEARCH_SHARES = (0.25, -0.25, 0.5, -0.5, 1.0, -1.0)
 """Offsets along the normal, in radii, at which points that did not converge search a crossing."""
-SURFACE_POINTS_BRACKET_SHARE = 1e-3
-"""A found crossing is bracketed to this share of the radius."""
+SURFACE_POINTS_BRACKET_SHARE = 1e-3  # a found crossing is bracketed to this share of the radius
 
 
 @dataclass(frozen=True)

@@ -29,13 +29,11 @@ from .tile import BorderFaces, TileSurface, cost_units, longest_edge, tiles_disa
 # repaired and its vertices merged up to the same cost. So dense faces exist of one tile, and
 # along the border of what has been joined so far.
 
-RINGS = 2
-"""Rings of faces around a band's points that are merged along with it."""
+RINGS = 2  # rings of faces around a band's points that are merged along with it
 
 LoadTile = Callable[[int], TileSurface]  # returns the surface of a tile
 
-BLOCK = 1 << 20
-"""Faces that are looked through at once."""
+BLOCK = 1 << 20  # faces that are looked through at once
 
 
 class Joined(NamedTuple):

@@ -41,11 +41,8 @@ CLEARANCE_RADII = 8.0
 flat that it dips less than a radius below the surface, and a thin plate stays whole (with 2.5 it
 got holes)."""
 
-CLEARANCE_CAP_RADII = 2.5
-"""The same from cap points, which have no gaps."""
-
-SIDES_PER_TILE = 16.0
-"""Lattice sides along the side of a square with the area of a tile's surface."""
+CLEARANCE_CAP_RADII = 2.5  # the same from cap points, which have no gaps
+SIDES_PER_TILE = 16.0  # lattice sides along the side of a square with the area of a tile's surface
 
 MIN_SIDE_RADII = 4.0
 MAX_STEINER_POINTS = 400_000
