@@ -134,7 +134,7 @@ class FloaterRemoval:
     kept: int
     removed_solids: int
     removed_cavities: int
-    removed_area_share: float  # Area of the removed components, as a share of the total
+    removed_area_share: float  # area of the removed components, as a share of the total
 
     @property
     def removed(self) -> int:

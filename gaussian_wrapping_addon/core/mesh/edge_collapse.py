@@ -608,8 +608,8 @@ OPTIMAL_HEAP_COLUMNS = 5  # integer columns of the heap
 class Limits(NamedTuple):
     """Bounds on the faces around a collapsed edge."""
 
-    turn_cos: float  # Cosine of the largest rotation of a face in one collapse
-    fold_cos: float  # Cosine of the sharpest new bend between neighbours: -1 is folded back flat
+    turn_cos: float  # cosine of the largest rotation of a face in one collapse
+    fold_cos: float  # cosine of the sharpest new bend between neighbours: -1 is folded back flat
     min_shape: float
     """Least height of a new face over its longest edge, unless the face was narrower before."""
 

@@ -138,7 +138,7 @@ class Units(NamedTuple):
     """What coordinates and costs are measured in; meshes whose costs are compared share it."""
 
     center: np.ndarray  # (3,) float64
-    length: float  # About the size of the mesh
+    length: float  # about the size of the mesh
 
     def local(self, vertices: np.ndarray) -> np.ndarray:
         """Return vertices relative to the centre, in units of the length."""
@@ -228,8 +228,7 @@ class DecimationResult:
 
     vertices: np.ndarray  # (w, 3) float64
     faces: np.ndarray  # (g, 3) int64
-
-    reached: bool  # Whether the target was reached
+    reached: bool  # whether the target was reached
 
 
 def decimate(

@@ -65,7 +65,7 @@ class TexturedMesh:
     """(h, w) uint8 photos blended into each texel, 0 where unseen or between charts."""
     face_atlas: np.ndarray | None = None
     """(f,) uint8 the atlas of each face, from 0; None if there is only one."""
-    further: tuple[AtlasMaps, ...] = ()  # Atlases 1, 2, ...: of the same size, with the same maps
+    further: tuple[AtlasMaps, ...] = ()  # atlases 1, 2, ...: of the same size, with the same maps
     udims: tuple[int, ...] = ()
     """UDIM number of each atlas, which then names its files; empty for numbered atlases."""
 

@@ -29,19 +29,19 @@ class MeshStatistics:
 
     vertices: int
     faces: int
-    boundary_edges: int  # Edges with one face
-    nonmanifold_edges: int  # Edges with more than two faces
-    nonmanifold_vertices: int  # Vertices whose faces form more than one fan
-    inconsistent_edges: int  # Edges whose two faces have opposite orientations
-    degenerate_faces: int  # Faces with two equal corners, or with no area in float64
+    boundary_edges: int  # edges with one face
+    nonmanifold_edges: int  # edges with more than two faces
+    nonmanifold_vertices: int  # vertices whose faces form more than one fan
+    inconsistent_edges: int  # edges whose two faces have opposite orientations
+    degenerate_faces: int  # faces with two equal corners, or with no area in float64
     unused_vertices: int
     euler: int
     components: int
-    genus: int | None  # Sum over all parts; ``None`` where the mesh is not a closed 2-manifold
+    genus: int | None  # sum over all parts; ``None`` where the mesh is not a closed 2-manifold
     volume: float
     area: float
     mean_edge: float
-    closed: bool  # Every edge has exactly two faces, of one orientation
+    closed: bool  # every edge has exactly two faces, of one orientation
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -100,8 +100,8 @@ def _fans(faces: np.ndarray, keys: np.ndarray) -> int:
 
 # -- Validate that a mesh is an oriented 2-manifold, independently of the code that made it -------
 #
-# The checks share no code with :mod:`.repair` and the statistics above but that of scipy, so that
-# a bug there does not hide itself here.
+# The checks share no code with :mod:`.repair` and the statistics above but scipy's connected
+# components, so that a bug there does not hide itself here.
 
 MIN_HEIGHT_SHARE = 1e-6
 """A face with a height below this share of its longest edge counts as degenerate. Files hold
@@ -121,7 +121,7 @@ class CheckedComponent:
     faces: int
     euler: int
     genus: int | None  # ``None`` where the mesh is not a closed oriented 2-manifold
-    volume: float  # Negative for a cavity; in the mesh's units
+    volume: float  # negative for a cavity; in the mesh's units
 
 
 @dataclass(frozen=True)
@@ -129,18 +129,18 @@ class ManifoldCheck:
     """Defects of a mesh; a valid one has counts of 0 and a positive ``volume``."""
 
     faces: int
-    bad_indices: int  # Faces with an index out of range; they are left out of all other counts
+    bad_indices: int  # faces with an index out of range; they are left out of all other counts
     not_finite_vertices: int
     unused_vertices: int
-    open_edges: int  # Edges with one face
-    nonmanifold_edges: int  # Edges with more than two faces
-    inconsistent_edges: int  # Edges whose two faces have opposite orientations
-    nonmanifold_vertices: int  # Vertices whose faces form more than one ring
+    open_edges: int  # edges with one face
+    nonmanifold_edges: int  # edges with more than two faces
+    inconsistent_edges: int  # edges whose two faces have opposite orientations
+    nonmanifold_vertices: int  # vertices whose faces form more than one ring
     degenerate_faces: int
     """Faces with a repeated corner, or with a height below :data:`MIN_HEIGHT_SHARE`."""
     euler: int
     volume: float
-    parts: tuple[CheckedComponent, ...]  # From the largest number of faces to the smallest
+    parts: tuple[CheckedComponent, ...]  # from the largest number of faces to the smallest
     open_at_region: int | None = None
     """Open edges that lie on one plane of the region's boundary; ``None`` if the mesh must be
     closed."""

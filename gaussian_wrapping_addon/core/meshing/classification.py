@@ -173,6 +173,17 @@ def tetrahedron_neighbours(tetrahedra: np.ndarray) -> np.ndarray:
     return result.reshape(count, 4)
 
 
+def faces_opposite(tetrahedra: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return the faces opposite the chosen corners (m, 4) bool of tetrahedra, outward, (f, 3)."""
+    tetrahedron, corner = np.nonzero(chosen)
+    return tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]
+
+
+def of_neighbours(labels: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+    """Return the labels (m,) bool of the neighbours, (m, 4); false beyond the hull."""
+    return np.where(neighbours >= 0, labels[neighbours], False)
+
+
 def boundary_faces(
     tetrahedra: np.ndarray, neighbours: np.ndarray, inside: np.ndarray
 ) -> np.ndarray:
@@ -181,9 +192,7 @@ def boundary_faces(
     Oriented outward where the tetrahedra are positively oriented. The set is closed: every edge
     has as many faces in one direction as in the other.
     """
-    beyond = np.where(neighbours >= 0, inside[neighbours], False)  # (m, 4)
-    tetrahedron, corner = np.nonzero(inside[:, None] & ~beyond)
-    return tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]
+    return faces_opposite(tetrahedra, inside[:, None] & ~of_neighbours(inside, neighbours))
 
 
 # -- Label tetrahedra inside or outside: progressive sampling, then a minimum cut -----------------
@@ -229,8 +238,8 @@ class Classification:
     inside: np.ndarray  # (m,) bool
 
     samples: np.ndarray  # (m,) int64 number of interior samples
-    undecided: int  # Tetrahedra whose label was left to the minimum cut
-    flipped: int  # Tetrahedra whose label the minimum cut changed
+    undecided: int  # tetrahedra whose label was left to the minimum cut
+    flipped: int  # tetrahedra whose label the minimum cut changed
 
 
 def classify(
@@ -279,7 +288,8 @@ def classify(
         mean = total / np.maximum(samples, 1)
         inside = (mean <= limits.ISO_LEVEL) & ~outer
         near = np.abs(mean - limits.ISO_LEVEL) < DECIDED_MARGIN
-        outvoted = _disagreeing(inside, neighbours) >= DISAGREEING_NEIGHBOURS
+        others = of_neighbours(inside, neighbours) != inside[:, None]
+        outvoted = others.sum(1) >= DISAGREEING_NEIGHBOURS
         mixed = squares > samples * (mean**2 + MIXED_DEVIATION**2)
         rows = np.flatnonzero(((near & (mixed | (samples == 1))) | outvoted) & ~outer & ~flat)
     progress.update(0.85, "smoothing labels")
@@ -336,12 +346,6 @@ def _interior_weights(
         return np.full((*shape, 4), 0.25)
     weights = rng.standard_exponential((*shape, 4))
     return weights / weights.sum(-1, keepdims=True)
-
-
-def _disagreeing(inside: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-    """Count the neighbours with the other label, (m,); space beyond the hull is outside."""
-    theirs = np.where(neighbours >= 0, inside[neighbours], False)  # (m, 4)
-    return (theirs != inside[:, None]).sum(1)
 
 
 def regularised(

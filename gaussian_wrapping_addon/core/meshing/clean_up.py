@@ -65,7 +65,7 @@ class HandleClosure(NamedTuple):
     """Result of :func:`without_small_handles`."""
 
     faces: np.ndarray  # (g, 3) int64
-    closed: int  # Handles that were closed
+    closed: int  # handles that were closed
     left: int
     """Small handles that could not be closed without cutting something else; there may be more that
     no box happens to contain."""

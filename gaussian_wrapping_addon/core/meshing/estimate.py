@@ -76,9 +76,9 @@ PROBES = 20_000
 class MeshEstimate:
     """Ranges that the measured values of the finished mesh should lie in."""
 
-    area: float  # Area of the surface in the region, squared scene units
-    cap_area: float  # Area of the caps on the region's boundary
-    by_edge: bool  # Requested by an edge length, not by a number of points
+    area: float  # area of the surface in the region, squared scene units
+    cap_area: float  # area of the caps on the region's boundary
+    by_edge: bool  # requested by an edge length, not by a number of points
     adaptive: bool
     points_low: int
     points_high: int
@@ -88,9 +88,9 @@ class MeshEstimate:
     determine time and memory."""
     seconds_low: float
     seconds_high: float
-    memory_bytes: int  # Peak without tiles, at the high end
-    memory_low_bytes: int  # Peak without tiles, at the low end
-    tiled_memory_bytes: int  # Peak with tiles, at the low end
+    memory_bytes: int  # peak without tiles, at the high end
+    memory_low_bytes: int  # peak without tiles, at the low end
+    tiled_memory_bytes: int  # peak with tiles, at the low end
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values."""
@@ -313,11 +313,11 @@ class PivotEstimate:
 
     gaussians: int  # Gaussians that reach the region
     pivots_low: int
-    pivots_high: int  # Points that are triangulated
+    pivots_high: int  # points that are triangulated
     tetrahedra_low: int
     tetrahedra_high: int
     points_low: int
-    points_high: int  # Vertices of the mesh
+    points_high: int  # vertices of the mesh
     seconds_low: float
     seconds_high: float
     memory_low_bytes: int

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..progress import Progress
 from ..regions.shapes import Region
-from .classification import OUTWARD_FACES
+from .classification import faces_opposite
 
 # -- Clip a tetrahedral mesh to the planes of a region, keeping it conforming ---------------------
 #
@@ -213,8 +213,7 @@ def marching_closed(
     from outside.
     """
     pieces = _separating(tetrahedra, inside)
-    tetrahedron, corner = np.nonzero(neighbours < 0)
-    hull = tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]  # (h, 3)
+    hull = faces_opposite(tetrahedra, neighbours < 0)  # (h, 3)
     codes = inside[hull] @ np.array([1, 2, 4])
     for code, triangles in enumerate(_CAP_TRIANGLES):
         rows = np.flatnonzero(codes == code)

@@ -243,8 +243,8 @@ class RepairResult:
     vertices: np.ndarray  # (v, 3) float64
     faces: np.ndarray  # (f, 3) int64
     origin: np.ndarray  # (v,) int64: the original vertex, or -1 for midpoints of split edges
-    split_vertices: int  # Copies that were added
-    split_edges: int  # Edges that were split at their midpoint
+    split_vertices: int  # copies that were added
+    split_edges: int  # edges that were split at their midpoint
 
 
 def split_nonmanifold(

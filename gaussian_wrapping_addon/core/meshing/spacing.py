@@ -46,9 +46,9 @@ FINEST_SHARE = 1e-6  # edges shorter than this share of the diagonal are refused
 class ResolutionRequest:
     """A requested edge length or number of points, or neither (0 and 0)."""
 
-    edge_length: float  # Scene units
+    edge_length: float  # scene units
     points: int
-    notes: tuple[ReportWarning, ...] = ()  # Changes to the request, for the report
+    notes: tuple[ReportWarning, ...] = ()  # changes to the request, for the report
 
 
 def checked_request(edge_length: float, points: int, region: Region) -> ResolutionRequest:
@@ -112,8 +112,8 @@ class DenseRequest:
     """Resolution of the dense mesh that an adaptive mesh is simplified from."""
 
     request: ResolutionRequest
-    target: int  # Vertices to keep, for the surface without caps
-    share: float  # The same as a share of the dense mesh, which also has vertices on caps
+    target: int  # vertices to keep, for the surface without caps
+    share: float  # the same as a share of the dense mesh, which also has vertices on caps
 
 
 def dense_points(stay: float) -> float:
@@ -194,8 +194,8 @@ class Spacing:
 
     points: np.ndarray  # (n, 3) float64
     radii: np.ndarray  # (n,) float64
-    nominal: float  # Radius where the photos do not limit it: the smallest one
-    limited: float  # Share of the area where the photos limit the radius
+    nominal: float  # radius where the photos do not limit it: the smallest one
+    limited: float  # share of the area where the photos limit the radius
 
     @cached_property
     def _tree(self) -> cKDTree:

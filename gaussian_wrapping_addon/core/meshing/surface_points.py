@@ -184,7 +184,7 @@ class CandidateSurface:
     vertices: np.ndarray  # (v, 3) float64
     faces: np.ndarray  # (f, 3) int64, facing the empty side
     gaussians: int  # Gaussians that reach the region
-    pivots: int  # Points that were triangulated
+    pivots: int  # points that were triangulated
 
 
 def candidate_surface(
@@ -225,7 +225,7 @@ class PivotCloud:
 
     points: np.ndarray  # (p, 3) float64, all within :func:`halo_bounds`
     gaussians: int  # Gaussians that reach the region
-    chosen: int  # Those of them that contributed pivots
+    chosen: int  # those of them that contributed pivots
 
 
 def pivot_cloud(
@@ -368,7 +368,7 @@ class SurfacePoints:
     """(n, 3) float64 unit vectors towards the empty side; 0 on edges of the region."""
     kind: np.ndarray  # (n,) uint8
     radii: np.ndarray  # (n,) float64 local thinning radius
-    radius: float  # Nominal thinning radius, the smallest
+    radius: float  # nominal thinning radius, the smallest
     notes: tuple[ReportWarning, ...]
     figures: dict[str, Any]
 

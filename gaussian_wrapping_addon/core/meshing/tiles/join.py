@@ -290,8 +290,8 @@ class TileOverview:
     """What is known of all tiles before they are joined."""
 
     counts: np.ndarray  # (k,) int64: vertices whose cost of a merger lies in each interval
-    kept: int  # Vertices that no tile merges, without shared ones
-    shared: int  # Points at borders, each counted once
+    kept: int  # vertices that no tile merges, without shared ones
+    shared: int  # points at borders, each counted once
     order: tuple[int, ...]
     """In which tiles are joined: neighbours soon after each other, so that few borders are open."""
     ready: tuple[np.ndarray, ...]
@@ -300,7 +300,7 @@ class TileOverview:
     boxes: np.ndarray
     """(t, 2, 3) float64: bounds of each tile's surface; empty tiles have infinite ones."""
     least_height: float
-    figures: Counter[str]  # Sums over the tiles
+    figures: Counter[str]  # sums over the tiles
 
     @property
     def vertices(self) -> int:

@@ -116,7 +116,7 @@ class TilePlan:
 
     region: Region
     surface: CandidateSurface
-    area: float  # Area of the candidate surface in the region
+    area: float  # area of the candidate surface in the region
     spacing: Spacing
     """Local thinning radii of the whole surface; with adaptive spacing, of the dense mesh."""
     tiling: Tiling
@@ -127,9 +127,9 @@ class TilePlan:
     caps: Caps
     seed: int
     notes: tuple[ReportWarning, ...]
-    edge_length: float  # Edge length of the uniform mesh that meets the request
+    edge_length: float  # edge length of the uniform mesh that meets the request
     target: int
-    share: float  # Vertices to keep, as for :func:`.primal_adaptive.simplified`: 0 and 1 keep all
+    share: float  # vertices to keep, as for :func:`.primal_adaptive.simplified`: 0 and 1 keep all
     depth_samples: int = 0
 
     @property

@@ -14,7 +14,7 @@ from ...mesh.sampling import EDGE_PER_RADIUS, thin
 from ...mesh.simplification import Units, merge_vertices
 from ...progress import Progress
 from ...regions.shapes import Region
-from ..classification import OUTWARD_FACES, classify, tetrahedron_neighbours
+from ..classification import classify, faces_opposite, of_neighbours, tetrahedron_neighbours
 from ..delaunay import bounding_points, delaunay
 from ..primal_adaptive import DEGENERATE_SHARE, LONGEST_EDGE_SHARE, kinds_after
 from ..repair import remove_degenerate, split_nonmanifold
@@ -253,17 +253,15 @@ def tile_faces(
     seed = int(np.random.default_rng([plan.seed, tile, 2]).integers(2**31))
     numbers, tetrahedra = local_tetrahedra(plan, gathered, tile, seed, progress.span(0.0, 0.2))
     # Farther away they may differ from the triangulation of the whole region.
-    near = np.zeros(len(numbers) + 8, np.bool_)
-    near[: len(numbers)] = plan.tiling.within(
-        tile, gathered.cloud.points[numbers], CONTEXT_RADII * plan.radius
+    near = plan.tiling.within(tile, gathered.cloud.points[numbers], CONTEXT_RADII * plan.radius)
+    near, inner, own = (  # the bounding points are none of these
+        np.append(flags, np.zeros(8, np.bool_)) for flags in (near, gathered.inner[numbers], own)
     )
     tetrahedra = tetrahedra[near[tetrahedra].any(1)]
     neighbours = tetrahedron_neighbours(tetrahedra)
-    inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
     outer = ~inner[tetrahedra].all(1)
     # Indices of the region's points increase with the local ones.
-    first = tetrahedra.min(1)
-    owned = ~outer & np.append(own, np.zeros(8, np.bool_))[first]
+    owned = ~outer & own[tetrahedra.min(1)]
     # Only outer tetrahedra have bounding points as corners, whose positions are not used.
     points = np.concatenate([gathered.cloud.points[numbers], np.zeros((8, 3))])
     rng = np.random.default_rng([plan.seed, tile, 3])
@@ -272,17 +270,14 @@ def tile_faces(
         gathered.cloud.radii[numbers], field.vacancy, rng, progress.span(0.2, 1.0),
     )  # fmt: skip
     inside = labels.inside
-    known = np.where(neighbours >= 0, owned[neighbours], False)  # (m, 4)
-    theirs = np.where(neighbours >= 0, inside[neighbours], False)
+    known, theirs = of_neighbours(owned, neighbours), of_neighbours(inside, neighbours)  # (m, 4)
     # A neighbour with a corner in the tile is the same in all tiles.
-    own = np.append(own, np.zeros(8, np.bool_))
-    beyond = np.nonzero(owned[:, None] & (neighbours >= 0) & outer[neighbours])
-    known[beyond] = own[tetrahedra[beyond[0][:, None], OUTWARD_FACES[beyond[1]]]].any(1)
+    beyond = owned[:, None] & (neighbours >= 0) & outer[neighbours]
+    known[beyond] = own[faces_opposite(tetrahedra, beyond)].any(1)
     theirs[beyond] = False
-    tetrahedron, corner = np.nonzero((owned & inside)[:, None] & known & ~theirs)
-    faces = numbers[tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]]
-    tetrahedron, corner = np.nonzero(owned[:, None] & ~known)
-    border = numbers[tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]]
+    faces = faces_opposite(tetrahedra, (owned & inside)[:, None] & known & ~theirs)
+    at_border = owned[:, None] & ~known
+    border = faces_opposite(tetrahedra, at_border)
     # All tetrahedra at points of the tile are there.
     whole = own.copy()
     whole[tetrahedra[~owned & ~outer]] = False
@@ -293,7 +288,8 @@ def tile_faces(
         "undecided_tetrahedra": labels.undecided,
     }
     whole = numbers[whole[:-8] & gathered.inner[numbers]]
-    return TileFaces(faces, border, inside[tetrahedron], figures, whole)
+    solid = inside[np.nonzero(at_border)[0]]
+    return TileFaces(numbers[faces], numbers[border], solid, figures, whole)
 
 
 def local_tetrahedra(
@@ -342,7 +338,7 @@ class TileSurface:
     solid: np.ndarray
     """(b,) bool: which of those have the tile's solid behind them; ``vertices`` has their
     corners."""
-    least_height: float  # Faces with a smaller height are removed; the same for all tiles
+    least_height: float  # faces with a smaller height are removed; the same for all tiles
     figures: dict[str, Any]
 
 
