@@ -129,7 +129,7 @@ def kept_from_dense(points: float) -> float:
 def dense_request(
     request: ResolutionRequest, area: float, region: Region, *, adaptive: bool = True
 ) -> DenseRequest:
-    """Return the resolution of the dense mesh, and how many of its vertices to keep: if not all.
+    """Return the resolution of the dense mesh, and how many vertices to keep: all if not adaptive.
 
     Raises ResourceError: the dense mesh needs more points than the limit.
     """

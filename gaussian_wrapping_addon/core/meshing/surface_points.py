@@ -96,7 +96,8 @@ def cap_points(
         (rim, region.half_spaces[0][rim_face], PRIORITY_RIM),
         (points[~empty], normals[~empty], PRIORITY_INNER),
     )
-    all_points, all_normals = (np.concatenate([group[k] for group in groups]) for k in (0, 1))
+    all_points = np.concatenate([points for points, _, _ in groups])
+    all_normals = np.concatenate([normals for _, normals, _ in groups])
     priority = np.concatenate([np.full(len(points), level) for points, _, level in groups])
     local = spacing.at(all_points)  # (n,)
     radii = np.where(priority == PRIORITY_INNER, INNER_RADII * local, local)

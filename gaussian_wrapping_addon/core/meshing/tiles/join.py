@@ -259,8 +259,8 @@ def flip_by_tiles(
         low = vertices[at].min(0) - ROOM_RADII * plan.radius
         high = vertices[at].max(0) + ROOM_RADII * plan.radius
         near = np.flatnonzero((boxes[:, 0] <= high).all(1) & (boxes[:, 1] >= low).all(1))
-        tiles = (load(number) for number in near.tolist())
-        others = (_in_box(tile.vertices[tile.faces], low, high) for tile in tiles)
+        surfaces = (load(number) for number in near.tolist())  # one at a time
+        others = (_in_box(near_by.vertices[near_by.faces], low, high) for near_by in surfaces)
         dense = np.concatenate([_in_box(between, low, high), *others])
         rows = np.flatnonzero(at[faces].any(1))
         points, local, source = compacted(vertices, faces[rows])

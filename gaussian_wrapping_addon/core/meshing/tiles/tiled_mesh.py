@@ -43,7 +43,7 @@ def plan_tiles(
     tiles: int, seed: int, edge_length_scene: float = 0.0,
     depth_samples: DepthSamples | None = None,
 ) -> TilePlan:  # fmt: skip
-    """Extract the region's candidate surface and split it into tiles; 0: as the request needs.
+    """Extract the region's candidate surface and split it; 0 ``tiles``: as many as it needs.
 
     Raises MeshingError: the region holds no surface; UsageError, ResourceError: the request is
     invalid, or needs more points than the limit.
