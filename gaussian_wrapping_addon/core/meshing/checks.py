@@ -254,7 +254,8 @@ def _nonmanifold_vertices(faces: np.ndarray, vertex_count: int) -> int:
         return 0
     keys = [(faces * vertex_count + np.roll(faces, -k, axis=1)).ravel() for k in (1, 2)]
     ends, index = np.unique(np.concatenate(keys), return_inverse=True)
-    count, label = connected(*index.reshape(2, -1), len(ends))
+    one, other = index.reshape(2, -1)
+    count, label = connected(one, other, len(ends))
     owner = np.zeros(count, np.int64)
     owner[label] = ends // vertex_count
     return int((np.bincount(owner) > 1).sum())

@@ -177,7 +177,8 @@ def _patches(
     euler -= np.bincount(np.append(label[one], label[two[between]]), minlength=number)
     ends = np.append(outline + np.tile(low[between], 2), outline + np.tile(high[between], 2))
     nodes, index, degree = np.unique(ends, return_inverse=True, return_counts=True)
-    loop_count, loop_label = connected(*index.reshape(2, -1), len(nodes))
+    low_end, high_end = index.reshape(2, -1)
+    loop_count, loop_label = connected(low_end, high_end, len(nodes))
     loop_patch = np.zeros(loop_count, np.int64)
     loop_patch[loop_label] = nodes // count
     loops = np.bincount(loop_patch, minlength=number)
