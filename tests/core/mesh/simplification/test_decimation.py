@@ -153,6 +153,14 @@ def test_vertices_on_the_region_stay_on_it_and_none_leaves_it() -> None:
     assert (np.abs(result.vertices - 1.0).max(1) < 1e-12).sum() == 1, "the corner of three caps"
 
 
+def test_source_tells_where_a_vertex_came_from() -> None:
+    vertices, faces = slab((1, 1, 1), 0.2)
+    result = decimated((vertices, faces), len(faces) - 2)
+    same = (result.vertices == vertices[result.source]).all(1)
+    assert (~same).sum() <= 1
+    np.testing.assert_array_equal(np.unique(result.source), np.sort(result.source))
+
+
 def test_an_open_boundary_stays_as_it_is() -> None:
     vertices, faces = ball(4)
     faces = faces[(vertices[faces][:, :, 2] <= 0.0).all(1)]

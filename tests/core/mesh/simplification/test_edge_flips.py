@@ -62,7 +62,7 @@ def test_error_falls_and_the_shape_stays_closed() -> None:
     better = flip_edges(vertices, coarse, points, faces, 10.0)
     errors = []
     for each in (coarse, better):
-        figures = assert_closed_manifold(SurfaceMesh(vertices, each.astype(np.int32), {}))
+        figures = assert_closed_manifold(SurfaceMesh(vertices, each.astype(np.int32), None, {}))
         assert (figures.vertices, figures.genus, figures.components) == (400, 1, 1)
         where, _ = sample_triangles(vertices, each, 40_000, np.random.default_rng(0))
         errors.append(np.abs(torus()(where)).mean())
@@ -111,5 +111,5 @@ def test_a_part_is_flipped_like_the_whole_and_nothing_else() -> None:
     part[rows] = source[flip_edges(local_vertices, local, points, faces, 10.0, movable[rows])]
     np.testing.assert_array_equal(part[~movable], coarse[~movable])
     assert (part != coarse).any(1).sum() > 10
-    figures = assert_closed_manifold(SurfaceMesh(vertices, part.astype(np.int32), {}))
+    figures = assert_closed_manifold(SurfaceMesh(vertices, part.astype(np.int32), None, {}))
     assert (figures.vertices, figures.genus, figures.components) == (400, 1, 1)
