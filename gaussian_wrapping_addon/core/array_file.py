@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Read the npz files that stages hand to each other: whole, and of bounded size.
+"""Read and write the npz files that stages hand to each other: whole, and of bounded size.
 
 A file may be cut by a full disk or changed by another program, and a job folder may come from
 elsewhere: what a header states is compared with what the file holds before memory is taken.
@@ -7,6 +7,7 @@ elsewhere: what a header states is compared with what the file holds before memo
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import tokenize
@@ -19,7 +20,7 @@ from typing import IO
 import numpy as np
 
 from .errors import ParseError
-from .files import open_regular
+from .files import open_regular, write_bytes
 
 DAMAGES = (
     ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError,
@@ -33,6 +34,13 @@ _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
+
+
+def write_arrays(path: Path, **arrays: np.ndarray) -> None:
+    """Write arrays as ``numpy.savez`` does, atomically. Raises OSError: that failed."""
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **arrays)
+    write_bytes(path, stream.getvalue())
 
 
 def read_arrays(

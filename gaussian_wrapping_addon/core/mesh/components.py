@@ -4,14 +4,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from .surface_mesh import area_vectors, edge_keys, half_edges, normals_and_areas
+from .surface_mesh import (
+    area_vectors,
+    edge_keys,
+    half_edges,
+    next_half_edges,
+    normals_and_areas,
+    summed,
+)
 
 # -- Face adjacency of a triangle mesh, face normals and areas, and UV charts ---------------------
+
+
+def connected(one: np.ndarray, other: np.ndarray, count: int) -> tuple[int, np.ndarray]:
+    """Return the number of parts that pairs of ``count`` members form, and the part of each."""
+    pairs = coo_matrix((np.ones(len(one), np.int8), (one, other)), shape=(count, count))
+    parts, label = connected_components(pairs, directed=False)
+    return int(parts), label
 
 
 @dataclass(frozen=True)
@@ -20,12 +35,9 @@ class FaceGraph:
 
     opposite: np.ndarray
     """(f, 3) int32: half-edge ``3 * g + j`` across the edge from corner k to k + 1, or -1."""
-    normals: np.ndarray
-    """(f, 3) float64 unit normals; zero for faces without area."""
-    areas: np.ndarray
-    """(f,) float64, square scene units."""
-    centroids: np.ndarray
-    """(f, 3) float64."""
+    normals: np.ndarray  # (f, 3) float64 unit normals; zero for faces without area
+    areas: np.ndarray  # (f,) float64, square scene units
+    centroids: np.ndarray  # (f, 3) float64
 
 
 def face_graph(vertices: np.ndarray, faces: np.ndarray) -> FaceGraph:
@@ -51,21 +63,11 @@ def _opposite(faces: np.ndarray) -> np.ndarray:
 def components(graph: FaceGraph, joined: np.ndarray) -> np.ndarray:
     """Label the connected components of faces.
 
-    Parameters
-    ----------
-    joined : (f, 3) bool
-        Whether the edge at that corner connects its faces; must agree on both sides.
-
-    Returns
-    -------
-    (f,) int32
-        Labels from 0, in order of first appearance.
+    ``joined`` (f, 3) bool tells whether the edge at that corner connects its faces; both sides must
+    agree. Returns (f,) int32 labels from 0, in order of first appearance.
     """
-    count = len(graph.opposite)
     face, corner = np.nonzero(joined & (graph.opposite >= 0))
-    other = graph.opposite[face, corner] // 3
-    adjacency = coo_matrix((np.ones(len(face), np.int8), (face, other)), shape=(count, count))
-    labels = connected_components(adjacency, directed=False)[1]
+    _, labels = connected(face, graph.opposite[face, corner] // 3, len(graph.opposite))
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int32)
     rank[np.argsort(first, kind="stable")] = np.arange(len(first), dtype=np.int32)
@@ -73,36 +75,24 @@ def components(graph: FaceGraph, joined: np.ndarray) -> np.ndarray:
 
 
 def uv_charts(graph: FaceGraph, faces: np.ndarray, corner_uvs: np.ndarray) -> np.ndarray:
-    """Label UV charts: faces joined by edges whose UVs agree on both sides.
-
-    Returns
-    -------
-    (f,) int32
-        Labels from 0.
-    """
+    """Label UV charts, (f,) int32 from 0: faces joined by edges whose UVs agree on both sides."""
     uvs = corner_uvs.reshape(-1, 2)
     vertex = faces.ravel()
     here = np.arange(faces.size).reshape(-1, 3)  # half-edge = its first corner
-    here_next = np.roll(here, -1, axis=1)
+    here_next = next_half_edges(here)
     there = np.where(graph.opposite >= 0, graph.opposite, 0)
-    there_next = there - there % 3 + (there % 3 + 1) % 3
+    there_next = next_half_edges(there)
     same_way = vertex[there] == vertex[here]
     match = np.where(same_way, there, there_next)
     match_next = np.where(same_way, there_next, there)
     joined = (uvs[here] == uvs[match]).all(-1) & (uvs[here_next] == uvs[match_next]).all(-1)
-    return components(graph, joined & (graph.opposite >= 0))
+    return components(graph, joined)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return (v, 3) float64 area-weighted unit normals; zero where undefined."""
     cross = area_vectors(np.asarray(vertices, np.float64), faces)
-    total = np.stack(
-        [
-            np.bincount(faces.ravel(), np.repeat(cross[:, axis], 3), len(vertices))
-            for axis in range(3)
-        ],
-        axis=1,
-    )
+    total = summed(faces.ravel(), np.repeat(cross, 3, axis=0), len(vertices))
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return total / np.where(length > 0, length, 1.0)
 
@@ -117,12 +107,9 @@ def face_components(vertex_count: int, faces: np.ndarray) -> tuple[int, np.ndarr
     """
     if len(faces) == 0:
         return 0, np.zeros(0, np.int64)
-    rows, columns = half_edges(faces)
-    shape = (vertex_count, vertex_count)
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=shape)
-    _, label = connected_components(graph, directed=False)
+    _, label = connected(*half_edges(faces), vertex_count)
     used, part = np.unique(label[faces[:, 0]], return_inverse=True)
-    return len(used), part.astype(np.int64)
+    return len(used), part
 
 
 def volumes_and_areas(
@@ -136,28 +123,28 @@ def volumes_and_areas(
     a, b, c = (vertices[faces[:, k]] - center for k in range(3))
     each = (a * np.cross(b, c)).sum(1) / 6.0
     _, areas = normals_and_areas(vertices, faces)
-    return (
-        np.bincount(part, weights=each, minlength=count),
-        np.bincount(part, weights=areas, minlength=count),
-    )
+    return np.bincount(part, each, count), np.bincount(part, areas, count)
 
 
 @dataclass(frozen=True)
 class FloaterRemoval:
     """Result of :func:`without_floaters`."""
 
-    faces: np.ndarray
-    """(g, 3) remaining faces."""
+    faces: np.ndarray  # (g, 3) remaining faces
     kept: int
     removed_solids: int
     removed_cavities: int
-    removed_area_share: float
-    """Area of the removed components, as a share of the total."""
+    removed_area_share: float  # area of the removed components, as a share of the total
 
     @property
     def removed(self) -> int:
         """All removed components: the volume of open ones does not tell solids from cavities."""
         return self.removed_solids + self.removed_cavities
+
+    def figures(self) -> dict[str, Any]:
+        """Return what the provenance of a mesh says about it."""
+        names = ("removed_solids", "removed_cavities", "removed_area_share")
+        return {"components": self.kept, **{name: getattr(self, name) for name in names}}
 
 
 LONG_FACTOR = 3.0
@@ -167,7 +154,7 @@ LONG_FACES = 30
 """With fewer faces a long component is a sliver between a few vertices, not a structure."""
 
 
-def extents(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: int) -> np.ndarray:
+def _extents(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: int) -> np.ndarray:
     """Return the diagonal of the bounding box of each component, (count,)."""
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     corners = vertices[faces]  # (f, 3, 3)
@@ -195,30 +182,23 @@ def without_floaters(
     """
     count, part = face_components(len(vertices), faces)
     volume, area = volumes_and_areas(vertices, faces, part, count)
-    length = extents(vertices, faces, part, count)
+    length = _extents(vertices, faces, part, count)
     keep = area >= min_share * area.max(initial=0.0)
     long = length >= LONG_FACTOR * min_share * length.max(initial=0.0)
     keep |= long & (np.bincount(part, stand_for, minlength=count) >= LONG_FACES)
     if most:
         keep &= _largest(vertices, faces, part, np.where(keep, volume, np.nan), area, most)
-    removed = float(area[~keep].sum() / max(area.sum(), 1e-300))
     return FloaterRemoval(
-        faces[keep[part]],
-        int(keep.sum()),
-        int((~keep & (volume >= 0)).sum()),
-        int((~keep & (volume < 0)).sum()),
-        removed,
-    )
+        faces[keep[part]], int(keep.sum()),
+        int((~keep & (volume >= 0)).sum()), int((~keep & (volume < 0)).sum()),
+        float(area[~keep].sum() / max(area.sum(), 1e-300)),
+    )  # fmt: skip
 
 
 def _largest(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    part: np.ndarray,
-    volume: np.ndarray,
-    area: np.ndarray,
-    most: int,
-) -> np.ndarray:
+    vertices: np.ndarray, faces: np.ndarray, part: np.ndarray,
+    volume: np.ndarray, area: np.ndarray, most: int,
+) -> np.ndarray:  # fmt: skip
     """Return (count,) bool: the largest solids, and the cavities inside of them.
 
     ``volume`` is NaN for components that do not count.
@@ -248,14 +228,6 @@ def winding_number(point: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -
 
 
 def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Drop unused vertices.
-
-    Returns
-    -------
-    vertices : (w, 3)
-    faces : (f, 3) int64
-    source : (w,) int64
-        Old index of each vertex.
-    """
+    """Drop unused vertices; return the others (w, 3), (f, 3) int64 faces and (w,) old indices."""
     source, index = np.unique(faces, return_inverse=True)
     return vertices[source], index.reshape(-1, 3).astype(np.int64), source

@@ -22,33 +22,19 @@ pass their own."""
 class DepthBuffer:
     """First hits of the rays through the pixel centres."""
 
-    depth: np.ndarray
-    """(h, w) float32 z-depth, infinite where nothing is hit."""
-    face: np.ndarray
-    """(h, w) int32, -1 where nothing is hit."""
+    depth: np.ndarray  # (h, w) float32 z-depth, infinite where nothing is hit
+    face: np.ndarray  # (h, w) int32, -1 where nothing is hit
 
 
 def depth_buffer(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    camera: Camera,
-    *,
-    threads: int = 1,
-    near: float = NEAR_DEPTH,
-) -> DepthBuffer:
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera, *,
+    threads: int = 1, near: float = NEAR_DEPTH,
+) -> DepthBuffer:  # fmt: skip
     """Rasterise a mesh; front and back faces both occlude.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-        In the camera's world frame.
-    faces : (f, 3) int32
-    camera : Camera
-        Determines the size of the buffer.
-    threads : int
-        Threads to use; the result does not depend on it (ties go to the lower face).
-    near : float
-        z-depth > 0 of the near plane, in units of the camera's world frame.
+    ``vertices`` (v, 3) float64 and ``near``, the z-depth > 0 of the near plane, are in the camera's
+    world frame; ``faces`` are (f, 3) int32. The result does not depend on the number of threads:
+    ties go to the lower face.
     """
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
     face = np.full((camera.height, camera.width), -1, np.int32)
@@ -74,8 +60,7 @@ def _in_front(local: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.nda
     ids = np.arange(len(faces), dtype=np.int32)
     front = local[:, 2] > near
     inside = front[faces].sum(axis=1)
-    whole = local[faces[inside == 3]]
-    pieces, owners = [whole], [ids[inside == 3]]
+    pieces, owners = [local[faces[inside == 3]]], [ids[inside == 3]]
     for face in np.flatnonzero((inside == 1) | (inside == 2)).tolist():
         corners = local[faces[face]]
         polygon: list[np.ndarray] = []
@@ -87,9 +72,9 @@ def _in_front(local: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.nda
         for k in range(1, len(polygon) - 1):
             pieces.append(np.stack([polygon[0], polygon[k], polygon[k + 1]])[None])
             owners.append(ids[face : face + 1])
-    triangles = np.concatenate(pieces)
-    order = np.argsort(np.concatenate(owners), kind="stable")
-    return triangles[order], np.concatenate(owners)[order]
+    triangles, owner = np.concatenate(pieces), np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    return triangles[order], owner[order]
 
 
 @kernel(fast=False)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Quadric edge collapses: kernels."""
 
+# mypy: disable-error-code="no-untyped-def"
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -11,28 +13,22 @@ from ..compiled import kernel, part
 
 # -- Counters and return codes of the collapse kernels --------------------------------------------
 
-
 HEAP_SIZE, SEQUENCE, FACES_LEFT, VERTICES_LEFT, LAST_MARK = 0, 1, 2, 3, 4
 """Indices into ``counts``, (5,) int64: heap entries in use, number of the next entry, remaining
-faces and used vertices, last mark given (see :mod:`.edge_collapse`)."""
+faces and used vertices, last mark given (see below)."""
 
-COUNTERS = 5
-"""Length of ``counts``."""
+COUNTERS = 5  # length of ``counts``
 
 DONE, EMPTY, FULL, PAUSED = 0, 1, 2, 3
 """Why a collapse kernel returned: target reached, heap empty, heap full, budget spent."""
 
-HEAP_ROOM = 128
-"""Free heap entries required before a collapse: more than one collapse adds."""
+HEAP_ROOM = 128  # free heap entries required before a collapse: more than one collapse adds
 
 
 # -- Binary heap over columns, so that a long run can pause, grow the heap and resume (numba) -----
 #
 # A heap is a tuple of arrays of equal length: costs float64, ties int64, then any int64 columns.
 # The entry with the least (cost, tie) comes first; ``counts[HEAP_SIZE]`` entries are in use.
-
-
-# mypy: disable-error-code="no-untyped-def"
 
 
 @part(fast=False)
@@ -97,10 +93,7 @@ def pop_first(heap, counts):
 #
 # ``mesh`` is the tuple of points (v, 3) float64, faces (f, 3) int64, head (v,) int64, following
 # (3f,) int64, quadrics (v, 11) float64, stamps (v,) int64 (how often a vertex has changed) and
-# marks (v,) int64 (see :mod:`.edge_collapse`). All are modified in place.
-
-
-# mypy: disable-error-code="no-untyped-def"
+# marks (v,) int64 (see :func:`mark_ring`). All are modified in place.
 
 
 @kernel(fast=False)
@@ -164,9 +157,6 @@ def merge_vertices(u, v, mesh, counts):
 # a ring are marked with increasing numbers, so that marks need not be erased.
 
 
-# mypy: disable-error-code="no-untyped-def"
-
-
 @part(fast=False)
 def mark_ring(u, mesh, counts, ring):
     """Mark the neighbours of ``u``; return the number of its faces, and the mark.
@@ -195,12 +185,8 @@ def mark_ring(u, mesh, counts, ring):
 def link_allows(u, v, around_u, mark, max_ring, mesh, counts):
     """Return whether the surface stays a manifold when ``u`` and ``v`` merge.
 
-    Parameters
-    ----------
-    around_u, mark : int
-        From :func:`mark_ring` for ``u``.
-    max_ring : int
-        Most faces around the merged vertex.
+    ``around_u`` and ``mark`` come from :func:`mark_ring` for ``u``; ``max_ring`` is the most faces
+    around the merged vertex.
     """
     faces, head, following, marks = mesh[1], mesh[2], mesh[3], mesh[6]
     counts[LAST_MARK] += 1
@@ -230,31 +216,16 @@ def link_allows(u, v, around_u, mark, max_ring, mesh, counts):
 # is the total weight of the planes. Each collapse strategy evaluates it in its own order of
 # operations, on which its results depend in the last digits.
 
-
-# mypy: disable-error-code="no-untyped-def"
-
-
-COLUMNS = 11
-"""Columns of a quadric."""
-
-WEIGHT = 10
-"""Column of the planes' total weight."""
+COLUMNS = 11  # of a quadric
+WEIGHT = 10  # column of the planes' total weight
 
 
 @kernel(fast=False)
 def add_face_quadrics(points, faces, quadrics, scale, point_weight):
     """Add the plane of each face to the quadrics of its three corners.
 
-    Parameters
-    ----------
-    points : (v, 3) float64
-    faces : (f, 3) int64
-    quadrics : (v, 11) float64
-        Modified in place.
-    scale : float
-        Weight of a plane per length of the area vector, which is twice the area.
-    point_weight : float
-        Weight of the squared distance to the corner itself relative to that of the plane.
+    ``scale`` is the weight of a plane per length of the area vector, which is twice the area;
+    ``point_weight`` that of the squared distance to the corner itself, relative to the plane's.
     """
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -320,10 +291,6 @@ def error_of_both(quadrics, u, v, x, y, z):
 # ``caps`` is the tuple of planes (v, 3) int64 that each vertex lies on (-1: none), locked (v,)
 # bool, normals (k, 3) and offsets (k,) float64: inside is ``normal . x <= offset``.
 
-
-# mypy: disable-error-code="no-untyped-def"
-
-
 OPTIMAL, FIRST, SECOND = 0, 1, 2
 """Placements of the merged vertex: at the least error, or at one of the ends."""
 
@@ -345,9 +312,7 @@ def on_planes_of(planes, u, v):
 def _free_directions(planes, normals, v, basis):
     """Fill ``basis`` with an orthonormal basis of the directions in which ``v`` may move.
 
-    Returns
-    -------
-    Number of directions.
+    Returns their number.
     """
     count = 0
     for i in range(3):
@@ -469,43 +434,17 @@ def place_merged(u, v, kind, mesh, caps, scratch):
 # The heap holds vertices with the cost of their cheapest collapse, in three columns: costs,
 # vertices, stamps. Changes two edges away may alter that cost without a new entry, so it is
 # recomputed when a vertex is popped.
+#
+# ``bounds`` is the tuple of the square of the greatest length of a new edge, the weight of squared
+# length relative to squared height in the cost, the least roundness (height over longest edge) of
+# a changed triangle unless it was narrower before, and the least cosine between its normals before
+# and after. ``log`` is the tuple of locked (v,) bool (vertices that neither merge nor are merged
+# into; all others have all their faces), into (v,) int64 (the vertex that each has merged into),
+# level (v,) float64 (the highest cost so far when it merged) and the highest cost so far, (1,)
+# float64. The last three are filled.
 
-
-# mypy: disable-error-code="no-untyped-def"
-
-
-MAX_RING = 64
-"""Most neighbours of a vertex that can be removed."""
-
-HEAP_COLUMNS = 2
-"""Integer columns of the heap: vertices and stamps."""
-
-
-class ShapeBounds(NamedTuple):
-    """Bounds on the faces around a removed vertex."""
-
-    longest_squared: float
-    """Square of the greatest length of a new edge."""
-    shape_weight: float
-    """Weight of squared length relative to squared height in the cost."""
-    least_roundness: float
-    """Least height over longest edge of a changed triangle, unless it was narrower before."""
-    least_cosine: float
-    """Least cosine between the normals of a triangle before and after."""
-
-
-class MergeLog(NamedTuple):
-    """Which vertices take part, and what has become of them."""
-
-    locked: np.ndarray
-    """(v,) bool: vertices that neither merge nor are merged into; all others have all their faces.
-    """
-    into: np.ndarray
-    """(v,) int64: the vertex that each has merged into; filled."""
-    level: np.ndarray
-    """(v,) float64: the highest cost so far when it merged; filled."""
-    highest: np.ndarray
-    """(1,) float64: the highest cost so far."""
+MAX_RING = 64  # most neighbours of a vertex that can be removed
+HEAP_COLUMNS = 2  # integer columns of the heap: vertices and stamps
 
 
 @part(fast=False)
@@ -611,18 +550,7 @@ def push_vertices(mesh, heap, counts, bounds, log):
 def collapse_half_edges(mesh, heap, counts, bounds, log, target, most, budget):
     """Merge the cheapest vertices into neighbours until ``target`` vertices are left.
 
-    Parameters
-    ----------
-    mesh, heap, counts : tuple, tuple, array
-        See :mod:`.edge_collapse`, above and :mod:`.edge_collapse`.
-    bounds : tuple
-        Values of :class:`ShapeBounds`.
-    log : tuple
-        Arrays of :class:`MergeLog`.
-    most : float
-        Highest cost of a merger.
-    budget : int
-        Greatest number of entries to pop.
+    No merger costs more than ``most``, and no more than ``budget`` entries are popped.
     """
     stamps = mesh[5]
     locked, into, level, highest = log
@@ -668,29 +596,20 @@ def collapse_half_edges(mesh, heap, counts, bounds, log, target, most, budget):
 # first and second ends, kinds of placement. If the optimal position is refused, the ends are
 # tried.
 
-
-# mypy: disable-error-code="no-untyped-def"
-
-
 POINT_WEIGHT = 1e-7
 """Weight of the distance to the vertices relative to the distance to the planes. It makes the
 optimum unique on flat patches; 1e-4 would make collapses across a thin plate cheaper than along it.
 """
 
-OPTIMAL_MAX_RING = 48
-"""Most faces around a merged vertex: fans of needles bake and subdivide badly."""
-
-OPTIMAL_HEAP_COLUMNS = 5
-"""Integer columns of the heap."""
+OPTIMAL_MAX_RING = 48  # most faces around a merged vertex: fans of needles bake and subdivide badly
+OPTIMAL_HEAP_COLUMNS = 5  # integer columns of the heap
 
 
 class Limits(NamedTuple):
     """Bounds on the faces around a collapsed edge."""
 
-    turn_cos: float
-    """Cosine of the largest rotation of a face in one collapse."""
-    fold_cos: float
-    """Cosine of the sharpest new bend between neighbours: -1 is folded back flat."""
+    turn_cos: float  # cosine of the largest rotation of a face in one collapse
+    fold_cos: float  # cosine of the sharpest new bend between neighbours: -1 is folded back flat
     min_shape: float
     """Least height of a new face over its longest edge, unless the face was narrower before."""
 
@@ -827,18 +746,9 @@ def push_edges(mesh, caps, heap, counts, scratch):
 
 @kernel(fast=False)
 def collapse_edges(mesh, caps, heap, counts, limits, scratch, target, budget):
-    """Collapse the cheapest edges until ``target`` faces are left.
+    """Collapse the cheapest edges until ``target`` faces are left or ``budget`` entries popped.
 
-    Parameters
-    ----------
-    mesh, caps, heap, counts : tuple, tuple, tuple, array
-        See :mod:`.edge_collapse`, :mod:`.edge_collapse`, above and :mod:`.edge_collapse`.
-    limits : tuple
-        Values of :class:`Limits`.
-    work : (8, 3) float64
-        Scratch.
-    budget : int
-        Greatest number of entries to pop.
+    ``limits``: values of :class:`Limits`; ``scratch``: (8, 3) float64.
     """
     faces, head, following, stamps = mesh[1], mesh[2], mesh[3], mesh[5]
     unused = np.empty(0, np.int64)

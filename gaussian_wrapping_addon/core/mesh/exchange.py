@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import struct
 from dataclasses import dataclass
@@ -13,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from .. import limits
-from ..array_file import read_arrays
+from ..array_file import read_arrays, write_arrays
 from ..errors import ParseError, WorkerError
-from ..files import read_json, write_bytes
+from ..files import read_json
 from ..names import EXPORT_FORMATS
 from ..photos.formats import forbid_ghostscript
 from ..scene.camera import Similarity
@@ -23,7 +22,6 @@ from ..scene.frames import Y_UP
 from .textured_mesh import Polygons, checked_polygons
 
 # -- Read triangle meshes with their UVs from common file formats ---------------------------------
-
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".off")
 _CHOOSE_A_MESH = "Export the file again."
@@ -33,10 +31,8 @@ _CHOOSE_A_MESH = "Export the file again."
 class FileMesh:
     """A triangle mesh as its file has it."""
 
-    vertices: np.ndarray
-    """(v, 3) float64, coordinates of the file."""
-    faces: np.ndarray
-    """(f, 3) int64."""
+    vertices: np.ndarray  # (v, 3) float64, coordinates of the file
+    faces: np.ndarray  # (f, 3) int64
     corner_uvs: np.ndarray | None = None
     """(f, 3, 2) float64, v upwards, not checked; ``None`` if a part of the mesh has no UVs."""
     polygons: Polygons | None = None
@@ -50,14 +46,8 @@ def read_mesh_file(path: Path) -> FileMesh:
 
     Node transforms of a GLB are applied; its axes are kept (Y up). The parts of a file become one
     mesh; parts share no vertices, and vertices with several UVs may be repeated.
-
-    Raises
-    ------
-    ParseError
-        Not a mesh file, truncated, without faces, with values that are not finite, or with vertex
-        indices out of range.
-    WorkerError
-        The worker's Python lacks trimesh.
+    Raises ParseError: not a mesh file, truncated, without faces, with values that are not finite,
+    or with vertex indices out of range; WorkerError: the worker's Python lacks trimesh.
     """
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise ParseError(
@@ -81,31 +71,30 @@ def read_mesh_file(path: Path) -> FileMesh:
         parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
         mesh = _joined([part for part in parts if isinstance(part, trimesh.Trimesh)])
     except Exception as error:  # a broken file can make the reader raise anything
-        raise ParseError(
-            path,
-            "whole file",
-            f"cannot be read as a mesh ({error}); it may be truncated.",
-            _CHOOSE_A_MESH,
-        ) from None
+        problem = f"cannot be read as a mesh ({error}); it may be truncated."
+        raise ParseError(path, "whole file", problem, _CHOOSE_A_MESH) from None
     if len(mesh.faces) == 0:
         raise ParseError(path, "faces", "there are none, or the file is truncated.", _CHOOSE_A_MESH)
     faces, count = mesh.faces, len(mesh.vertices)
     if faces.min() < 0 or faces.max() >= count:
         bad = int(np.flatnonzero(((faces < 0) | (faces >= count)).any(1))[0])
-        raise ParseError(
-            path, f"face {bad}", "refers to a vertex that does not exist.", _CHOOSE_A_MESH
-        )
-    not_finite = np.flatnonzero(~np.isfinite(mesh.vertices).all(1))
-    if len(not_finite):
-        place = f"vertex {int(not_finite[0])}"
-        raise ParseError(
-            path, place, f"is not finite (as are {len(not_finite)} in all).", _CHOOSE_A_MESH
-        )
+        problem = "refers to a vertex that does not exist."
+        raise ParseError(path, f"face {bad}", problem, _CHOOSE_A_MESH)
+    _check_finite(path, mesh.vertices, _CHOOSE_A_MESH)
     return mesh
+
+
+def _check_finite(path: Path, vertices: np.ndarray, hint: str) -> None:
+    bad = np.flatnonzero(~np.isfinite(vertices).all(1))
+    if len(bad):
+        problem = f"is not finite (as are {len(bad)} in all)."
+        raise ParseError(path, f"vertex {int(bad[0])}", problem, hint)
 
 
 def _joined(parts: list[Any]) -> FileMesh:
     """Join the parts of a file; UVs are kept if every part has them."""
+    if not parts:
+        return FileMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     vertices, faces, corner_uvs, base = [], [], [], 0
     for part in parts:
         part_vertices = np.asarray(part.vertices, np.float64).reshape(-1, 3)
@@ -116,14 +105,9 @@ def _joined(parts: list[Any]) -> FileMesh:
         vertices.append(part_vertices)
         faces.append(part_faces + base)
         base += len(part_vertices)
-    if not parts:
-        return FileMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    filled = sum(len(part) > 0 for part in faces)
-    return FileMesh(
-        np.concatenate(vertices),
-        np.concatenate(faces),
-        np.concatenate(corner_uvs) if corner_uvs and len(corner_uvs) == filled else None,
-    )
+    whole = corner_uvs and len(corner_uvs) == sum(len(part) > 0 for part in faces)
+    uvs = np.concatenate(corner_uvs) if whole else None
+    return FileMesh(np.concatenate(vertices), np.concatenate(faces), uvs)
 
 
 # -- Meshes that Blender hands over to the worker: arrays in world coordinates, in double
@@ -131,44 +115,32 @@ def _joined(parts: list[Any]) -> FileMesh:
 #
 # Needs numpy only.
 
-
 SUFFIX = ".npz"
 MAX_BYTES = 4 * 2**30
 _HAND_OVER_AGAIN = "Start it again from Blender."
 
 
 def write_handed_over(path: Path, mesh: FileMesh) -> None:
-    """Write a mesh in the world frame of the job's input.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
-    """
+    """Write a mesh in the world frame of the job's input; OSError if that fails."""
     arrays = {} if mesh.corner_uvs is None else {"corner_uvs": np.asarray(mesh.corner_uvs)}
     if mesh.polygons is not None:
         arrays |= {"polygons": mesh.polygons.of_faces, "loops": mesh.polygons.loops}
         arrays |= {"is_new": np.array(mesh.is_new)}
-    stream = io.BytesIO()
-    np.savez(stream, frame=np.array("world"), vertices=mesh.vertices, faces=mesh.faces, **arrays)
-    write_bytes(path, stream.getvalue())
+    write_arrays(path, frame=np.array("world"), vertices=mesh.vertices, faces=mesh.faces, **arrays)
 
 
 def read_handed_over(path: Path) -> FileMesh:
     """Read a file of :func:`write_handed_over`.
 
-    Raises
-    ------
-    ParseError
-        It is none, or its mesh has no faces, values that are not finite, or indices out of range.
+    Raises ParseError: it is none, or its mesh has no faces, values that are not finite, or indices
+    out of range.
     """
     if not path.is_file():
         raise ParseError(path, "whole file", "the file does not exist.", _HAND_OVER_AGAIN)
-    names = ("frame", "vertices", "faces")
-    optional = ("corner_uvs", "polygons", "loops", "is_new")
     arrays = read_arrays(
-        path, names, optional=optional, most_bytes=MAX_BYTES, hint=_HAND_OVER_AGAIN
-    )
+        path, ("frame", "vertices", "faces"), most_bytes=MAX_BYTES, hint=_HAND_OVER_AGAIN,
+        optional=("corner_uvs", "polygons", "loops", "is_new"),
+    )  # fmt: skip
     try:
         if str(arrays["frame"]) != "world":
             raise ValueError("not in world coordinates")
@@ -191,17 +163,11 @@ def read_handed_over(path: Path) -> FileMesh:
         raise ParseError(path, "faces", "there are none.", "Choose a mesh with faces.")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ParseError(path, "faces", "an index is out of range.", _HAND_OVER_AGAIN)
-    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-    if len(bad):
-        raise ParseError(
-            path, f"vertex {int(bad[0])}", f"is not finite (as are {len(bad)} in all).",
-            "Delete these vertices, or undo what made them.",
-        )  # fmt: skip
+    _check_finite(path, vertices, "Delete these vertices, or undo what made them.")
     return FileMesh(vertices, faces.astype(np.int64), uvs, polygons, is_new)
 
 
 # -- Find the frame of a mesh file: how its coordinates lead to the world of the input ------------
-
 
 _GLB_MAGIC, _JSON_CHUNK = 0x46546C67, 0x4E4F534A
 _HINT = "Export the file again, or say --up y or --up z without a sidecar."
@@ -210,23 +176,11 @@ _HINT = "Export the file again, or say --up y or --up z without a sidecar."
 def world_from_file(path: Path, sidecar: Path | None = None, up: str = "auto") -> Similarity:
     """Return the similarity from the coordinates of a mesh file to the world of the input.
 
-    The first of these that exists decides: the sidecar that is named; a given ``up``; the sidecar
-    of an export beside the file (``auto.glb.json``); ``transform.json`` of a result folder; the
-    axes of the format, as this add-on and Blender export it, and the offset inside a GLB.
-
-    Parameters
-    ----------
-    path : Path
-        The mesh file.
-    sidecar : Path, optional
-        The sidecar of the exported file from which the mesh was made.
-    up : str
-        One of ``auto``, ``y``, ``z``; with an axis, nothing else is read.
-
-    Raises
-    ------
-    ParseError
-        The sidecar is none, or its transform is no similarity.
+    The first of these that exists decides: ``sidecar``, that of the exported file from which the
+    mesh was made; ``up``, one of ``auto``, ``y``, ``z``; the sidecar of an export beside the file
+    (``auto.glb.json``); ``transform.json`` of a result folder; the axes of the format, as this
+    add-on and Blender export it, and the offset inside a GLB.
+    Raises ParseError: the sidecar is none, or its transform is no similarity.
     """
     if sidecar is None and up != "auto":
         return _turned(up == "y", np.zeros(3))
@@ -234,15 +188,12 @@ def world_from_file(path: Path, sidecar: Path | None = None, up: str = "auto") -
     if sidecar is not None or beside.is_file():
         return _of_sidecar(sidecar or beside)
     known = path.with_name("transform.json")
-    if known.is_file():
-        offset = _of_result(known, path.name)
-        if offset is not None:
-            return offset
+    if known.is_file() and (found := _of_result(known, path.name)) is not None:
+        return found
     formats = {f.suffix: f.y_up for f in EXPORT_FORMATS.values() if f.of_mesh}
-    is_glb = path.suffix.lower() == ".glb"
-    return _turned(
-        formats.get(path.suffix.lower(), False), _glb_offset(path) if is_glb else np.zeros(3)
-    )
+    suffix = path.suffix.lower()
+    offset = _glb_offset(path) if suffix == ".glb" else np.zeros(3)
+    return _turned(formats.get(suffix, False), offset)
 
 
 def _turned(y_up: bool, offset: np.ndarray) -> Similarity:

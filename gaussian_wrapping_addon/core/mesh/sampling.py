@@ -12,41 +12,28 @@ from .surface_mesh import normals_and_areas
 
 # -- Sample points on triangles: uniform by area, and Poisson-disk thinning -----------------------
 
-
 POINTS_PER_SQUARE = 0.56
 """Points per squared radius of area after thinning, with as many candidates as surface_points uses
 (measured on a sphere; the densest random packing has 0.70)."""
 
-EDGE_PER_RADIUS = 1.5
-"""Mean edge of the triangulated points, in radii (same measurement)."""
+EDGE_PER_RADIUS = 1.5  # mean edge of the triangulated points, in radii (same measurement)
 
 SAME_SIDE_COSINE = -0.2
 OTHER_SIDE_SHARE = 0.1
 """Two points on opposite sides of a thin wall do not conflict, unless they are closer than this
 share of the radius."""
 
-LEVEL_STEP = 2.0
-"""Ratio between the cell sides of successive levels of thinning."""
+LEVEL_STEP = 2.0  # ratio between the cell sides of successive levels of thinning
 
 
 def sample_triangles(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    count: int,
-    rng: np.random.Generator,
+    vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator,
     density: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Draw ``count`` points uniformly by area (stratified along the list of faces).
 
-    Parameters
-    ----------
-    density : (f,) float64, optional
-        Relative number of points per area of each face.
-
-    Returns
-    -------
-    points : (count, 3) float64
-    face : (count,) int64
+    ``density``: (f,) float64 relative number of points per area of each face.
+    Returns points (count, 3) float64 and their faces (count,) int64.
     """
     _, areas = normals_and_areas(vertices, faces)
     total = np.cumsum(areas if density is None else areas * density)
@@ -63,19 +50,10 @@ def thin(
     """Select points that are at least a radius apart, greedily in order of priority.
 
     Two points conflict if they are closer than the smaller of their radii and lie on the same
-    side of a wall (their normals agree).
+    side of a wall (their normals agree); points with zero normals can conflict with any other.
 
-    Parameters
-    ----------
-    points, normals : (n, 3) float64
-        Points with zero normals can conflict with any other.
-    radii : (n,) float64
-    priority : (n,) float64
-        Smaller values come first, ties by index.
-
-    Returns
-    -------
-    (n,) bool
+    ``points`` and ``normals`` are (n, 3) float64, ``radii`` and ``priority`` (n,) float64: smaller
+    values come first, ties by index. Returns (n,) bool.
     """
     if len(points) == 0:
         return np.zeros(0, np.bool_)
@@ -169,22 +147,9 @@ def distances_to_mesh(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the distance of each point to a triangle mesh, with the nearest face and point.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    vertices : (v, 3) float64
-    faces : (f, 3) int
-        Degenerate faces count as the segment or point that they are. libigl uses as many threads
-        as there are cores.
-
-    Returns
-    -------
-    distances : (n,) float64
-        Infinite where the mesh has no faces.
-    face : (n,) int64
-        The face of the nearest point, -1 without faces.
-    closest : (n, 3) float64
-        The nearest point, infinite without faces.
+    Degenerate faces count as the segment or point that they are. libigl uses as many threads as
+    there are cores.
+    Returns (n,) float64, (n,) int64 and (n, 3) float64; inf, -1 and inf where there are no faces.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     count = len(points)
@@ -206,25 +171,12 @@ def distances_to_mesh(
 def distances_to_cloud(
     points: np.ndarray, cloud: np.ndarray, *, threads: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance of each point to the nearest point of a cloud.
+    """Return the distance of each point (n, 3) to the nearest point of a cloud (m, 3), and its row.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    cloud : (m, 3) float64
-    threads : int
-        Threads of the search; the result does not depend on it.
-
-    Returns
-    -------
-    distances : (n,) float64
-        Infinite where the cloud is empty.
-    index : (n,) int64
-        Row of ``cloud``, -1 where it is empty.
+    Returns (n,) float64 and int64; inf and -1 where the cloud is empty. The result does not depend
+    on the number of threads.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     if len(cloud) == 0 or len(points) == 0:
         return np.full(len(points), np.inf), np.full(len(points), -1)
-    tree = cKDTree(np.asarray(cloud, np.float64))
-    distances, index = tree.query(points, workers=threads)
-    return distances, index
+    return cKDTree(np.asarray(cloud, np.float64)).query(points, workers=threads)

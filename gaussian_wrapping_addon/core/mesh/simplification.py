@@ -13,7 +13,7 @@ import numpy as np
 from ..compiled import kernel
 from ..errors import MeshingError
 from ..progress import Progress
-from ..regions.scene_regions import CapPlanes, cap_planes
+from ..regions.scene_regions import cap_planes
 from ..regions.shapes import Region
 from .components import compacted
 from .edge_collapse import (
@@ -30,8 +30,6 @@ from .edge_collapse import (
     POINT_WEIGHT,
     VERTICES_LEFT,
     Limits,
-    MergeLog,
-    ShapeBounds,
     add_face_quadrics,
     collapse_edges,
     collapse_half_edges,
@@ -43,34 +41,21 @@ from .surface_mesh import edge_keys, half_edges, normals_and_areas, vertices_of_
 
 # -- State of a simplification run, and the driver loop of its collapse kernels -------------------
 
-
-Heap = tuple[np.ndarray, ...]
-"""See :mod:`.edge_collapse`."""
+Heap = tuple[np.ndarray, ...]  # see :mod:`.edge_collapse`
 
 
 class Simplification:
     """A mesh under simplification, modified in place.
 
-    Parameters
-    ----------
-    points : (v, 3) float64
-        In units of about the mesh's size.
-    faces : (f, 3) int64
-        Oriented 2-manifold; modified in place.
-    scale, point_weight : float
-        See :func:`.edge_collapse.add_face_quadrics`.
-    quadrics : (v, 11) float64, optional
-        Instead of those of the faces; modified in place.
+    ``points`` (v, 3) float64 are in units of about the mesh's size; ``faces`` (f, 3) int64 are an
+    oriented 2-manifold. ``quadrics`` (v, 11) float64 replace those of the faces, which are weighted
+    by ``scale`` and ``point_weight`` (:func:`.edge_collapse.add_face_quadrics`).
     """
 
     def __init__(
-        self,
-        points: np.ndarray,
-        faces: np.ndarray,
-        scale: float,
-        point_weight: float,
+        self, points: np.ndarray, faces: np.ndarray, scale: float, point_weight: float,
         quadrics: np.ndarray | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         count = len(points)
         head, following = np.full(count, -1, np.int64), np.full(faces.size, -1, np.int64)
         link_corners(faces, head, following)
@@ -80,10 +65,9 @@ class Simplification:
             quadrics = np.zeros((count, COLUMNS))
             add_face_quadrics(self.points, faces, quadrics, scale, point_weight)
         marks = np.zeros(count, np.int64)
+        # What kernels take, see :mod:`.edge_collapse`.
         self.mesh = (self.points, faces, head, following, quadrics, self.stamps, marks)
-        """The tuple that kernels take, see :mod:`.edge_collapse`."""
         self.counts = np.zeros(COUNTERS, np.int64)
-        """See :mod:`.edge_collapse`."""
         self.counts[FACES_LEFT] = len(faces)
         self.counts[VERTICES_LEFT] = (head >= 0).sum()
 
@@ -102,35 +86,15 @@ class Simplification:
         size = max(size, 2 * HEAP_ROOM)
         return (np.zeros(size), *(np.zeros(size, np.int64) for _ in range(columns)))
 
-    def run(
-        self,
-        heap: Heap,
-        collapse: Callable[[Heap], int],
-        after: Callable[[], None] | None = None,
-    ) -> None:
+    def run(self, heap: Heap, collapse: Callable[[Heap], int]) -> None:
         """Call a collapse kernel until its target is reached or its heap empty.
 
-        Parameters
-        ----------
-        collapse : callable
-            Continues with the heap; returns a code such as :data:`.edge_collapse.DONE`.
-        after : callable, optional
-            Called after every call, for progress.
+        ``collapse`` continues with the heap and returns a code such as
+        :data:`.edge_collapse.DONE`.
         """
-        while True:
-            state = collapse(heap)
-            if after is not None:
-                after()
-            if state in (DONE, EMPTY):
-                return
+        while (state := collapse(heap)) not in (DONE, EMPTY):
             if state == FULL:
-                heap = tuple(_twice_as_long(column) for column in heap)
-
-
-def _twice_as_long(column: np.ndarray) -> np.ndarray:
-    result = np.zeros(2 * len(column), column.dtype)
-    result[: len(column)] = column
-    return result
+                heap = tuple(np.concatenate([column, np.zeros_like(column)]) for column in heap)
 
 
 # -- Simplify a dense closed mesh to a subset of its vertices, by half-edge collapses -------------
@@ -139,15 +103,13 @@ def _twice_as_long(column: np.ndarray) -> np.ndarray:
 # fold), where long triangles along it suffice. Removing the cheapest vertex first finds both
 # where and in which directions edges may be long. No vertex moves, so all stay on the isosurface.
 
-
 SHAPE_WEIGHT = 1e-6
 """Weight of squared length relative to squared height in the cost: it decides on flat surfaces."""
 
 LEAST_ROUNDNESS = 0.03
 """Least height over longest edge of a changed triangle, unless it was narrower before."""
 
-LEAST_COSINE = 0.3
-"""Least cosine between the normals of a triangle before and after a change."""
+LEAST_COSINE = 0.3  # least cosine between the normals of a triangle before and after a change
 
 _NO_LIMIT = np.iinfo(np.int64).max
 
@@ -161,20 +123,9 @@ def select_vertices(
     vertex that replaces it to the planes of all faces that it represents. A closed 2-manifold stays
     one, with the same genus and parts; no face turns over or becomes narrow.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int
-        A closed 2-manifold, every vertex used.
-    target : int
-        Number of vertices; more remain if no other can be removed.
-    longest : float
-        Greatest length of a new edge.
-
-    Returns
-    -------
-    (g, 3) int64
-        Faces over the same vertices, most of which are unused.
+    ``vertices`` (v, 3) float64, ``faces`` (f, 3): a closed 2-manifold, every vertex used. More than
+    ``target`` vertices remain if no other can be removed; no new edge is longer than ``longest``.
+    Returns (g, 3) int64 faces over the same vertices, most of which are unused.
     """
     if len(vertices) <= target:
         return np.asarray(faces, np.int64)
@@ -186,10 +137,8 @@ def select_vertices(
 class Units(NamedTuple):
     """What coordinates and costs are measured in; meshes whose costs are compared share it."""
 
-    center: np.ndarray
-    """(3,) float64."""
-    length: float
-    """About the size of the mesh."""
+    center: np.ndarray  # (3,) float64
+    length: float  # about the size of the mesh
 
     def local(self, vertices: np.ndarray) -> np.ndarray:
         """Return vertices relative to the centre, in units of the length."""
@@ -199,40 +148,24 @@ class Units(NamedTuple):
 class Merged(NamedTuple):
     """Result of :func:`merge_vertices`."""
 
-    faces: np.ndarray
-    """(g, 3) int64 over the same vertices, most of which are unused."""
-    into: np.ndarray
-    """(v,) int64: the vertex that each has merged into, -1 for those that are left."""
+    faces: np.ndarray  # (g, 3) int64 over the same vertices, most of which are unused
+    into: np.ndarray  # (v,) int64: the vertex that each has merged into, -1 for those that are left
     level: np.ndarray
     """(v,) float64: the highest cost up to the merger of each, infinite for those that are left.
     So those with a level of at most c have merged before all others."""
-    quadrics: np.ndarray
-    """(v, 11) float64: of those that are left, with those of all that merged into them."""
+    quadrics: np.ndarray  # (v, 11) float64: of those left, with those of all that merged into them
 
 
 def merge_vertices(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    units: Units,
-    target: int,
-    longest: float,
-    *,
-    most: float = np.inf,
-    locked: np.ndarray | None = None,
-    quadrics: np.ndarray | None = None,
-) -> Merged:
+    vertices: np.ndarray, faces: np.ndarray, units: Units, target: int, longest: float, *,
+    most: float = np.inf, locked: np.ndarray | None = None, quadrics: np.ndarray | None = None,
+) -> Merged:  # fmt: skip
     """Select vertices as :func:`select_vertices`, also on a part of a mesh.
 
-    Parameters
-    ----------
-    faces : (f, 3) int
-        Of a closed 2-manifold, at least all those at vertices that are not locked.
-    most : float
-        Highest cost of a merger.
-    locked : (v,) bool, optional
-        Vertices that stay, and that no other merges into.
-    quadrics : (v, 11) float64, optional
-        Instead of those of the faces, in the same units.
+    ``faces``: (f, 3) of a closed 2-manifold, at least all those at vertices that are not locked.
+    ``most``: highest cost of a merger.
+    ``locked``: (v,) bool vertices that stay, and that no other merges into.
+    ``quadrics``: (v, 11) float64 instead of those of the faces, in the same units.
     """
     # Planes are weighted by twice the area of their face; corners have no weight.
     run = Simplification(
@@ -240,22 +173,19 @@ def merge_vertices(
         None if quadrics is None else quadrics.copy(),
     )  # fmt: skip
     count = len(vertices)
-    bounds = tuple(
-        ShapeBounds((longest / units.length) ** 2, SHAPE_WEIGHT, LEAST_ROUNDNESS, LEAST_COSINE)
-    )
-    log = MergeLog(
-        np.zeros(count, np.bool_) if locked is None else locked,
-        np.full(count, -1, np.int64), np.full(count, np.inf), np.zeros(1),
-    )  # fmt: skip
+    bounds = ((longest / units.length) ** 2, SHAPE_WEIGHT, LEAST_ROUNDNESS, LEAST_COSINE)
+    into, level = np.full(count, -1, np.int64), np.full(count, np.inf)
+    log = (np.zeros(count, np.bool_) if locked is None else locked, into, level, np.zeros(1))
     heap = run.empty_heap(2 * count, HEAP_COLUMNS)
-    push_vertices(run.mesh, heap, run.counts, bounds, tuple(log))
-    run.run(
-        heap,
-        lambda heap: collapse_half_edges(
-            run.mesh, heap, run.counts, bounds, tuple(log), target, most, _NO_LIMIT
-        ),
-    )
-    return Merged(run.faces(), log.into, log.level, run.mesh[4])
+    push_vertices(run.mesh, heap, run.counts, bounds, log)
+
+    def collapse(heap: Heap) -> int:
+        return int(
+            collapse_half_edges(run.mesh, heap, run.counts, bounds, log, target, most, _NO_LIMIT)
+        )
+
+    run.run(heap, collapse)
+    return Merged(run.faces(), into, level, run.mesh[4])
 
 
 def quadrics_of(vertices: np.ndarray, faces: np.ndarray, units: Units) -> np.ndarray:
@@ -267,16 +197,9 @@ def quadrics_of(vertices: np.ndarray, faces: np.ndarray, units: Units) -> np.nda
 
 
 def left_of(into: np.ndarray, level: np.ndarray, most: float) -> np.ndarray:
-    """Return for each vertex the one that stands for it after all mergers up to a level.
+    """Return for each vertex the one that stands for it after all mergers up to a level, (v,).
 
-    Parameters
-    ----------
-    into, level : (v,)
-        See :class:`Merged`.
-
-    Returns
-    -------
-    (v,) int64
+    ``into``, ``level``: (v,), see :class:`Merged`.
     """
     stands = np.arange(len(into))
     gone = level <= most
@@ -290,13 +213,8 @@ def left_of(into: np.ndarray, level: np.ndarray, most: float) -> np.ndarray:
 #
 # Libraries that do the same break thin parts (their collapses join sheets) or fold faces over.
 
-
-MIN_TARGET = 4
-"""Faces of a tetrahedron: no closed surface has fewer."""
-
-EDGES_PER_CALL = 100_000
-"""Edges processed between two checks for cancellation: about 0.2 s."""
-
+MIN_TARGET = 4  # faces of a tetrahedron: no closed surface has fewer
+EDGES_PER_CALL = 100_000  # edges processed between two checks for cancellation: about 0.2 s
 
 LIMITS = Limits(0.0, -0.97, 1e-4)
 """Bends up to 166 degrees, and no face turns over (90 degrees). Tighter bounds measured worse: they
@@ -308,46 +226,24 @@ faces; the bound is still far above what counts as degenerate (1e-6)."""
 class DecimationResult:
     """A mesh with fewer faces."""
 
-    vertices: np.ndarray
-    """(w, 3) float64."""
-    faces: np.ndarray
-    """(g, 3) int64."""
-    source: np.ndarray
-    """(w,) int64: the original vertex of each, which may have moved."""
-    reached: bool
-    """Whether the target was reached."""
+    vertices: np.ndarray  # (w, 3) float64
+    faces: np.ndarray  # (g, 3) int64
+    reached: bool  # whether the target was reached
 
 
 def decimate(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    target: int,
-    progress: Progress,
-    *,
+    vertices: np.ndarray, faces: np.ndarray, target: int, progress: Progress, *,
     region: Region | None = None,
-) -> DecimationResult:
+) -> DecimationResult:  # fmt: skip
     """Collapse edges until ``target`` faces are left, or one more.
 
     A closed oriented 2-manifold stays one, and every part keeps its genus; the same holds for open
     manifolds, whose boundary is kept. No face turns over or folds back onto its neighbour. Vertices
-    on the region's faces stay on them, and none leaves it.
+    on the faces of the region that the mesh was made in stay on them, and none leaves it.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int
-        Consistently oriented 2-manifold, every vertex used.
-    target : int
-        At least :data:`MIN_TARGET`; a mesh with fewer faces is returned unchanged.
-    region : Region, optional
-        The region that the mesh was made in, same frame.
-
-    Raises
-    ------
-    MeshingError
-        The target is too small, or the faces are no oriented manifold.
-    Cancelled
-        Through ``progress``.
+    ``vertices`` (v, 3), ``faces`` (f, 3): consistently oriented 2-manifold, every vertex used.
+    ``target``: at least :data:`MIN_TARGET`; a mesh with fewer faces is returned unchanged.
+    Raises MeshingError: the target is too small, or the faces are no oriented manifold.
     """
     if target < MIN_TARGET:
         raise MeshingError(
@@ -356,7 +252,7 @@ def decimate(
     faces = np.array(faces, np.int64).reshape(-1, 3)
     vertices = np.asarray(vertices, np.float64)
     if len(faces) <= target:
-        return DecimationResult(vertices, faces, np.arange(len(vertices)), True)
+        return DecimationResult(vertices, faces, True)
     caps = cap_planes(vertices, region)
     # In units of the mesh's size: neither the unit nor UTM coordinates change a decision.
     low, high = vertices[faces].min((0, 1)), vertices[faces].max((0, 1))
@@ -365,58 +261,40 @@ def decimate(
         raise MeshingError(
             "A mesh without a finite size cannot be decimated.", "Mesh the region again."
         )
-    run = _Decimation((vertices - center) / size, faces, caps, center, size)
-    first = len(faces)
+    locked = caps.fixed | _on_boundary(faces, len(vertices))
+    # Planes are weighted by the area of their face.
+    run = Simplification((vertices - center) / size, faces, 0.5, POINT_WEIGHT)
+    offsets = (caps.offsets - caps.normals @ center) / size
+    bounds = (caps.planes, locked, np.ascontiguousarray(caps.normals), offsets)
+    scratch, first = np.zeros((8, 3)), len(faces)
+
+    def one_pass(before: int, progress: Progress) -> None:
+        """Process every edge once, and changed edges again, until the heap is empty."""
+        heap = run.empty_heap(3 * before, OPTIMAL_HEAP_COLUMNS)
+        push_edges(run.mesh, bounds, heap, run.counts, scratch)
+
+        def collapse(heap: Heap) -> int:
+            state: int = collapse_edges(
+                run.mesh, bounds, heap, run.counts, tuple(LIMITS), scratch, target, EDGES_PER_CALL
+            )
+            left = run.faces_left
+            share = (before - left) / max(before - target, 1)
+            progress.update(min(share, 1.0), f"{left} of {first} faces left")
+            return state
+
+        run.run(heap, collapse)
+
     while True:
         before = run.faces_left
-        share = (first - before) / (first - target)
-        run.collapse_pass(target, progress.span(min(share, 1.0), 1.0), first)
+        one_pass(before, progress.span(min((first - before) / (first - target), 1.0), 1.0))
         # Refused collapses may be allowed now that their surroundings have changed.
         if run.faces_left <= target or run.faces_left == before:
             break
     moved = run.stamps > 0
     result = np.where(moved[:, None], run.points * size + center, vertices)
-    result, kept, source = compacted(result, run.faces())
+    result, kept, _ = compacted(result, run.faces())
     progress.update(1.0, f"{len(kept)} faces left")
-    return DecimationResult(result, kept, source, len(kept) <= target)
-
-
-class _Decimation(Simplification):
-    """Edge collapses that respect a region's planes."""
-
-    def __init__(
-        self,
-        points: np.ndarray,
-        faces: np.ndarray,
-        caps: CapPlanes,
-        center: np.ndarray,
-        size: float,
-    ) -> None:
-        locked = caps.fixed | _on_boundary(faces, len(points))
-        # Planes are weighted by the area of their face.
-        super().__init__(points, faces, 0.5, POINT_WEIGHT)
-        offsets = (caps.offsets - caps.normals @ center) / size
-        self._caps = (caps.planes, locked, np.ascontiguousarray(caps.normals), offsets)
-        self._scratch = np.zeros((8, 3))
-
-    def collapse_pass(self, target: int, progress: Progress, first: int) -> None:
-        """Process every edge once, and changed edges again, until the heap is empty."""
-        heap = self.empty_heap(3 * self.faces_left, OPTIMAL_HEAP_COLUMNS)
-        push_edges(self.mesh, self._caps, heap, self.counts, self._scratch)
-        start = self.faces_left
-
-        def collapse(heap: Heap) -> int:
-            return collapse_edges(
-                self.mesh, self._caps, heap, self.counts, tuple(LIMITS), self._scratch, target,
-                EDGES_PER_CALL,
-            )  # fmt: skip
-
-        def report() -> None:
-            left = self.faces_left
-            share = (start - left) / max(start - target, 1)
-            progress.update(min(share, 1.0), f"{left} of {first} faces left")
-
-        self.run(heap, collapse, report)
+    return DecimationResult(result, kept, len(kept) <= target)
 
 
 def _on_boundary(faces: np.ndarray, count: int) -> np.ndarray:
@@ -437,48 +315,28 @@ def _on_boundary(faces: np.ndarray, count: int) -> np.ndarray:
 # Half-edge collapses leave the edges in arbitrary directions. Flipping some of them lowers the
 # surface error of an adaptive mesh by a tenth, with the same vertices.
 
-
-PASSES = 6
-"""Nearly all flips happen in the first two; the third and fourth find a few more."""
+PASSES = 6  # nearly all flips happen in the first two; the third and fourth find a few more
 
 LEAST_GAIN = 0.02
 """Share of the error of two triangles that a flip must save; below it, rounding would decide."""
 
-FLAT_HEIGHT = 1e-4
-"""Errors below this share of the edges are ignored: flat parts are not changed."""
+FLAT_HEIGHT = 1e-4  # errors below this share of the edges are ignored: flat parts are not changed
 
 
 def flip_edges(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    dense_vertices: np.ndarray,
-    dense_faces: np.ndarray,
-    longest: float,
-    movable: np.ndarray | None = None,
-) -> np.ndarray:
+    vertices: np.ndarray, faces: np.ndarray, dense_vertices: np.ndarray, dense_faces: np.ndarray,
+    longest: float, movable: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Flip edges while that brings the faces closer to a dense mesh of the same surface.
 
     Vertices, genus and parts do not change; no face turns over or becomes narrow. The error of a
     triangle is computed from the heights of the surface over the midpoints of its edges, with a
     quadratic model of the surface.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-        On the dense mesh.
-    faces : (f, 3) int64
-        A closed 2-manifold.
-    dense_vertices : (n, 3) float64
-    dense_faces : (m, 3) int64
-        Oriented alike.
-    longest : float
-        Greatest length of a new edge.
-    movable : (f,) bool, optional
-        For a part of a mesh: faces that may change. All faces at their corners are given.
-
-    Returns
-    -------
-    (f, 3) int64
+    ``vertices`` (v, 3) lie on the dense mesh; ``faces`` (f, 3), a closed 2-manifold, and
+    ``dense_faces`` are oriented alike; ``longest`` is the greatest length of a new edge.
+    ``movable``: (f,) bool, for a part of a mesh: faces that may change; all faces at their corners
+    are given. Returns (f, 3) int64.
     """
     faces = np.array(faces, np.int64)
     if len(faces) == 0 or len(dense_faces) == 0:
@@ -488,8 +346,7 @@ def flip_edges(
     points = vertices - (low + high) / 2
     surface = _SurfaceHeights(points, dense_vertices - (low + high) / 2, dense_faces)
     for _ in range(PASSES):
-        chosen = _one_pass(points, faces, surface, longest, movable)
-        if chosen == 0:
+        if _one_pass(points, faces, surface, longest, movable) == 0:
             break
     return faces
 
@@ -507,21 +364,18 @@ class _SurfaceHeights:
         self._keys = np.zeros(0, np.int64)
         self._heights, self._up = np.zeros(0), np.zeros((0, 3))
 
-    def key(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return a key for each pair of vertices, independent of their order."""
-        return edge_keys(a, b, self._count)
-
     def over(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return heights (k,), negative inside, and normals (k, 3) of the surface there."""
-        wanted = self.key(a, b)
+        wanted = edge_keys(a, b, self._count)
         fresh = np.setdiff1d(wanted, self._keys)
         if len(fresh):
             middle = (self._points[fresh // self._count] + self._points[fresh % self._count]) / 2
             _, face, nearest = self._tree.squared_distance(self._vertices, self._faces, middle)
             up, away = self._normals[face], middle - nearest
             height = np.copysign(np.linalg.norm(away, axis=1), (away * up).sum(1))
-            order = np.argsort(np.concatenate([self._keys, fresh]), kind="stable")
-            self._keys = np.concatenate([self._keys, fresh])[order]
+            keys = np.concatenate([self._keys, fresh])
+            order = np.argsort(keys, kind="stable")
+            self._keys = keys[order]
             self._heights = np.concatenate([self._heights, height])[order]
             self._up = np.concatenate([self._up, up])[order]
         at = np.searchsorted(self._keys, wanted)
@@ -529,17 +383,14 @@ class _SurfaceHeights:
 
 
 def _one_pass(
-    points: np.ndarray,
-    faces: np.ndarray,
-    surface: _SurfaceHeights,
-    longest: float,
+    points: np.ndarray, faces: np.ndarray, surface: _SurfaceHeights, longest: float,
     movable: np.ndarray | None,
-) -> int:
+) -> int:  # fmt: skip
     """Flip the best edges, no two in the same face, in place; return their number."""
     # Half-edge 3 f + k leads from corner k of face f to the next, opposite the third.
+    count = len(points)
     start, end, tip = (np.roll(faces, -k, 1).ravel() for k in range(3))
-    backward = end * len(points) + start
-    forward = start * len(points) + end
+    forward, backward = start * count + end, end * count + start
     order = np.argsort(forward)
     twin = order[np.minimum(np.searchsorted(forward[order], backward), len(order) - 1)]
     one = np.flatnonzero(start < end)
@@ -562,8 +413,8 @@ def _one_pass(
         allowed &= (normal * up).sum(1) > LEAST_COSINE
     allowed &= (normal_3 * normal_4).sum(1) > 0.0
     allowed &= np.linalg.norm(points[c] - points[d], axis=1) <= longest
-    edges = surface.key(a, b) if movable is None else surface.key(start, end)
-    allowed &= ~np.isin(surface.key(c, d), edges)
+    edges = edge_keys(a, b, count) if movable is None else edge_keys(start, end, count)
+    allowed &= ~np.isin(edge_keys(c, d, count), edges)
 
     rows = np.flatnonzero(allowed)
     one, other, a, b, c, d = (x[rows] for x in (one, other, a, b, c, d))
@@ -578,9 +429,8 @@ def _one_pass(
     good &= (there * up[rows]).sum(1) > LEAST_COSINE
     best = np.flatnonzero(good)
     best = best[np.argsort((after - before)[best], kind="stable")]
-    faces_1, faces_2 = one[best] // 3, other[best] // 3
-    keys, number = np.unique(surface.key(c, d)[best], return_inverse=True)
-    best = best[_independent(faces_1, faces_2, number, len(faces), len(keys))]
+    keys, number = np.unique(edge_keys(c, d, count)[best], return_inverse=True)
+    best = best[_independent(one[best] // 3, other[best] // 3, number, len(faces), len(keys))]
     a, b, c, d = a[best], b[best], c[best], d[best]
     faces[one[best] // 3] = np.stack([a, d, c], 1)
     faces[other[best] // 3] = np.stack([d, b, c], 1)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..array_file import read_arrays
+from ..array_file import read_arrays, write_arrays
 from ..errors import ParseError
-from ..files import write_bytes
 
 # -- A triangle mesh in the scene frame -----------------------------------------------------------
 
@@ -22,12 +20,8 @@ from ..files import write_bytes
 class SurfaceMesh:
     """Triangles with shared vertices; face normals point to the empty side."""
 
-    vertices: np.ndarray
-    """(v, 3) float64, scene frame."""
-    faces: np.ndarray
-    """(f, 3) int32, counter-clockwise seen from outside."""
-    colors: np.ndarray | None = None
-    """(v, 3) uint8, optional."""
+    vertices: np.ndarray  # (v, 3) float64, scene frame
+    faces: np.ndarray  # (f, 3) int32, counter-clockwise seen from outside
     provenance: dict[str, Any] = field(default_factory=dict)
     """How the mesh was made and what was measured, plain JSON values."""
 
@@ -37,10 +31,8 @@ class SurfaceMesh:
 
 def save_mesh(path: Path, mesh: SurfaceMesh) -> None:
     """Write vertices, faces and provenance atomically."""
-    stream = io.BytesIO()
     provenance = np.frombuffer(json.dumps(mesh.provenance).encode(), np.uint8)
-    np.savez(stream, vertices=mesh.vertices, faces=mesh.faces, provenance=provenance)
-    write_bytes(path, stream.getvalue())
+    write_arrays(path, vertices=mesh.vertices, faces=mesh.faces, provenance=provenance)
 
 
 def load_mesh(path: Path) -> SurfaceMesh:
@@ -49,7 +41,7 @@ def load_mesh(path: Path) -> SurfaceMesh:
     arrays = read_arrays(path, ("vertices", "faces", "provenance"), hint=hint)
     try:
         provenance = json.loads(arrays["provenance"].tobytes())
-        return SurfaceMesh(arrays["vertices"], arrays["faces"], None, provenance)
+        return SurfaceMesh(arrays["vertices"], arrays["faces"], provenance)
     except (ValueError, TypeError) as error:
         raise ParseError(path, "whole file", f"not a mesh file ({error}).", hint) from None
 
@@ -99,11 +91,14 @@ def edge_keys(begin: np.ndarray, end: np.ndarray, vertex_count: int) -> np.ndarr
 
 def faces_per_edge(faces: np.ndarray, vertex_count: int) -> np.ndarray:
     """Return for each half-edge how many faces its edge has, (3f,) int64."""
-    begin, end = half_edges(faces)
-    _, index, count = np.unique(
-        edge_keys(begin, end, vertex_count), return_inverse=True, return_counts=True
-    )
+    keys = edge_keys(*half_edges(faces), vertex_count)
+    _, index, count = np.unique(keys, return_inverse=True, return_counts=True)
     return count[index]
+
+
+def summed(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Return (count, k) float64: the sums of the rows of ``values`` (n, k) with the same index."""
+    return np.stack([np.bincount(index, column, count) for column in values.T], axis=1)
 
 
 def vertices_of_half_edges(chosen: np.ndarray, faces: np.ndarray, vertex_count: int) -> np.ndarray:

@@ -13,22 +13,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from .surface_mesh import area_vectors, next_half_edges
+from .components import connected
+from .surface_mesh import area_vectors, next_half_edges, summed
 
 
 @dataclass(frozen=True)
 class TangentFrames:
     """Frames at the corners of a mesh's faces."""
 
-    normals: np.ndarray
-    """(v, 3) float64 unit normals of the vertices."""
+    normals: np.ndarray  # (v, 3) float64 unit normals of the vertices
     tangents: np.ndarray
     """(f, 3, 3) float64 unit tangents of the corners, orthogonal to their normals."""
-    signs: np.ndarray
-    """(f,) float64: 1, or -1 where the UVs are mirrored."""
+    signs: np.ndarray  # (f,) float64: 1, or -1 where the UVs are mirrored
 
 
 def shading_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -36,12 +33,12 @@ def shading_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     Vertices without a face of non-zero area get (0, 0, 1): file formats require unit length.
     """
-    corners = np.asarray(vertices, np.float64)[faces]  # (f, 3, 3)
-    face_normals = _unit(area_vectors(np.asarray(vertices, np.float64), faces))
+    vertices = np.asarray(vertices, np.float64)
+    corners, face_normals = vertices[faces], _unit(area_vectors(vertices, faces))
     ahead = _unit(np.roll(corners, -1, axis=1) - corners)
     behind = _unit(np.roll(corners, 1, axis=1) - corners)
     weighted = _angles(ahead, behind)[..., None] * face_normals[:, None]  # (f, 3, 3)
-    normals = _unit(_summed(np.asarray(faces).ravel(), weighted.reshape(-1, 3), len(vertices)))
+    normals = _unit(summed(np.asarray(faces).ravel(), weighted.reshape(-1, 3), len(vertices)))
     normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
     return normals
 
@@ -51,17 +48,10 @@ def tangent_frames(
 ) -> TangentFrames:
     """Compute the frames of a smooth-shaded mesh with UVs.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int32
-    corner_uvs : (f, 3, 2) float32
-        v points up. Corners of one vertex with equal UVs share their tangent.
-
-    Notes
-    -----
-    Faces without area, on the surface or in the atlas, do not contribute to their neighbours; they
-    hold no texel, and their own tangents are arbitrary vectors orthogonal to the normals.
+    ``vertices`` (v, 3) float64, ``faces`` (f, 3) int32, ``corner_uvs`` (f, 3, 2) float32, v up.
+    Corners of one vertex with equal UVs share their tangent. Faces without area, on the surface or
+    in the atlas, do not contribute to their neighbours; they hold no texel, and their own tangents
+    are arbitrary vectors orthogonal to the normals.
     """
     faces = np.asarray(faces, np.int64)
     normals = shading_normals(vertices, faces)
@@ -80,7 +70,7 @@ def tangent_frames(
     angles = _angles(ahead, behind)
     weighted = angles[..., None] * _unit(_flattened(np.repeat(along[:, None], 3, axis=1), owner))
     group = _groups(faces, uvs, signs)
-    total = _summed(group, weighted.reshape(-1, 3), int(group.max()) + 1)
+    total = summed(group, weighted.reshape(-1, 3), int(group.max()) + 1)
     tangents = _unit(total)[group].reshape(-1, 3, 3)
     missing = ~tangents.any(axis=2)
     if missing.any():
@@ -108,8 +98,7 @@ def _groups(faces: np.ndarray, uvs: np.ndarray, signs: np.ndarray) -> np.ndarray
     same = np.flatnonzero(edge[order[1:]] == edge[order[:-1]])
     one, other = order[same], order[same + 1]
     rows, columns = np.r_[low[one], high[one]], np.r_[low[other], high[other]]
-    adjacency = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), (faces.size, faces.size))
-    return connected_components(adjacency, directed=False)[1].astype(np.int64)
+    return connected(rows, columns, faces.size)[1].astype(np.int64)
 
 
 def _flattened(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -121,10 +110,6 @@ def _angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return angles between unit vectors; 0 where one of them is zero."""
     cosine = (one * other).sum(axis=-1).clip(-1.0, 1.0)
     return np.arccos(cosine) * (one.any(axis=-1) & other.any(axis=-1))
-
-
-def _summed(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    return np.stack([np.bincount(index, values[:, axis], count) for axis in range(3)], axis=1)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,17 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ..array_file import read_arrays
+from ..array_file import read_arrays, write_arrays
 from ..errors import ParseError
-from ..files import write_bytes
 from .surface_mesh import SurfaceMesh
 
 # -- UDIM tiles: several textures side by side in one UV map. Needs numpy only --------------------
 
-
 TILE_COLUMNS, TILE_ROWS = 10, 100
-FIRST_UDIM = 1001
-"""UDIM tiles are 1001 + column + 10 row."""
+FIRST_UDIM = 1001  # UDIM tiles are 1001 + column + 10 row
 LAST_UDIM = FIRST_UDIM + TILE_COLUMNS * TILE_ROWS - 1
 
 
@@ -29,9 +25,8 @@ def udim_uvs(
     corner_uvs: np.ndarray, face_atlas: np.ndarray | None, udims: Sequence[int]
 ) -> np.ndarray:
     """Return (f, 3, 2) float32 UVs in the UDIM tiles of their atlases, from UVs in [0, 1]."""
-    number = np.asarray(udims, np.int64) - FIRST_UDIM
     of_faces = np.zeros(len(corner_uvs), np.int64) if face_atlas is None else face_atlas
-    number = number[of_faces]
+    number = np.asarray(udims, np.int64)[of_faces] - FIRST_UDIM
     shift = np.stack([number % TILE_COLUMNS, number // TILE_COLUMNS], axis=1)
     moved: np.ndarray = (corner_uvs + shift[:, None]).astype(np.float32)
     return moved
@@ -58,10 +53,8 @@ class TexturedMesh:
     """
 
     mesh: SurfaceMesh
-    corner_uvs: np.ndarray
-    """(f, 3, 2) float32 in [0, 1]; v upwards (OpenGL and Blender)."""
-    albedo: np.ndarray
-    """(h, w, 3) uint8 sRGB; row 0 is the top of the image (v = 1)."""
+    corner_uvs: np.ndarray  # (f, 3, 2) float32 in [0, 1]; v upwards (OpenGL and Blender)
+    albedo: np.ndarray  # (h, w, 3) uint8 sRGB; row 0 is the top of the image (v = 1)
     statistics: dict[str, Any] = field(default_factory=dict)
     """Coverage: texels used, seen and filled; number of charts; utilisation."""
     normal_map: np.ndarray | None = None
@@ -72,8 +65,7 @@ class TexturedMesh:
     """(h, w) uint8 photos blended into each texel, 0 where unseen or between charts."""
     face_atlas: np.ndarray | None = None
     """(f,) uint8 the atlas of each face, from 0; None if there is only one."""
-    further: tuple[AtlasMaps, ...] = ()
-    """Atlases 1, 2, ...: of the same size, with the same maps."""
+    further: tuple[AtlasMaps, ...] = ()  # atlases 1, 2, ...: of the same size, with the same maps
     udims: tuple[int, ...] = ()
     """UDIM number of each atlas, which then names its files; empty for numbered atlases."""
 
@@ -112,11 +104,9 @@ class TexturedMesh:
 #
 # Needs numpy only.
 
-
 POLYGONS_FILE = "polygons.npz"
 MAX_BYTES = 4 * 2**30
-SAME_UV = 1e-6
-"""UVs of one corner in two triangles that differ by less are the same."""
+SAME_UV = 1e-6  # UVs of one corner in two triangles that differ by less are the same
 _HINT = "Bake the photos again."
 
 
@@ -124,8 +114,7 @@ _HINT = "Bake the photos again."
 class Polygons:
     """How triangles are parts of polygons."""
 
-    of_faces: np.ndarray
-    """(f,) int64 polygon of each triangle."""
+    of_faces: np.ndarray  # (f,) int64 polygon of each triangle
     loops: np.ndarray
     """(f, 3) int64 loop at each corner. The loops of a polygon have numbers of their own, which
     ascend counter-clockwise."""
@@ -135,41 +124,18 @@ class Polygons:
 class JoinedMesh:
     """Polygons as Blender holds them."""
 
-    corners: np.ndarray
-    """(c,) int64 vertices, polygon after polygon."""
-    starts: np.ndarray
-    """(p,) int64 first corner of each polygon."""
-    uvs: np.ndarray
-    """(c, 2) float32."""
+    corners: np.ndarray  # (c,) int64 vertices, polygon after polygon
+    starts: np.ndarray  # (p,) int64 first corner of each polygon
+    uvs: np.ndarray  # (c, 2) float32
 
 
 def write_polygons(path: Path, polygons: Polygons) -> None:
-    """Write the polygons of a mesh beside it.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
-    """
-    stream = io.BytesIO()
-    np.savez(stream, polygons=polygons.of_faces, loops=polygons.loops)
-    write_bytes(path, stream.getvalue())
+    """Write the polygons of a mesh beside it. Raises OSError: the file cannot be written."""
+    write_arrays(path, polygons=polygons.of_faces, loops=polygons.loops)
 
 
 def read_polygons(path: Path, faces: int) -> Polygons:
-    """Read a file of :func:`write_polygons`.
-
-    Parameters
-    ----------
-    path : Path
-    faces : int
-        Triangles of the mesh.
-
-    Raises
-    ------
-    ParseError
-        It is none, or of another mesh.
-    """
+    """Read the polygons of a mesh with this many triangles; ParseError if they are not its own."""
     arrays = read_arrays(path, ("polygons", "loops"), most_bytes=MAX_BYTES, hint=_HINT)
     try:
         return checked_polygons(arrays["polygons"], arrays["loops"], faces)
@@ -180,10 +146,7 @@ def read_polygons(path: Path, faces: int) -> Polygons:
 def checked_polygons(of_faces: np.ndarray, loops: np.ndarray, faces: int) -> Polygons:
     """Return polygons from arrays of a file.
 
-    Raises
-    ------
-    ValueError
-        Shapes, types or numbers are not those of this many triangles.
+    Raises ValueError: shapes, types or numbers are not those of this many triangles.
     """
     for name, values, shape in (("polygons", of_faces, (faces,)), ("loops", loops, (faces, 3))):
         if values.shape != shape or values.dtype.kind not in "iu":
@@ -198,15 +161,8 @@ def join_triangles(faces: np.ndarray, corner_uvs: np.ndarray, polygons: Polygons
     """Join triangles to the polygons that they were cut from.
 
     Polygons whose triangles disagree stay triangles: where a seam of the UVs cuts them, or where
-    vertices were welded to one. Triangles with a vertex twice are left out.
-
-    Parameters
-    ----------
-    faces : (f, 3) int
-        Indices within range.
-    corner_uvs : (f, 3, 2) float
-    polygons : Polygons
-        Of these triangles.
+    vertices were welded to one. Triangles with a vertex twice are left out. ``faces`` (f, 3) hold
+    indices within range; ``corner_uvs`` are (f, 3, 2).
     """
     loops, of_faces = polygons.loops, polygons.of_faces
     count = int(loops.max()) + 1
@@ -216,7 +172,8 @@ def join_triangles(faces: np.ndarray, corner_uvs: np.ndarray, polygons: Polygons
     uvs[loops.ravel()] = corner_uvs.reshape(-1, 2)
     agree = (vertex[loops] == faces).all(axis=1) & (owner[loops] == of_faces[:, None]).all(axis=1)
     agree &= (np.abs(uvs[loops] - corner_uvs) <= SAME_UV).all(axis=(1, 2))
-    agree &= _ascend(loops)
+    # Numbers of loops ascend, from whichever corner on.
+    agree &= (np.roll(loops, -1, axis=1) > loops).sum(axis=1) == 2
     number = int(of_faces.max()) + 1
     whole = np.bincount(of_faces, ~agree, number) == 0
     used = np.flatnonzero(owner >= 0)
@@ -227,19 +184,9 @@ def join_triangles(faces: np.ndarray, corner_uvs: np.ndarray, polygons: Polygons
     kept = used[whole[owner[used]]]
     kept = kept[np.lexsort((kept, owner[kept]))]
     apart = ~whole[of_faces] & (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    sides = np.append(sides[whole & (sides > 0)], np.full(apart.sum(), 3))
     return JoinedMesh(
         np.concatenate([vertex[kept], faces[apart].ravel()]).astype(np.int64),
-        np.concatenate(
-            [_starts(sides[whole & (sides > 0)]), len(kept) + 3 * np.arange(apart.sum())]
-        ).astype(np.int64),
+        (np.cumsum(sides) - sides).astype(np.int64),
         np.concatenate([uvs[kept], corner_uvs[apart].reshape(-1, 2).astype(np.float32)]),
     )
-
-
-def _ascend(loops: np.ndarray) -> np.ndarray:
-    """Return whether the numbers of (f, 3) corners ascend, from whichever corner on."""
-    return np.asarray((np.roll(loops, -1, axis=1) > loops).sum(axis=1) == 2)
-
-
-def _starts(sides: np.ndarray) -> np.ndarray:
-    return np.asarray(np.cumsum(sides) - sides)

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from ..mesh.components import face_components, volumes_and_areas
+from ..mesh.components import connected, face_components, volumes_and_areas
 from ..mesh.surface_mesh import (
     SurfaceMesh,
     edge_keys,
@@ -31,26 +29,19 @@ class MeshStatistics:
 
     vertices: int
     faces: int
-    boundary_edges: int
-    """Edges with one face."""
-    nonmanifold_edges: int
-    """Edges with more than two faces."""
-    nonmanifold_vertices: int
-    """Vertices whose faces form more than one fan."""
-    inconsistent_edges: int
-    """Edges whose two faces have opposite orientations."""
-    degenerate_faces: int
-    """Faces with two equal corners, or with no area in float64."""
+    boundary_edges: int  # edges with one face
+    nonmanifold_edges: int  # edges with more than two faces
+    nonmanifold_vertices: int  # vertices whose faces form more than one fan
+    inconsistent_edges: int  # edges whose two faces have opposite orientations
+    degenerate_faces: int  # faces with two equal corners, or with no area in float64
     unused_vertices: int
     euler: int
     components: int
-    genus: int | None
-    """Sum over all parts; ``None`` where the mesh is not a closed 2-manifold."""
+    genus: int | None  # sum over all parts; ``None`` where the mesh is not a closed 2-manifold
     volume: float
     area: float
     mean_edge: float
-    closed: bool
-    """Every edge has exactly two faces, of one orientation."""
+    closed: bool  # every edge has exactly two faces, of one orientation
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -97,29 +88,20 @@ def mesh_statistics(mesh: SurfaceMesh) -> MeshStatistics:
 
 def _fans(faces: np.ndarray, keys: np.ndarray) -> int:
     """Count fans: corners at one vertex, connected across shared edges."""
-    corners = np.arange(faces.size)
-    following = next_half_edges(corners)
+    following = next_half_edges(np.arange(faces.size))
     order = np.argsort(keys, kind="stable")
     same = keys[order[1:]] == keys[order[:-1]]
     first, second = order[:-1][same], order[1:][same]  # half-edges on one edge
-    flat = faces.reshape(-1)
-    aligned = flat[first] == flat[second]
-    rows = np.concatenate([first, following[first]])
-    columns = np.concatenate(
-        [
-            np.where(aligned, second, following[second]),
-            np.where(aligned, following[second], second),
-        ]
-    )
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(faces.size,) * 2)
-    return int(connected_components(graph, directed=False)[0]) if faces.size else 0
+    aligned = faces.ravel()[first] == faces.ravel()[second]
+    begin, end = np.where(aligned, [second, following[second]], [following[second], second])
+    rows, columns = np.r_[first, following[first]], np.r_[begin, end]
+    return connected(rows, columns, faces.size)[0] if faces.size else 0
 
 
 # -- Validate that a mesh is an oriented 2-manifold, independently of the code that made it -------
 #
-# The checks use permutations of half-edges and share no code with :mod:`.repair` and
-# :mod:`.checks`, so that a bug there does not hide itself here.
-
+# The checks share no code with :mod:`.repair` and the statistics above but scipy's connected
+# components, so that a bug there does not hide itself here.
 
 MIN_HEIGHT_SHARE = 1e-6
 """A face with a height below this share of its longest edge counts as degenerate. Files hold
@@ -129,8 +111,7 @@ ON_PLANE_SHARE = 1e-7
 """Tolerance for a vertex on the plane of a region's face, in diagonals of the region: float32
 resolves no less."""
 
-MAX_LISTED_PARTS = 20
-"""The report lists this many of the largest parts."""
+MAX_LISTED_PARTS = 20  # the report lists this many of the largest parts
 
 
 @dataclass(frozen=True)
@@ -139,10 +120,8 @@ class CheckedComponent:
 
     faces: int
     euler: int
-    genus: int | None
-    """``None`` where the mesh is not a closed oriented 2-manifold."""
-    volume: float
-    """Negative for a cavity; in the mesh's units."""
+    genus: int | None  # ``None`` where the mesh is not a closed oriented 2-manifold
+    volume: float  # negative for a cavity; in the mesh's units
 
 
 @dataclass(frozen=True)
@@ -150,38 +129,32 @@ class ManifoldCheck:
     """Defects of a mesh; a valid one has counts of 0 and a positive ``volume``."""
 
     faces: int
-    bad_indices: int
-    """Faces with an index out of range; they are left out of all other counts."""
+    bad_indices: int  # faces with an index out of range; they are left out of all other counts
     not_finite_vertices: int
     unused_vertices: int
-    open_edges: int
-    """Edges with one face."""
-    nonmanifold_edges: int
-    """Edges with more than two faces."""
-    inconsistent_edges: int
-    """Edges whose two faces have opposite orientations."""
-    nonmanifold_vertices: int
-    """Vertices whose faces form more than one ring."""
+    open_edges: int  # edges with one face
+    nonmanifold_edges: int  # edges with more than two faces
+    inconsistent_edges: int  # edges whose two faces have opposite orientations
+    nonmanifold_vertices: int  # vertices whose faces form more than one ring
     degenerate_faces: int
     """Faces with a repeated corner, or with a height below :data:`MIN_HEIGHT_SHARE`."""
     euler: int
     volume: float
-    parts: tuple[CheckedComponent, ...]
-    """From the largest number of faces to the smallest."""
+    parts: tuple[CheckedComponent, ...]  # from the largest number of faces to the smallest
     open_at_region: int | None = None
     """Open edges that lie on one plane of the region's boundary; ``None`` if the mesh must be
     closed."""
 
     @property
     def good(self) -> bool:
-        """Whether the mesh is an oriented 2-manifold without defects.
-
-        It must be closed with positive volume, or, if requested, open on the region's planes alone.
-        """
+        """Whether the mesh is an oriented 2-manifold without defects."""
         return not self.defects()
 
     def defects(self) -> list[str]:
-        """Return descriptions of the defects, none for a good mesh."""
+        """Return descriptions of the defects, none for a good mesh.
+
+        It must be closed with positive volume, or, if requested, open on the region's planes alone.
+        """
         if self.faces == 0:
             return ["the mesh has no faces"]
         counted = (
@@ -206,8 +179,8 @@ class ManifoldCheck:
         for holder in (values, *values["parts"]):
             if not np.isfinite(holder["volume"]):
                 holder["volume"] = None
-        counts = {"part_count": len(self.parts), "good": self.good, "defects": self.defects()}
-        return {**values, **counts}
+        defects = self.defects()
+        return {**values, "part_count": len(self.parts), "good": not defects, "defects": defects}
 
 
 def validate_manifold(
@@ -215,38 +188,32 @@ def validate_manifold(
 ) -> ManifoldCheck:
     """Check a triangle mesh; any input is accepted, also an empty mesh.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float
-    faces : (f, 3) int
-        Counter-clockwise seen from outside.
-    open_at : Region, optional
-        Region whose faces may hold boundary edges of the mesh.
+    Faces are counter-clockwise seen from outside. The faces of ``open_at`` may hold boundary edges.
     """
     vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
     given, count = len(faces), len(vertices)
     faces = faces[((faces >= 0) & (faces < count)).all(1)]
     repeated = (faces == np.roll(faces, 1, axis=1)).any(1)
-    finite = np.isfinite(vertices).all(1)
     used = np.zeros(count, np.bool_)
     used[faces] = True
     edges = _Edges(faces, count)
-    part = _parts(faces, count)
     sound = edges.open + edges.nonmanifold + edges.inconsistent == 0 and not repeated.any()
-    rings = _nonmanifold_vertices(edges.twin, faces, count) if sound else None
+    parted = _nonmanifold_vertices(faces, count)
     corners = vertices[faces]  # (f, 3, 3)
-    parts, volume = _measure_parts(corners, faces, part, edges, sound and rings == 0)
+    parts, volume = _measure_parts(
+        corners, faces, _parts(faces, count), edges, sound and parted == 0
+    )
     allowed = None if open_at is None else _on_boundary(vertices, edges.open_pairs, open_at)
     return ManifoldCheck(
         faces=given,
         bad_indices=given - len(faces),
-        not_finite_vertices=int((~finite).sum()),
+        not_finite_vertices=int((~np.isfinite(vertices).all(1)).sum()),
         unused_vertices=int((~used).sum()),
         open_edges=edges.open,
         nonmanifold_edges=edges.nonmanifold,
         inconsistent_edges=edges.inconsistent,
-        nonmanifold_vertices=_nonmanifold_vertices_any(faces) if rings is None else rings,
+        nonmanifold_vertices=parted,
         degenerate_faces=int((repeated | _degenerate(corners)).sum()),
         euler=int(used.sum()) - edges.count + len(faces),
         volume=volume,
@@ -267,14 +234,9 @@ class _Edges:
         self.count = len(unique_edges)
         self.open, self.nonmanifold = int((sizes == 1).sum()), int((sizes > 2).sum())
         once = sizes[self.edge_index] == 1
-        self.open_pairs = np.stack([begin[once], end[once]], 1)
-        """(o, 2) end points of the edges with one face."""
+        self.open_pairs = np.stack([begin[once], end[once]], 1)  # (o, 2)
         balance = np.bincount(self.edge_index, weights=np.where(begin < end, 1.0, -1.0))
         self.inconsistent = int(((sizes == 2) & (balance != 0)).sum()) if len(unique_edges) else 0
-        order = np.argsort(forward, kind="stable")
-        position = np.searchsorted(forward[order], backward)
-        self.twin = order[np.minimum(position, max(len(order) - 1, 0))]
-        """The opposite half-edge; only where the mesh is closed and consistent."""
 
 
 def _on_boundary(vertices: np.ndarray, pairs: np.ndarray, region: Region) -> int:
@@ -286,65 +248,24 @@ def _on_boundary(vertices: np.ndarray, pairs: np.ndarray, region: Region) -> int
     return int(found.sum())
 
 
-def _nonmanifold_vertices(twin: np.ndarray, faces: np.ndarray, vertex_count: int) -> int:
-    """Count vertices with more than one ring, on a closed and consistently oriented mesh.
-
-    The twin of the previous half-edge in a face is the next one that leaves the same vertex. This
-    is a permutation; each of its cycles is one ring.
-    """
-    half = np.arange(faces.size)
-    turn = twin[half - half % 3 + (half + 2) % 3]
-    lowest = _cycle_minima(turn)
-    rings = np.bincount(faces.reshape(-1)[lowest == half], minlength=vertex_count)
-    return int((rings > 1).sum())
-
-
-def _cycle_minima(step: np.ndarray) -> np.ndarray:
-    """Return the least member of the cycle of each element, by pointer doubling."""
-    lowest, ahead = np.arange(len(step)), step
-    while True:
-        better = np.minimum(lowest, lowest[ahead])
-        if np.array_equal(better, lowest):
-            return lowest
-        lowest, ahead = better, ahead[ahead]
-
-
-def _nonmanifold_vertices_any(faces: np.ndarray) -> int:
-    """Count vertices whose faces form more than one piece, on any mesh."""
-    around: dict[int, list[tuple[int, int]]] = {}
-    for a, b, c in faces.tolist():
-        for v, first, second in ((a, b, c), (b, c, a), (c, a, b)):
-            around.setdefault(v, []).append((first, second))
-    return sum(_connected_pieces(edges) > 1 for edges in around.values())
-
-
-def _connected_pieces(edges: list[tuple[int, int]]) -> int:
-    """Count the connected pieces of a few edges."""
-    leader: dict[int, int] = {}
-
-    def find(x: int) -> int:
-        while leader.setdefault(x, x) != x:
-            x = leader[x]
-        return x
-
-    for first, second in edges:
-        leader[find(first)] = find(second)
-    return len({find(x) for x in leader})
+def _nonmanifold_vertices(faces: np.ndarray, vertex_count: int) -> int:
+    """Count vertices whose faces form more than one piece: the edges opposite to them do."""
+    if len(faces) == 0:
+        return 0
+    keys = [(faces * vertex_count + np.roll(faces, -k, axis=1)).ravel() for k in (1, 2)]
+    ends, index = np.unique(np.concatenate(keys), return_inverse=True)
+    one, other = index.reshape(2, -1)
+    count, label = connected(one, other, len(ends))
+    owner = np.zeros(count, np.int64)
+    owner[label] = ends // vertex_count
+    return int((np.bincount(owner) > 1).sum())
 
 
 def _parts(faces: np.ndarray, vertex_count: int) -> np.ndarray:
     """Label each face by the least vertex of its part, (f,) int64."""
-    leader = np.arange(vertex_count)
-    while True:
-        low = leader[faces].min(1)  # (f,)
-        before = leader.copy()
-        for k in range(3):
-            # Propagate the least leader of the face to the corner and to its leader.
-            np.minimum.at(leader, leader[faces[:, k]], low)
-            np.minimum.at(leader, faces[:, k], low)
-        leader = leader[leader]
-        if np.array_equal(leader, before):
-            return leader[faces[:, 0]]
+    begin, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    _, label = connected(begin, end, max(vertex_count, 1))
+    return np.unique(label, return_index=True)[1][label[faces[:, 0]]]
 
 
 def _degenerate(corners: np.ndarray) -> np.ndarray:
@@ -377,13 +298,9 @@ def _measure_parts(
     vertex_count = np.bincount(index[first // 3], minlength=count)
     eulers = vertex_count - np.bincount(edge_part, minlength=count) + sizes
     order = np.argsort(-sizes, kind="stable")
+    columns = (values[order].tolist() for values in (sizes, eulers, volumes))
     parts = tuple(
-        CheckedComponent(
-            int(sizes[i]),
-            int(eulers[i]),
-            1 - int(eulers[i]) // 2 if manifold else None,
-            float(volumes[i]),
-        )
-        for i in order
+        CheckedComponent(size, euler, 1 - euler // 2 if manifold else None, inside)
+        for size, euler, inside in zip(*columns, strict=True)
     )
     return parts, float(volumes.sum())

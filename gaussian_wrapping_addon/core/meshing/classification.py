@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from ..mesh.surface_mesh import area_vectors
 from ..progress import Progress
 
 # -- Exact minimum cut on the dual graph of a tetrahedral mesh, by push-relabel (numba) -----------
-
 
 ARCS_PER_NODE = 6
 """Arcs scanned per node between two global relabellings, each of which scans four. The cut of
@@ -35,20 +34,11 @@ def minimum_cut(
     problem", 1988). Nodes that can still reach remaining sink capacity are inside. Memory and, on
     meshes, time grow linearly with the nodes; millions are practical.
 
-    Parameters
-    ----------
-    arcs : (k, 4) int
-        Neighbours, -1 for none; mutual, each at most once in a row.
-    capacity : (k, 4) int
-        Capacity of each arc, >= 0 and below 2**30; the smaller of both directions counts.
-    unary : (k,) int
-        Unary term of each node; positive favours inside.
-    progress : Progress, optional
-        Updated at each global relabelling, so that the computation can be cancelled.
-
-    Returns
-    -------
-    (k,) bool
+    ``arcs``: (k, 4) neighbours, -1 for none; mutual, each at most once in a row.
+    ``capacity``: (k, 4) of each arc, >= 0 and below 2**30; the smaller of both directions counts.
+    ``unary``: (k,) term of each node; positive favours inside.
+    ``progress``: updated at each global relabelling, so that the computation can be cancelled.
+    Returns (k,) bool.
     """
     progress = progress or Progress()
     count = len(arcs)
@@ -68,10 +58,8 @@ def minimum_cut(
         queue[: len(active)] = active
         queued[:] = False
         queued[active] = True
-        _push_kernel(
-            arcs, residual, reverse, excess, height, queue, queued, len(active),
-            ARCS_PER_NODE * count,
-        )  # fmt: skip
+        budget = ARCS_PER_NODE * count
+        _push_kernel(arcs, residual, reverse, excess, height, queue, queued, len(active), budget)
 
 
 @kernel(fast=False)
@@ -159,7 +147,6 @@ def _push_kernel(  # type: ignore[no-untyped-def]
 
 # -- Neighbours of tetrahedra, and the faces between inside and outside tetrahedra ----------------
 
-
 OUTWARD_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 """Corners of the face opposite each corner of a positively oriented tetrahedron, outward."""
 
@@ -186,6 +173,17 @@ def tetrahedron_neighbours(tetrahedra: np.ndarray) -> np.ndarray:
     return result.reshape(count, 4)
 
 
+def faces_opposite(tetrahedra: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return the faces opposite the chosen corners (m, 4) bool of tetrahedra, outward, (f, 3)."""
+    tetrahedron, corner = np.nonzero(chosen)
+    return tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]
+
+
+def of_neighbours(labels: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+    """Return the labels (m,) bool of the neighbours, (m, 4); false beyond the hull."""
+    return np.where(neighbours >= 0, labels[neighbours], False)
+
+
 def boundary_faces(
     tetrahedra: np.ndarray, neighbours: np.ndarray, inside: np.ndarray
 ) -> np.ndarray:
@@ -194,9 +192,7 @@ def boundary_faces(
     Oriented outward where the tetrahedra are positively oriented. The set is closed: every edge
     has as many faces in one direction as in the other.
     """
-    beyond = np.where(neighbours >= 0, inside[neighbours], False)  # (m, 4)
-    tetrahedron, corner = np.nonzero(inside[:, None] & ~beyond)
-    return tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]
+    return faces_opposite(tetrahedra, inside[:, None] & ~of_neighbours(inside, neighbours))
 
 
 # -- Label tetrahedra inside or outside: progressive sampling, then a minimum cut -----------------
@@ -204,16 +200,11 @@ def boundary_faces(
 # See docs/method.md, section 7.5.
 
 
-Vacancy = Callable[[np.ndarray], np.ndarray]
-"""Maps (n, 3) points to (n,) vacancy."""
-
 ROUNDS = (1, 3, 6)
 """Interior samples added in each round: the centroid, then random points (10 in all, as in PAM)."""
 
-DECIDED_MARGIN = 0.3
-"""A mean vacancy this far from 0.5 needs no further samples, ..."""
-DISAGREEING_NEIGHBOURS = 3
-"""... unless this many neighbours have the other label."""
+DECIDED_MARGIN = 0.3  # a mean vacancy this far from 0.5 needs no further samples, ...
+DISAGREEING_NEIGHBOURS = 3  # ... unless this many neighbours have the other label
 MIXED_DEVIATION = 0.1
 """Samples near 0.5 whose standard deviation is below this come from a sliver on the surface: more
 samples add nothing, and the minimum cut decides."""
@@ -232,8 +223,7 @@ thin tube saves much area. From 0.1 to 0.05 the mean distances of wheel, fence a
 truth fall or stay, and fewer spokes break; with 0 the torus gets small noisy components."""
 DATA_WEIGHT = 1.0
 """Cost of a label against the samples, in units of the tetrahedron's own mean face area."""
-CAPACITY_STEPS = 4096.0
-"""Integer steps of the median face area in the minimum cut."""
+CAPACITY_STEPS = 4096.0  # integer steps of the median face area in the minimum cut
 LARGEST_CAPACITY = 2**27
 """In the same steps, 32 768 median areas: larger faces are clamped to it. Flow along an arc can
 double the residual capacity of its reverse, which must fit into 32 bits."""
@@ -245,28 +235,18 @@ POINTS_PER_CHUNK = 1 << 19
 class Classification:
     """Labels of tetrahedra and the statistics behind them."""
 
-    inside: np.ndarray
-    """(m,) bool."""
-    vacancy: np.ndarray
-    """(m,) float64 mean vacancy of the interior samples; 1 where not sampled."""
-    samples: np.ndarray
-    """(m,) int64 number of interior samples."""
-    undecided: int
-    """Tetrahedra whose label was left to the minimum cut."""
-    flipped: int
-    """Tetrahedra whose label the minimum cut changed."""
+    inside: np.ndarray  # (m,) bool
+
+    samples: np.ndarray  # (m,) int64 number of interior samples
+    undecided: int  # tetrahedra whose label was left to the minimum cut
+    flipped: int  # tetrahedra whose label the minimum cut changed
 
 
 def classify(
-    points: np.ndarray,
-    tetrahedra: np.ndarray,
-    neighbours: np.ndarray,
-    outer: np.ndarray,
-    sheet: Sheet,
-    vacancy: Vacancy,
-    rng: np.random.Generator,
+    points: np.ndarray, tetrahedra: np.ndarray, neighbours: np.ndarray, outer: np.ndarray,
+    normals: np.ndarray, radii: np.ndarray, field: Any, rng: np.random.Generator,
     progress: Progress,
-) -> Classification:
+) -> Classification:  # fmt: skip
     """Label tetrahedra by the vacancy of interior points (docs/method.md, section 7.5).
 
     A tetrahedron whose corners lie on one smooth sheet is flat: whichever its label, the surface
@@ -275,24 +255,21 @@ def classify(
     surface, with well-shaped triangles. Labelled by interior samples, a cylinder would get the long
     edges of a convex hull.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    tetrahedra : (m, 4) int64
-    neighbours : (m, 4) int64
-        Tetrahedron behind the face opposite each corner, -1 on the hull.
-    outer : (m,) bool
-        Outside by definition (beyond the region), not sampled.
-    sheet : Sheet
-        From :func:`on_one_sheet`.
+    ``points`` (n, 3) float64, ``tetrahedra`` (m, 4) int64, ``neighbours`` (m, 4) int64: from
+    :func:`tetrahedron_neighbours`.
+    ``outer``: (m,) bool: outside by definition (beyond the region), not sampled.
+    ``normals``, ``radii``: (k, 3) and (k,) float64 normals and local spacing at the first k points;
+    tetrahedra with other corners are ``outer``.
+    ``field``: VacancyField, or any object with ``vacancy(points)``.
     """
     count = len(tetrahedra)
     total, squares = np.zeros(count), np.zeros(count)
     samples = np.zeros(count, np.int64)
     total[outer], samples[outer] = 1.0, 1
+    rows, side = _on_one_sheet(points, tetrahedra, normals, outer, radii)
     flat = np.zeros(count, np.bool_)
-    flat[sheet.rows] = True
-    total[sheet.rows], samples[sheet.rows] = 0.5 + 0.5 * sheet.side, 1
+    flat[rows] = True
+    total[rows], samples[rows] = 0.5 + 0.5 * side, 1
     rows = np.flatnonzero(~outer & ~flat)
     for index, extra in enumerate(ROUNDS):
         span = progress.span(0.8 * index / len(ROUNDS), 0.8 * (index + 1) / len(ROUNDS))
@@ -303,50 +280,36 @@ def classify(
             weights = _interior_weights((extra, len(part)), index == 0, rng)
             where = np.einsum("ekc,kcx->ekx", weights, points[tetrahedra[part]])
             # One call for all samples: each call visits every camera, however few the points.
-            value = vacancy(where.reshape(-1, 3)).reshape(extra, -1).astype(np.float64)
+            value = field.vacancy(where.reshape(-1, 3)).filled
+            value = value.reshape(extra, -1).astype(np.float64)
             total[part] += value.sum(0)
             squares[part] += (value**2).sum(0)
             samples[part] += extra
         mean = total / np.maximum(samples, 1)
         inside = (mean <= limits.ISO_LEVEL) & ~outer
         near = np.abs(mean - limits.ISO_LEVEL) < DECIDED_MARGIN
-        outvoted = _disagreeing(inside, neighbours) >= DISAGREEING_NEIGHBOURS
+        others = of_neighbours(inside, neighbours) != inside[:, None]
+        outvoted = others.sum(1) >= DISAGREEING_NEIGHBOURS
         mixed = squares > samples * (mean**2 + MIXED_DEVIATION**2)
         rows = np.flatnonzero(((near & (mixed | (samples == 1))) | outvoted) & ~outer & ~flat)
     progress.update(0.85, "smoothing labels")
     free = flat | (np.abs(mean - limits.ISO_LEVEL) < FIXED_MARGIN) & ~outer
-    areas = face_areas(points, tetrahedra)
+    # (m, 4) areas of the faces opposite each corner.
+    doubled = (area_vectors(points, np.delete(tetrahedra, k, axis=1)) for k in range(4))
+    areas = np.stack([np.linalg.norm(each, axis=1) / 2 for each in doubled], axis=1)
     smooth = regularised(inside, mean, free, neighbours, areas, progress.span(0.9, 1.0))
     progress.update(1.0, "smoothing labels")
-    flipped = int((smooth != inside).sum())
-    return Classification(smooth, mean, samples, int(free.sum()), flipped)
+    return Classification(smooth, samples, int(free.sum()), int((smooth != inside).sum()))
 
 
-@dataclass(frozen=True)
-class Sheet:
-    """Tetrahedra whose corners lie on one smooth sheet of the surface."""
-
-    rows: np.ndarray
-    """(k,) int64 indices."""
-    side: np.ndarray
-    """(k,) float64 from -1 to 1: how far the circumcentre lies on the empty side, in spacings."""
-
-
-def on_one_sheet(
-    points: np.ndarray,
-    tetrahedra: np.ndarray,
-    normals: np.ndarray,
-    outer: np.ndarray,
+def _on_one_sheet(
+    points: np.ndarray, tetrahedra: np.ndarray, normals: np.ndarray, outer: np.ndarray,
     radii: np.ndarray,
-) -> Sheet:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Find flat tetrahedra: normals agree at all corners and are nearly orthogonal to the edges.
 
-    Parameters
-    ----------
-    normals : (k, 3) float64
-        Normals at the first k points; tetrahedra with other corners are ``outer``.
-    radii : (k,) float64
-        Local spacing at the first k points.
+    Returns their indices, and how far the circumcentre of each lies on the empty side, in spacings
+    from -1 to 1.
     """
     rows = np.flatnonzero(~outer)
     corners = tetrahedra[rows]
@@ -372,7 +335,7 @@ def on_one_sheet(
     safe = np.where(np.abs(volume) > 1e-12 * radius**3, volume, 1e-12 * radius**3)
     offset = sum(s * x for s, x in zip(squares, cross, strict=True)) / safe[:, None]
     height = ((offset - (a + b + c) / 4) * up).sum(1)
-    return Sheet(rows, np.clip(height / radius, -1.0, 1.0))
+    return rows, np.clip(height / radius, -1.0, 1.0)
 
 
 def _interior_weights(
@@ -385,38 +348,15 @@ def _interior_weights(
     return weights / weights.sum(-1, keepdims=True)
 
 
-def _disagreeing(inside: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-    """Count the neighbours with the other label, (m,); space beyond the hull is outside."""
-    theirs = np.where(neighbours >= 0, inside[neighbours], False)  # (m, 4)
-    return (theirs != inside[:, None]).sum(1)
-
-
-def face_areas(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Return (m, 4) areas of the faces opposite each corner."""
-    result = np.empty(tetrahedra.shape)
-    for k in range(4):
-        faces = np.delete(tetrahedra, k, axis=1)
-        result[:, k] = np.linalg.norm(area_vectors(points, faces), axis=1) / 2
-    return result
-
-
 def regularised(
-    inside: np.ndarray,
-    vacancy: np.ndarray,
-    free: np.ndarray,
-    neighbours: np.ndarray,
-    areas: np.ndarray,
-    progress: Progress | None = None,
-) -> np.ndarray:
-    """Label the ``free`` tetrahedra by a minimum cut.
+    inside: np.ndarray, vacancy: np.ndarray, free: np.ndarray, neighbours: np.ndarray,
+    areas: np.ndarray, progress: Progress | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Label the ``free`` tetrahedra by a minimum cut; return all labels, (m,) bool.
 
     Minimises the area of the faces between different labels plus, for each tetrahedron labelled
     against its samples, ``DATA_WEIGHT * 2 |vacancy - 0.5|`` times its mean face area. The other
     labels are fixed, so thin parts that the field shows clearly cannot be smoothed away.
-
-    Returns
-    -------
-    (m,) bool
     """
     nodes = np.flatnonzero(free)
     if len(nodes) == 0:

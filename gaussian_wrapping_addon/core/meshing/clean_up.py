@@ -4,23 +4,29 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ..errors import MeshingError
 from ..field.isosurface_projection import isosurface_residuals
-from ..mesh.components import compacted, face_components, volumes_and_areas, without_floaters
+from ..mesh.components import (
+    compacted,
+    connected,
+    face_components,
+    volumes_and_areas,
+    without_floaters,
+)
 from ..mesh.simplification import decimate
 from ..mesh.surface_mesh import (
     SurfaceMesh,
     area_vectors,
     edge_keys,
+    edge_lengths,
     faces_per_edge,
     half_edges,
     next_half_edges,
@@ -34,7 +40,6 @@ from ..settings import MeshingSettings
 from .repair import SEPARATION_SHARE
 
 # -- Close handles below the mesh's resolution by replacing the patch around each by a disc -------
-
 
 BOX_EDGES = (2.0, 3.0, 4.5)
 """Sides of the boxes that are searched for handles, in edge lengths of the mesh, in increasing
@@ -56,29 +61,14 @@ region's boundary can be collinear."""
 MAX_PASSES = 8
 
 
-@dataclass(frozen=True)
-class HandleClosure:
+class HandleClosure(NamedTuple):
     """Result of :func:`without_small_handles`."""
 
-    faces: np.ndarray
-    """(g, 3) int64."""
-    closed: int
-    """Handles that were closed."""
+    faces: np.ndarray  # (g, 3) int64
+    closed: int  # handles that were closed
     left: int
     """Small handles that could not be closed without cutting something else; there may be more that
     no box happens to contain."""
-
-
-@dataclass(frozen=True)
-class _Patches:
-    """Connected sets of faces in the same box."""
-
-    of_face: np.ndarray
-    """(f,) int64 label of each face."""
-    handles: np.ndarray
-    """(p,) int64 genus of each; 0 also where the boundary touches itself."""
-    loops: np.ndarray
-    """(p,) int64 boundary loops of each."""
 
 
 def without_small_handles(
@@ -90,53 +80,40 @@ def without_small_handles(
     tetrahedra. Vertices are neither moved nor added. A patch with more than one boundary loop is
     kept, since discs would cut what passes through it.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int
-        Closed 2-manifold, consistently oriented.
-    edge_length : float
-        Edge length of the final mesh, scene units.
+    ``vertices`` (v, 3), ``faces`` (f, 3): closed 2-manifold, consistently oriented; ``edge_length``
+    is that of the final mesh, scene units.
     """
     faces = np.asarray(faces, np.int64)
-    if _genus(len(vertices), faces) == 0:
+    parts, _ = face_components(len(vertices), faces)
+    euler = len(np.unique(faces)) - len(faces) // 2
+    if (2 * parts - euler) // 2 == 0:  # total genus
         return HandleClosure(faces, 0, 0)
-    closed = 0
+    closed, shifts = 0, [np.array(shift) for shift in product((0.0, 0.5), repeat=3)]
     for share in BOX_EDGES:
         for _ in range(MAX_PASSES):
-            found = 0
-            for shift in product((0.0, 0.5), repeat=3):
-                faces, count = _close_in_grid(vertices, faces, share, edge_length, np.array(shift))
-                found += count
-            closed += found
-            if found == 0:
+            before = closed
+            for shift in shifts:
+                faces, count = _close_in_grid(vertices, faces, share, edge_length, shift)
+                closed += count
+            if closed == before:
                 break
-    left = 0
-    for shift in product((0.0, 0.5), repeat=3):
-        patches = _patches(vertices, faces, BOX_EDGES[-1] * edge_length, np.array(shift))
-        left = max(left, int(patches.handles.sum()))
-    return HandleClosure(faces, closed, left)
-
-
-def _genus(vertex_count: int, faces: np.ndarray) -> int:
-    """Return the total genus of a closed 2-manifold."""
-    parts, _ = face_components(vertex_count, faces)
-    euler = len(np.unique(faces)) - len(faces) // 2
-    return (2 * parts - euler) // 2
+    side = BOX_EDGES[-1] * edge_length
+    left = [int(_patches(vertices, faces, side, shift)[1].sum()) for shift in shifts]
+    return HandleClosure(faces, closed, max(0, *left))
 
 
 def _close_in_grid(
     vertices: np.ndarray, faces: np.ndarray, share: float, edge_length: float, shift: np.ndarray
 ) -> tuple[np.ndarray, int]:
     """Close the handles in the boxes of one grid; return the faces and the number of handles."""
-    patches = _patches(vertices, faces, share * edge_length, shift)
-    chosen = np.flatnonzero((patches.handles > 0) & (patches.loops == 1))
+    patch, handles, loops = _patches(vertices, faces, share * edge_length, shift)
+    chosen = np.flatnonzero((handles > 0) & (loops == 1))
     if len(chosen) == 0:
         return faces, 0
     count = len(vertices)
     keys = np.sort(_edge_keys(faces, count))
-    order = np.argsort(patches.of_face, kind="stable")
-    bounds = np.searchsorted(patches.of_face[order], np.stack([chosen, chosen + 1], axis=1))
+    order = np.argsort(patch, kind="stable")
+    bounds = np.searchsorted(patch[order], np.stack([chosen, chosen + 1], axis=1))
     kept = np.ones(len(faces), np.bool_)
     covers: list[np.ndarray] = []
     covered: set[int] = set()
@@ -149,9 +126,7 @@ def _close_in_grid(
         pairs = edge_keys(loop[:, None], loop[None, :], count)  # (n, n)
         forbidden = keys[np.minimum(np.searchsorted(keys, pairs), len(keys) - 1)] == pairs
         forbidden &= ~np.isin(pairs, _edge_keys(faces[rows], count))
-        forbidden |= np.array([key in covered for key in pairs.ravel().tolist()]).reshape(
-            pairs.shape
-        )
+        forbidden |= np.array([[key in covered for key in row] for row in pairs.tolist()])
         cover = _least_area_triangles(vertices[loop], loop, forbidden)
         if cover is None:
             continue
@@ -161,7 +136,7 @@ def _close_in_grid(
         kept[rows] = False
         covers.append(cover)
         covered.update(_edge_keys(cover, count).tolist())
-        closed += int(patches.handles[label])
+        closed += int(handles[label])
     return np.concatenate([faces[kept], *covers]), closed
 
 
@@ -173,8 +148,14 @@ def _farthest(points: np.ndarray, triangles: np.ndarray) -> float:
     return float(cKDTree(near).query(points)[0].max())
 
 
-def _patches(vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.ndarray) -> _Patches:
-    """Group adjacent faces whose centroids lie in the same box; count handles and loops."""
+def _patches(
+    vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Group adjacent faces whose centroids lie in the same box.
+
+    Returns the patch of each face, (f,) int64, and for each patch its genus, 0 also where the
+    boundary touches itself, and its number of boundary loops.
+    """
     middle = vertices[faces].mean(1)
     box = np.floor((middle - middle.min(0)) / side + shift).astype(np.int64)  # (f, 3)
     size = box.max(0) + 1
@@ -185,31 +166,19 @@ def _patches(vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.nda
     # A closed 2-manifold: edges come in pairs.
     one, two = order[0::2] // 3, order[1::2] // 3  # (e,) faces beside each edge
     same = box_id[one] == box_id[two]
-    graph = coo_matrix((np.ones(same.sum(), np.int8), (one[same], two[same])), (len(faces),) * 2)
-    number, label = connected_components(graph, directed=False)
+    number, label = connected(one[same], two[same], len(faces))
     label = label.astype(np.int64)
     # Edges inside a patch and on its boundary; an edge between two patches belongs to both.
     low, high = begin[order[0::2]], end[order[0::2]]
     between = label[one] != label[two]
-    outline_patch = np.concatenate([label[one[between]], label[two[between]]])
-    outline_low = np.tile(low[between], 2)
-    outline_high = np.tile(high[between], 2)
-    edge_count = np.bincount(label[one], minlength=number) + np.bincount(
-        label[two[between]], minlength=number
-    )
+    outline = count * np.concatenate([label[one[between]], label[two[between]]])
     corner = np.unique(np.repeat(label, 3) * count + begin)
-    vertex_count = np.bincount(corner // count, minlength=number)
-    face_count = np.bincount(label, minlength=number)
-    euler = vertex_count - edge_count + face_count
-    ends = np.concatenate(
-        [outline_patch * count + outline_low, outline_patch * count + outline_high]
-    )
+    euler = np.bincount(corner // count, minlength=number) + np.bincount(label, minlength=number)
+    euler -= np.bincount(np.append(label[one], label[two[between]]), minlength=number)
+    ends = np.append(outline + np.tile(low[between], 2), outline + np.tile(high[between], 2))
     nodes, index, degree = np.unique(ends, return_inverse=True, return_counts=True)
-    half = len(outline_patch)
-    loop_graph = coo_matrix(
-        (np.ones(half, np.int8), (index[:half], index[half:])), (len(nodes),) * 2
-    )
-    loop_count, loop_label = connected_components(loop_graph, directed=False)
+    low_end, high_end = index.reshape(2, -1)
+    loop_count, loop_label = connected(low_end, high_end, len(nodes))
     loop_patch = np.zeros(loop_count, np.int64)
     loop_patch[loop_label] = nodes // count
     loops = np.bincount(loop_patch, minlength=number)
@@ -217,7 +186,7 @@ def _patches(vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.nda
     # A patch without a boundary is a whole small part: its handles are small as well, but no disc
     # can replace it.
     handles = np.where(touching | (loops == 0), 0, (2 - euler - loops) // 2)
-    return _Patches(label, handles, loops)
+    return label, handles, loops
 
 
 def _edge_keys(faces: np.ndarray, count: int) -> np.ndarray:
@@ -244,15 +213,8 @@ def _least_area_triangles(
 ) -> np.ndarray | None:
     """Return the triangles of least area that span a loop, (n - 2, 3), or None.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    taken : (n, n) bool
-        Pairs that must not be joined, since the mesh has that edge elsewhere.
-
-    Notes
-    -----
-    Dynamic programming over the loop's sub-polygons, O(n^3).
+    Dynamic programming over the loop's sub-polygons, O(n^3). ``forbidden`` (n, n) are the pairs
+    that must not be joined, since the mesh has that edge elsewhere.
     """
     count = len(loop)
     cost = np.full((count, count), np.inf)
@@ -284,7 +246,6 @@ def _least_area_triangles(
 
 # -- Open a closed mesh where its region cuts the solid, by removing the caps ---------------------
 
-
 MOVED_SHARE = 1.5 * SEPARATION_SHARE
 """A vertex moved by the repair may be off its plane by this share of its face's longest edge."""
 
@@ -302,19 +263,9 @@ def without_caps(
     alone. A solid may fall into pieces; small ones are removed like floaters. ``provenance`` counts
     the removed faces, the removed pieces and the remaining parts.
 
-    Parameters
-    ----------
-    mesh : SurfaceMesh
-        Closed 2-manifold, made in ``region``.
-    region : Region
-        Same frame.
-    min_component_share : float
-        As for :func:`~.components.without_floaters`; 0 keeps every piece.
-
-    Raises
-    ------
-    MeshingError
-        No faces remain: the region lies within a solid.
+    ``mesh`` is a closed 2-manifold, made in ``region``; ``min_component_share`` is as for
+    :func:`~.components.without_floaters`: 0 keeps every piece.
+    Raises MeshingError: no faces remain: the region lies within a solid.
     """
     vertices, faces = mesh.vertices.copy(), np.asarray(mesh.faces, np.int64)
     on_cap = np.zeros(len(faces), np.bool_)
@@ -338,8 +289,7 @@ def without_caps(
         )
     split, source = split_fans(stays)
     pieces = without_floaters(vertices[source], split, min_component_share)
-    vertices, split, used = compacted(vertices[source], pieces.faces)
-    colors = None if mesh.colors is None else mesh.colors[source[used]]
+    vertices, split, _ = compacted(vertices[source], pieces.faces)
     rim = (cap_planes(vertices, region).planes >= 0).any(1)
     counted = {
         "boundary": "open",
@@ -349,13 +299,7 @@ def without_caps(
         "removed_open_area_share": pieces.removed_area_share,
         "vertices_on_region_boundary": int(rim.sum()),
     }
-    return replace(
-        mesh,
-        vertices=vertices,
-        faces=split.astype(np.int32),
-        colors=colors,
-        provenance={**mesh.provenance, **counted},
-    )
+    return SurfaceMesh(vertices, split.astype(np.int32), {**mesh.provenance, **counted})
 
 
 def _within(points: np.ndarray, region: Region) -> np.ndarray:
@@ -374,13 +318,9 @@ def _within(points: np.ndarray, region: Region) -> np.ndarray:
 
 
 def _cap_faces(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    normal: np.ndarray,
-    distance: np.ndarray,
-    on_any: np.ndarray,
-    tolerance: float,
-) -> np.ndarray:
+    vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray, distance: np.ndarray,
+    on_any: np.ndarray, tolerance: float,
+) -> np.ndarray:  # fmt: skip
     """Return which faces lie on one plane of the region, (f,) bool.
 
     A face with a corner moved by the repair counts, unless other corners lie on other planes.
@@ -389,8 +329,7 @@ def _cap_faces(
     cap = exact[faces].all(1)
     own = (exact | ~on_any)[faces].all(1)
     near = np.flatnonzero(exact[faces].any(1) & ~cap & own)
-    corners = vertices[faces[near]]  # (k, 3, 3)
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
+    longest = edge_lengths(vertices, faces[near]).max(1)
     unit, _ = normals_and_areas(vertices, faces[near])
     close = np.abs(distance[faces[near]]).max(1) <= MOVED_SHARE * longest
     cap[near[close & (unit @ normal >= ALONG_COSINE)]] = True
@@ -400,33 +339,21 @@ def _cap_faces(
 def split_fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split vertices so that each fan of faces has its own; edges may have one or two faces.
 
-    Returns
-    -------
-    faces : (f, 3) int64
-        With new vertex numbers.
-    source : (w,) int64
-        Old vertex of each new one.
+    Returns (f, 3) faces of new vertices, and the old vertex of each new one, (w,) int64.
     """
-    begin, end = half_edges(faces)
-    keys = edge_keys(begin, end, int(faces.max()) + 1)
+    keys = _edge_keys(faces, int(faces.max()) + 1)
     order = np.argsort(keys, kind="stable")
     same = keys[order[1:]] == keys[order[:-1]]
     first, second = order[:-1][same], order[1:][same]  # half-edges of one edge, opposite ways
-    half = np.arange(faces.size)
-    following = next_half_edges(half)
-    rows = np.concatenate([first, following[first]])
-    columns = np.concatenate([following[second], second])
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(faces.size,) * 2)
-    _, label = connected_components(graph, directed=False)
+    rows, columns = np.r_[first, next_half_edges(first)], np.r_[next_half_edges(second), second]
+    _, label = connected(rows, columns, faces.size)
     _, first_corner, number = np.unique(label, return_index=True, return_inverse=True)
     return number.reshape(-1, 3), faces.reshape(-1)[first_corner]
 
 
 # -- Volume-preserving Taubin smoothing of closed meshes; off by default --------------------------
 
-
-SHRINK = 0.5
-"""Share of the way to the mean of the neighbours in the first half of a step."""
+SHRINK = 0.5  # share of the way to the mean of the neighbours in the first half of a step
 
 GROW = -1.0 / (2.0 - 0.1)
 """Share of the second half: it undoes the shrinking of waves longer than about ten edges (the pass
@@ -439,8 +366,7 @@ corners: no folds arise, and wires of three or four faces around are not crushed
 MIN_AREA_SHARE = 0.2
 """The same for a face that would be left with less than this share of its initial area."""
 
-VOLUME_ROUNDS = 5
-"""Newton steps along the normals that restore the volume of each part."""
+VOLUME_ROUNDS = 5  # Newton steps along the normals that restore the volume of each part
 
 MAX_VOLUME_CHANGE = 0.01
 """A part whose volume cannot be restored to 1 % is not smoothed: it has too few faces for its
@@ -448,34 +374,17 @@ shape, and the filter would crush it."""
 
 
 def smooth(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    steps: int,
-    progress: Progress,
-    *,
+    vertices: np.ndarray, faces: np.ndarray, steps: int, progress: Progress, *,
     region: Region | None = None,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return smoothed positions, (v, 3) float64; the faces are unchanged.
 
     Taubin's lambda-mu filter, with neighbours weighted by inverse distance so that uneven spacing
     does not drift. The volume of each part is restored afterwards; parts where that fails keep
-    their original positions. Vertices on the region's faces stay on them, vertices at open edges do
-    not move, and none leaves the region.
+    their original positions. Vertices on the faces of the region that the mesh was made in stay on
+    them, vertices at open edges do not move, and none leaves the region.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int
-        Oriented 2-manifold, every vertex used.
-    steps : int
-        0 changes nothing.
-    region : Region, optional
-        The region that the mesh was made in, same frame.
-
-    Raises
-    ------
-    Cancelled
-        Through ``progress``.
+    ``vertices`` (v, 3), ``faces`` (f, 3): oriented 2-manifold, every vertex used.
     """
     vertices = np.asarray(vertices, np.float64)
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
@@ -485,7 +394,8 @@ def smooth(
     origin = vertices[faces].mean((0, 1))
     points = vertices - origin
     limits = caps.offsets - caps.normals @ origin
-    free = ~(caps.fixed | _at_open_edges(faces, len(points)))
+    open_edges = faces_per_edge(faces, len(points)) == 1
+    free = ~(caps.fixed | vertices_of_half_edges(open_edges, faces, len(points)))
     weights = _neighbour_weights(points, faces)
     count, part = face_components(len(points), faces)
     volume, _ = volumes_and_areas(points, faces, part, count)
@@ -519,29 +429,15 @@ def _neighbour_weights(points: np.ndarray, faces: np.ndarray) -> csr_matrix:
     return csr_matrix((weight / total[rows], (rows, columns)), shape=shape)
 
 
-def _at_open_edges(faces: np.ndarray, count: int) -> np.ndarray:
-    return vertices_of_half_edges(faces_per_edge(faces, count) == 1, faces, count)
-
-
 def _safe_move(
-    points: np.ndarray,
-    faces: np.ndarray,
-    first: np.ndarray,
-    move: np.ndarray,
-    caps: CapPlanes,
+    points: np.ndarray, faces: np.ndarray, first: np.ndarray, move: np.ndarray, caps: CapPlanes,
     limits: np.ndarray,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Move vertices, except where a face would turn or shrink too far, or leave the region.
 
     A vertex that is held back may spoil another face, so the check is repeated until no face is
-    bad; in the worst case nothing moves.
-
-    Parameters
-    ----------
-    first : (f, 3) float64
-        Area vectors of the faces before any move.
-    limits : (k,) float64
-        Offsets of the region's planes in the frame of ``points``.
+    bad; in the worst case nothing moves. ``first`` (f, 3) are the area vectors of the faces before
+    any move, ``limits`` (k,) the offsets of the region's planes in the frame of ``points``.
     """
     moved = points + _in_planes(move, caps)
     for number, (normal, limit) in enumerate(zip(caps.normals, limits, strict=True)):
@@ -576,14 +472,9 @@ def _in_planes(move: np.ndarray, caps: CapPlanes) -> np.ndarray:
 
 
 def _volume_move(
-    points: np.ndarray,
-    faces: np.ndarray,
-    part: np.ndarray,
-    count: int,
-    volume: np.ndarray,
-    caps: CapPlanes,
-    free: np.ndarray,
-) -> np.ndarray:
+    points: np.ndarray, faces: np.ndarray, part: np.ndarray, count: int, volume: np.ndarray,
+    caps: CapPlanes, free: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """Return moves along the normals that restore the volume of each part, to first order."""
     gradient = np.zeros_like(points)  # of the volume, (v, 3)
     vectors = area_vectors(points, faces) / 6.0
@@ -602,7 +493,6 @@ def _volume_move(
 
 # -- Optional post-processing of a mesh: smoothing and decimation ---------------------------------
 
-
 _logger = logging.getLogger(__name__)
 
 
@@ -614,11 +504,7 @@ class CleanUpResult(NamedTuple):
 
 
 def clean_up(
-    mesh: SurfaceMesh,
-    region: Region,
-    settings: MeshingSettings,
-    vacancy: Any,
-    progress: Progress,
+    mesh: SurfaceMesh, region: Region, settings: MeshingSettings, vacancy: Any, progress: Progress
 ) -> CleanUpResult:
     """Smooth, then decimate, as the settings request; otherwise return the mesh unchanged.
 
@@ -626,35 +512,32 @@ def clean_up(
     vertices off the isosurface, so ``level_error_*`` of the provenance is measured again, at all
     vertices that are not on the region's boundary.
 
-    Parameters
-    ----------
-    region : Region
-        The region that the mesh was made in, same frame.
-    settings : MeshingSettings
-        ``target_faces`` and ``smooth_steps`` are used.
-    vacancy : VacancyField
-        Or any object with ``vacancy(points)``.
+    ``mesh`` was made in ``region``; ``vacancy`` is a VacancyField, or any object with
+    ``vacancy(points)``.
     """
-    if settings.smooth_steps == 0 and not 0 < settings.target_faces < len(mesh.faces):
-        return CleanUpResult(_with_request(mesh, settings), None)
-    vertices, faces, colors = mesh.vertices, np.asarray(mesh.faces, np.int64), mesh.colors
-    if settings.smooth_steps > 0:
-        vertices = smooth(
-            vertices, faces, settings.smooth_steps, progress.span(0.0, 0.4), region=region
-        )
+    target, steps = settings.target_faces, settings.smooth_steps
     notes = list(mesh.provenance.get("notes", []))
+    if steps == 0 and not 0 < target < len(mesh.faces):
+        if target > 0:
+            text = (
+                f"The mesh has {len(mesh.faces)} faces, fewer than the {target} requested: "
+                "nothing was decimated."
+            )
+            notes.append(ReportWarning("not-decimated", text).to_json())
+            mesh = replace(mesh, provenance={**mesh.provenance, "notes": notes})
+        return CleanUpResult(mesh, None)
+    vertices, faces = mesh.vertices, np.asarray(mesh.faces, np.int64)
+    if steps > 0:
+        vertices = smooth(vertices, faces, steps, progress.span(0.0, 0.4), region=region)
     dense = None
-    if 0 < settings.target_faces < len(faces):
+    if 0 < target < len(faces):
         dense = SurfaceMesh(vertices, np.asarray(mesh.faces, np.int32))
-        result = decimate(
-            vertices, faces, settings.target_faces, progress.span(0.4, 0.9), region=region
-        )
+        result = decimate(vertices, faces, target, progress.span(0.4, 0.9), region=region)
         vertices, faces = result.vertices, result.faces
-        colors = None if colors is None else colors[result.source]
         if not result.reached:
             text = (
                 f"{len(faces)} faces are left of {len(mesh.faces)}, more than the "
-                f"{settings.target_faces} requested: fewer would fold or tear the mesh."
+                f"{target} requested: fewer would fold or tear the mesh."
             )
             notes.append(ReportWarning("more-faces-left", text).to_json())
         _logger.info("Decimated %d faces to %d", len(mesh.faces), len(faces))
@@ -663,8 +546,8 @@ def clean_up(
     provenance = {
         **mesh.provenance,
         "notes": notes,
-        "smooth_steps": settings.smooth_steps,
-        "target_faces": settings.target_faces,
+        "smooth_steps": steps,
+        "target_faces": target,
         "faces_before_clean_up": len(mesh.faces),
         **isosurface_residuals(vacancy, vertices[~capped]),
         "vertices_on_surface": int((~capped).sum()),
@@ -673,18 +556,5 @@ def clean_up(
         "vertices_moved_apart": 0,
     }
     progress.update(1.0, f"{len(faces)} faces")
-    cleaned = SurfaceMesh(vertices, faces.astype(np.int32), colors, provenance)
+    cleaned = SurfaceMesh(vertices, faces.astype(np.int32), provenance)
     return CleanUpResult(cleaned, dense if len(faces) < len(mesh.faces) else None)
-
-
-def _with_request(mesh: SurfaceMesh, settings: MeshingSettings) -> SurfaceMesh:
-    """Add a note if the requested number of faces is not below the present one."""
-    if settings.target_faces == 0:
-        return mesh
-    text = (
-        f"The mesh has {len(mesh.faces)} faces, fewer than the {settings.target_faces} requested: "
-        "nothing was decimated."
-    )
-    note = ReportWarning("not-decimated", text).to_json()
-    notes = [*mesh.provenance.get("notes", []), note]
-    return replace(mesh, provenance={**mesh.provenance, "notes": notes})

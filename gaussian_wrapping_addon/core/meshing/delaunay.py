@@ -52,25 +52,11 @@ def delaunay(
     coordinates perturbed by :data:`JITTER_SHARE` of the extent, so in the given coordinates a
     tetrahedron of coplanar points can have a volume of about zero, of either sign.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    seed : int
-        Seed of the perturbation.
-    jitter_share : float
-        Size of the perturbation; 0 where the caller has already perturbed the points.
-
-    Returns
-    -------
-    (m, 4) int64
-        Indices into ``points``, positively oriented (in the perturbed coordinates).
-
-    Raises
-    ------
-    MeshingError
-        Fewer than four distinct points, or a point that is not finite.
-    ResourceError, WorkerError, Cancelled
-        From the fallback process.
+    ``jitter_share``: size of the perturbation; 0 where the caller has already perturbed the points.
+    Returns (m, 4) int64 indices into ``points`` (n, 3), positively oriented (in the perturbed
+    coordinates).
+    Raises MeshingError: fewer than four distinct points, or a point that is not finite;
+    ResourceError, WorkerError, Cancelled: from the fallback process.
     """
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -87,8 +73,7 @@ def delaunay(
     extent = float((high - low).max())
     # Centred: at UTM coordinates the perturbation would be lost in rounding.
     local = (points[first] - (low + high) / 2) / extent
-    shifts = np.random.default_rng(seed).uniform(-1.0, 1.0, local.shape)
-    local += jitter_share * shifts
+    local += jitter_share * np.random.default_rng(seed).uniform(-1.0, 1.0, local.shape)
     progress.update(0.0, f"triangulating {len(local)} points")
     try:
         import shull
@@ -124,11 +109,9 @@ def qhull_tetrahedra(points: np.ndarray, progress: Progress) -> np.ndarray:
     with tempfile.TemporaryDirectory(prefix="gwrap_delaunay_") as name:
         folder = Path(name)
         np.save(folder / "points.npy", points)
+        memory = HELPER_BASE_BYTES + HELPER_BYTES_PER_POINT * len(points)
         run_helper(
-            "meshing.delaunay_helper",
-            folder,
-            progress,
-            deadline_s=HELPER_DEADLINE_S,
-            memory_bytes=HELPER_BASE_BYTES + HELPER_BYTES_PER_POINT * len(points),
-        )
+            "meshing.delaunay_helper", folder, progress, deadline_s=HELPER_DEADLINE_S,
+            memory_bytes=memory,
+        )  # fmt: skip
         return np.load(folder / "tetrahedra.npy", allow_pickle=False).astype(np.int64)

@@ -11,10 +11,7 @@ import numpy as np
 def main(folder: Path) -> int:
     """Triangulate the points of ``folder``; see :func:`.delaunay.qhull_tetrahedra`.
 
-    Raises
-    ------
-    MeshingError
-        Qhull found the points degenerate even after joggling them.
+    Raises MeshingError: Qhull found the points degenerate even after joggling them.
     """
     from scipy.spatial import Delaunay, QhullError
 

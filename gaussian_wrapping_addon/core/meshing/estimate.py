@@ -38,7 +38,6 @@ from .tiles.plan import TILE_POINTS, WHOLE_POINTS
 
 # -- Estimate points, faces, memory and time of primal adaptive meshing before it starts ----------
 
-
 POINTS_PER_BOX = 8.0
 """Mean depth samples per counted box: with fewer, some boxes that the surface crosses hold none."""
 BOXES_PER_SQUARE = 1.5
@@ -61,17 +60,13 @@ JOINED_VERTEX_BYTES = 1_200
 (measured: 1 000)."""
 GATHERED_POINT_BYTES = 300
 """Peak per dense point while the points of all tiles are thinned together (measured: 210)."""
-SURROUNDINGS = 2.0
-"""Points in and around a tile, as a multiple of its own."""
+SURROUNDINGS = 2.0  # points in and around a tile, as a multiple of its own
 BASE_BYTES = 800 << 20
 """Python, compiled kernels, the Gaussians projected into each camera, the candidate surface."""
 
-EVALUATIONS_PER_POINT = 45.0
-"""Evaluations of vacancy per point of the mesh, over all steps."""
-POINT_S = 60e-6
-"""Everything else, per point: triangulation, thinning, repair."""
-FIXED_S = 6.0
-"""Pivots and candidate surface."""
+EVALUATIONS_PER_POINT = 45.0  # evaluations of vacancy per point of the mesh, over all steps
+POINT_S = 60e-6  # everything else, per point: triangulation, thinning, repair
+FIXED_S = 6.0  # pivots and candidate surface
 SECONDS_LOW, SECONDS_HIGH = 0.5, 2.0
 
 PROBES = 20_000
@@ -81,12 +76,9 @@ PROBES = 20_000
 class MeshEstimate:
     """Ranges that the measured values of the finished mesh should lie in."""
 
-    area: float
-    """Area of the surface in the region, squared scene units."""
-    cap_area: float
-    """Area of the caps on the region's boundary."""
-    by_edge: bool
-    """Requested by an edge length, not by a number of points."""
+    area: float  # area of the surface in the region, squared scene units
+    cap_area: float  # area of the caps on the region's boundary
+    by_edge: bool  # requested by an edge length, not by a number of points
     adaptive: bool
     points_low: int
     points_high: int
@@ -96,12 +88,9 @@ class MeshEstimate:
     determine time and memory."""
     seconds_low: float
     seconds_high: float
-    memory_bytes: int
-    """Peak without tiles, at the high end."""
-    memory_low_bytes: int
-    """Peak without tiles, at the low end."""
-    tiled_memory_bytes: int
-    """Peak with tiles, at the low end."""
+    memory_bytes: int  # peak without tiles, at the high end
+    memory_low_bytes: int  # peak without tiles, at the low end
+    tiled_memory_bytes: int  # peak with tiles, at the low end
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values."""
@@ -126,10 +115,7 @@ class MeshEstimate:
     def refuse(self, memory_bytes: int, *, tiled: bool) -> None:
         """Refuse a request that exceeds the points limit or the memory even at the low end.
 
-        Raises
-        ------
-        ResourceError
-            Its hint names what would fit.
+        Raises ResourceError: its hint names what would fit.
         """
         if self.by_edge and self.dense_low > limits.MAX_MESH_POINTS:
             raise ResourceError(
@@ -233,25 +219,15 @@ def evaluation_seconds(vacancy: Any, points: np.ndarray) -> float:
 
 
 def estimate_mesh(
-    area: float,
-    cap_area: float,
-    request: ResolutionRequest,
-    *,
-    adaptive: bool,
-    evaluation_s: float = 0.0,
-    resolved: np.ndarray | None = None,
-) -> MeshEstimate:
+    area: float, cap_area: float, request: ResolutionRequest, *,
+    adaptive: bool, evaluation_s: float = 0.0, resolved: np.ndarray | None = None,
+) -> MeshEstimate:  # fmt: skip
     """Estimate the cost of a mesh.
 
-    Parameters
-    ----------
-    area, cap_area : float
-        From :func:`box_counting_area` and :func:`occupied_boundary_area`.
-    evaluation_s : float
-        From :func:`evaluation_seconds`.
-    resolved : (n,) float64, optional
-        Shortest edge that the photos resolve at samples of the surface, which limits adaptive
-        spacing; from :func:`.spacing.resolved_edges`.
+    ``area``, ``cap_area``: from :func:`box_counting_area` and :func:`occupied_boundary_area`.
+    ``evaluation_s``: from :func:`evaluation_seconds`.
+    ``resolved``: (n,) float64 shortest edge that the photos resolve at samples of the surface,
+    which limits adaptive spacing; from :func:`.spacing.resolved_edges`.
     """
     by_edge = request.edge_length > 0
     if by_edge:
@@ -292,27 +268,17 @@ def estimate_mesh(
     tiled += min(stay_low, low) * JOINED_VERTEX_BYTES
     whole_low = BASE_BYTES + low * POINT_BYTES
     return MeshEstimate(
-        area,
-        cap_area,
-        by_edge,
-        adaptive,
-        int(stay_low),
-        int(stay_high),
-        int(low),
-        int(high),
-        SECONDS_LOW * (FIXED_S + low * each_s),
-        SECONDS_HIGH * (FIXED_S + high * each_s),
-        int(BASE_BYTES + high * POINT_BYTES),
-        int(whole_low),
-        int(min(tiled, whole_low)),
-    )
+        area, cap_area, by_edge, adaptive,
+        int(stay_low), int(stay_high), int(low), int(high),
+        SECONDS_LOW * (FIXED_S + low * each_s), SECONDS_HIGH * (FIXED_S + high * each_s),
+        int(BASE_BYTES + high * POINT_BYTES), int(whole_low), int(min(tiled, whole_low)),
+    )  # fmt: skip
 
 
 # -- Estimate the cost of pivot meshing from the Gaussians and depth samples in a region ----------
 #
 # The resolution is that of the Gaussians, so points are counted, not requested; each has about
 # six tetrahedra, as in any Delaunay triangulation of points near surfaces.
-
 
 TETRAHEDRA_LOW, TETRAHEDRA_HIGH = 5.0, 8.0
 """Per point, after clipping to the region (5.8 to 7.0 for spheres and tori)."""
@@ -323,8 +289,7 @@ long and more of them meet in a point (8.1 to 14.3 for spheres and tori)."""
 FACES_LOW, FACES_HIGH = 0.5, 3.0
 """Per pivot of the Gaussians (1.2 with nine pivots, most of which lie off the surface, to 2.4 with
 two; fewer at the region's boundary)."""
-FACES_ALONE_HIGH = 6.0
-"""The same with the pivots alone (up to 3.3: a torus, two pivots)."""
+FACES_ALONE_HIGH = 6.0  # the same with the pivots alone (up to 3.3: a torus, two pivots)
 PAIR_FACES_LOW, PAIR_FACES_HIGH = 3.0, 7.0
 """Per point from depth samples, all next to the surface (5 to 6 on a trained scene)."""
 
@@ -335,8 +300,7 @@ EVALUATIONS_LOW, EVALUATIONS_HIGH = 2.0, 22.0
 """Evaluations of vacancy per point, bisection of edges included (5.9 to 21.5). An evaluation may
 take as little as a quarter of the time that is measured at the surface."""
 
-POINT_LOW_S, PIVOT_S = 15e-6, 120e-6
-"""Everything else, per point."""
+POINT_LOW_S, PIVOT_S = 15e-6, 120e-6  # everything else, per point
 
 PAIRED_LOW, PAIRED_HIGH = 1.0, 4.0
 """Points per depth sample of the estimate: two where the inside is found behind it; a job uses more
@@ -347,16 +311,13 @@ cameras than an estimate."""
 class PivotEstimate:
     """Ranges like those of :class:`~.estimate.MeshEstimate`, for pivot meshing."""
 
-    gaussians: int
-    """Gaussians that reach the region."""
+    gaussians: int  # Gaussians that reach the region
     pivots_low: int
-    pivots_high: int
-    """Points that are triangulated."""
+    pivots_high: int  # points that are triangulated
     tetrahedra_low: int
     tetrahedra_high: int
     points_low: int
-    points_high: int
-    """Vertices of the mesh."""
+    points_high: int  # vertices of the mesh
     seconds_low: float
     seconds_high: float
     memory_low_bytes: int
@@ -368,24 +329,15 @@ class PivotEstimate:
 
     def lines(self) -> list[str]:
         """Return the estimate as lines of text."""
-        low_gb, high_gb = (
-            f"{size / 2**30:.1f}" for size in (self.memory_low_bytes, self.memory_bytes)
-        )
         return [
             f"tetrahedra: {two_digits(self.tetrahedra_low)} to {two_digits(self.tetrahedra_high)}",
             f"triangles: {two_digits(2 * self.points_low)} to {two_digits(2 * self.points_high)}",
             f"time: {_span(self.seconds_low)} to {_span(self.seconds_high)}",
-            f"memory: {low_gb} to {high_gb} GB",
+            f"memory: {self.memory_low_bytes / 2**30:.1f} to {self.memory_bytes / 2**30:.1f} GB",
         ]
 
     def refuse(self, memory_bytes: int) -> None:
-        """Refuse a mesh that exceeds the memory (0: unknown) even at the low end.
-
-        Raises
-        ------
-        ResourceError
-            Its hint names what would fit.
-        """
+        """Refuse a mesh that exceeds the memory (0: unknown) even at the low end: ResourceError."""
         if memory_bytes <= 0 or self.memory_low_bytes <= memory_bytes:
             return
         raise ResourceError(
@@ -406,25 +358,11 @@ def estimate_pivot_mesh(
 ) -> PivotEstimate:  # fmt: skip
     """Estimate the cost of :func:`~.pivot_meshing.mesh_by_pivots`.
 
-    Parameters
-    ----------
-    arrays, region
-        Same frame.
-    pivots : int
-        Number of pivots per Gaussian.
-    depth_samples : int
-        Number of depth samples in the region.
-    box : str
-        Of nine pivots, the setting ``pivot_box``.
-    alone : bool
-        Whether nothing is triangulated but the pivots (``pivot_samples = "none"``).
-    evaluation_s : float
-        Time of one evaluation of vacancy, from :func:`~.estimate.evaluation_seconds`.
-
-    Raises
-    ------
-    MeshingError
-        No Gaussian reaches the region.
+    ``arrays``, ``region``: same frame. ``depth_samples``: how many the region has.
+    ``pivots``, ``box``: the settings ``pivots`` and ``pivot_box``.
+    ``alone``: whether nothing is triangulated but the pivots (``pivot_samples = "none"``).
+    ``evaluation_s``: from :func:`evaluation_seconds`.
+    Raises MeshingError: no Gaussian reaches the region.
     """
     rule = pivot_rule(pivots, box)
     if alone:
@@ -439,15 +377,10 @@ def estimate_pivot_mesh(
     few = FACES_LOW * len(own.points) + PAIR_FACES_LOW * pairs_low
     many = faces_high * len(own.points) + PAIR_FACES_HIGH * pairs_high
     return PivotEstimate(
-        own.gaussians,
-        int(low),
-        int(high),
-        int(TETRAHEDRA_LOW * low),
-        int(tetrahedra_high * high),
-        int(few / 2),
-        int(many / 2),
+        own.gaussians, int(low), int(high),
+        int(TETRAHEDRA_LOW * low), int(tetrahedra_high * high), int(few / 2), int(many / 2),
         0.5 * FIXED_S + low * (EVALUATIONS_LOW * evaluation_s + POINT_LOW_S),
         2.0 * FIXED_S + high * (EVALUATIONS_HIGH * evaluation_s + PIVOT_S),
         int(BASE_BYTES / 2 + low * POINT_LOW_BYTES),
         int(BASE_BYTES + high * PIVOT_BYTES * tetrahedra_high / TETRAHEDRA_HIGH),
-    )
+    )  # fmt: skip

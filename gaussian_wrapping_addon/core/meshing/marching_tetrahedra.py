@@ -12,7 +12,7 @@ import numpy as np
 
 from ..progress import Progress
 from ..regions.shapes import Region
-from .classification import OUTWARD_FACES
+from .classification import faces_opposite
 
 # -- Clip a tetrahedral mesh to the planes of a region, keeping it conforming ---------------------
 #
@@ -20,7 +20,6 @@ from .classification import OUTWARD_FACES
 # section 6.5). Each that a plane crosses is split instead: its part inside becomes up to three
 # tetrahedra. The diagonal of a four-sided face depends on the indices of its corners alone, so
 # neighbours agree on it regardless of rounding.
-
 
 _REFERENCE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
 
@@ -32,10 +31,8 @@ _PRISM_QUADS = ((0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5))
 class CutTetrahedra:
     """Tetrahedra clipped to a region."""
 
-    points: np.ndarray
-    """(n + k, 3) float64: the given points, then those on the region's planes."""
-    tetrahedra: np.ndarray
-    """(m, 4) int64, face to face, with the given orientation."""
+    points: np.ndarray  # (n + k, 3) float64: the given points, then those on the region's planes
+    tetrahedra: np.ndarray  # (m, 4) int64, face to face, with the given orientation
 
 
 def cut_to_region(points: np.ndarray, tetrahedra: np.ndarray, region: Region) -> CutTetrahedra:
@@ -43,13 +40,7 @@ def cut_to_region(points: np.ndarray, tetrahedra: np.ndarray, region: Region) ->
 
     Each edge that a plane crosses gets a new point on that plane. Points on a plane count as
     inside. Connectivity depends on the indices and sides of points alone, so the result is face to
-    face even where tetrahedra have no volume.
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-    tetrahedra : (m, 4) int64
-        Face to face.
+    face, as ``tetrahedra`` (m, 4) are, even where these have no volume.
     """
     local = points - region.center  # (n, 3)
     for normal, offset in zip(*region.half_spaces, strict=True):
@@ -86,9 +77,7 @@ def _crossing_edges(
     numbers = np.full(crossing.shape, -1, np.int64)
     numbers[crossing] = index
     edges = np.stack([unique // count, unique % count], 1)
-    reversed_edges = ~inside[edges[:, 0]]
-    edges[reversed_edges] = edges[reversed_edges][:, ::-1]
-    return edges, numbers
+    return np.where(inside[edges[:, :1]], edges, edges[:, ::-1]), numbers
 
 
 def _split_crossed(tetrahedra: np.ndarray, codes: np.ndarray, cut_points: np.ndarray) -> np.ndarray:
@@ -133,18 +122,12 @@ def _inside_part(code: int) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=8)
-def _prism_parts(
-    first: int,
-) -> tuple[tuple[list[int], list[int], tuple[list[int], ...]], ...]:
+def _prism_parts(first: int) -> tuple[tuple[list[int], list[int], tuple[list[int], ...]], ...]:
     """Return the splits of a prism whose corner ``first`` has the lowest index.
 
     The diagonal of each four-sided face starts at its corner with the lowest index. Corner
     ``first`` is joined to the two faces that it does not lie on: a triangle and one four-sided
-    face.
-
-    Returns
-    -------
-    For each of the two cases: the opposite four-sided face, the positions in it that have its
+    face. Returns for each of the two cases the four-sided face, the positions in it that have its
     lowest index in this case, and the three tetrahedra.
     """
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1.0]])
@@ -167,9 +150,7 @@ def _prism_parts(
 #
 # See docs/method.md, section 6.3.
 
-
-IsEmpty = Callable[[np.ndarray], np.ndarray]
-"""Maps (n, 3) points to (n,) bool: on the empty side."""
+IsEmpty = Callable[[np.ndarray], np.ndarray]  # maps (n, 3) points to (n,) bool: on the empty side
 
 MAX_BISECTIONS = 40
 
@@ -181,14 +162,9 @@ def case_tables() -> tuple[np.ndarray, np.ndarray]:
     Bit k of a case is set where corner k is inside. The table is derived from a reference
     tetrahedron, so that triangles of positively oriented tetrahedra face the empty side.
 
-    Returns
-    -------
-    counts : (16,) int64
-        Triangles of each case: 0, 1 or 2.
-    corners : (16, 2, 3, 2) int64
-        For each triangle vertex the (inside, outside) corners of its edge.
+    Returns the number of triangles of each case, (16,) int64: 0, 1 or 2; and for each triangle
+    vertex the (inside, outside) corners of its edge, (16, 2, 3, 2) int64.
     """
-    reference = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
     counts = np.zeros(16, np.int64)
     corners = np.zeros((16, 2, 3, 2), np.int64)
     for code in range(1, 15):
@@ -199,9 +175,9 @@ def case_tables() -> tuple[np.ndarray, np.ndarray]:
             polygon = [(i, k), (i, m), (j, m), (j, k)]
         else:
             polygon = [(i, k) for i in inside for k in outside]
-        middle = np.array([(reference[i] + reference[k]) / 2 for i, k in polygon])
+        middle = np.array([(_REFERENCE[i] + _REFERENCE[k]) / 2 for i, k in polygon])
         normal = np.cross(middle[1] - middle[0], middle[2] - middle[0])
-        if normal @ (reference[outside].mean(0) - reference[inside].mean(0)) < 0:
+        if normal @ (_REFERENCE[outside].mean(0) - _REFERENCE[inside].mean(0)) < 0:
             polygon.reverse()
         counts[code] = len(polygon) - 2
         for t in range(counts[code]):
@@ -214,19 +190,10 @@ def marching_tetrahedra(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Triangulate the surface between inside and outside points, with vertices on edges.
 
-    Parameters
-    ----------
-    tetrahedra : (m, 4) int64
-        Positively oriented, face to face.
-    inside : (n,) bool
-        Label of each point. The surface is closed if no point of the hull is inside.
-
-    Returns
-    -------
-    edges : (e, 2) int64
-        Crossing edges (inside point, outside point); vertex i of the mesh lies on edge i.
-    faces : (f, 3) int64
-        Triangles, counter-clockwise seen from the empty side.
+    ``tetrahedra`` (m, 4) are positively oriented, face to face; ``inside`` (n,) bool labels each
+    point. The surface is closed if no point of the hull is inside.
+    Returns crossing edges (e, 2) int64 (inside point, outside point), on which the vertices of the
+    mesh lie, and faces (f, 3) int64, counter-clockwise seen from the empty side.
     """
     return _indexed(_separating(tetrahedra, inside), len(inside))
 
@@ -239,25 +206,14 @@ def marching_closed(
     The surface is a closed 2-manifold if the tetrahedra are a 3-manifold with boundary: no sign is
     zero, so the isosurface crosses every tetrahedron and every face of the hull transversally.
 
-    Parameters
-    ----------
-    tetrahedra : (m, 4) int64
-        Positively oriented, face to face.
-    neighbours : (m, 4) int64
-        :func:`.classification.tetrahedron_neighbours`.
-    inside : (n,) bool
-
-    Returns
-    -------
-    edges : (e, 2) int64
-        For each vertex of the mesh its crossing edge (inside point, outside point), or an inside
-        point of the hull twice.
-    faces : (f, 3) int64
-        Triangles, counter-clockwise seen from outside.
+    ``tetrahedra`` and ``inside`` are those of :func:`marching_tetrahedra`; ``neighbours`` (m, 4)
+    those of :func:`.classification.tetrahedron_neighbours`.
+    Returns for each vertex of the mesh its crossing edge (inside point, outside point), or an
+    inside point of the hull twice, (e, 2) int64; and faces (f, 3) int64, counter-clockwise seen
+    from outside.
     """
     pieces = _separating(tetrahedra, inside)
-    tetrahedron, corner = np.nonzero(neighbours < 0)
-    hull = tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]  # (h, 3)
+    hull = faces_opposite(tetrahedra, neighbours < 0)  # (h, 3)
     codes = inside[hull] @ np.array([1, 2, 4])
     for code, triangles in enumerate(_CAP_TRIANGLES):
         rows = np.flatnonzero(codes == code)
@@ -301,27 +257,14 @@ def _indexed(pieces: list[np.ndarray], count: int) -> tuple[np.ndarray, np.ndarr
 
 
 def bisect(
-    inside_points: np.ndarray,
-    outside_points: np.ndarray,
-    is_empty: IsEmpty,
-    tolerance: float | np.ndarray,
-    progress: Progress,
-) -> tuple[np.ndarray, np.ndarray]:
+    inside_points: np.ndarray, outside_points: np.ndarray, is_empty: IsEmpty,
+    tolerance: float | np.ndarray, progress: Progress,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Bisect segments until the sign change is bracketed within ``tolerance``.
 
-    Segments that are short enough stop early, which saves evaluations.
-
-    Parameters
-    ----------
-    inside_points, outside_points : (n, 3) float64
-        Occupied and empty ends.
-    tolerance : float or (n,) float64
-        Largest final length of a bracket, one for all or one each.
-
-    Returns
-    -------
-    inside, outside : (n, 3) float64
-        Ends of the brackets.
+    Segments that are short enough stop early, which saves evaluations. The ``tolerance`` is the
+    largest final length of a bracket, one for all or (n,). Returns the occupied and the empty ends
+    of the brackets, (n, 3) float64 each, as they are given.
     """
     inside, outside = inside_points.copy(), outside_points.copy()
     for step in range(MAX_BISECTIONS):

@@ -43,48 +43,25 @@ to a point, it cuts slivers."""
 
 
 def mesh_by_pivots(
-    vacancy: Any,
-    arrays: GaussianArrays,
-    cameras: Sequence[Camera],
-    region: Region,
-    settings: MeshingSettings,
-    progress: Progress,
-    *,
-    seed: int,
-    depth_samples: DepthSamples | None = None,
-) -> SurfaceMesh:
+    vacancy: Any, arrays: GaussianArrays, cameras: Sequence[Camera], region: Region,
+    settings: MeshingSettings, progress: Progress, *,
+    seed: int, depth_samples: DepthSamples | None = None,
+) -> SurfaceMesh:  # fmt: skip
     """Mesh the surface ``vacancy = 0.5`` inside a region at the resolution of the Gaussians.
 
     The tetrahedra are clipped to the region's planes before the field is evaluated, so that the
     solid ends exactly on these planes, with sharp edges. No tetrahedron is dropped, hence the mesh
-    is closed and manifold (docs/method.md, section 6.5).
+    is closed and manifold, oriented outward (docs/method.md, section 6.5).
 
-    Parameters
-    ----------
-    vacancy : VacancyField
-        Or any object with ``vacancy(points)`` and ``is_empty(points)``.
-    arrays : GaussianArrays
-        Scene frame.
-    cameras : sequence of Camera
-        The field's cameras; must not be empty. Their pixel footprints set the bracket tolerance.
-    region : Region
-        Scene frame.
-    settings : MeshingSettings
-        ``pivots`` (per Gaussian), ``pivot_box``, ``pivot_samples`` and ``min_component_share`` are
-        used. An edge length or a number of points does not apply; the provenance notes that.
-    depth_samples : DepthSamples, optional
-        Depth-map samples of the isosurface in the region (:mod:`.samples`); not used with
-        ``pivot_samples = "none"``.
-
-    Returns
-    -------
-    SurfaceMesh
-        Closed, 2-manifold, oriented outward.
-
-    Raises
-    ------
-    MeshingError
-        The region holds no surface, or no Gaussian reaches it.
+    ``vacancy``: VacancyField, or any object with ``vacancy(points)`` and ``is_empty(points)``.
+    ``arrays``, ``region``: scene frame.
+    ``cameras``: the field's; their pixel footprints set the bracket tolerance.
+    ``settings``: ``pivots`` (per Gaussian), ``pivot_box``, ``pivot_samples``,
+    ``min_component_share`` and ``most_parts`` are used. An edge length or a number of points does
+    not apply; the provenance notes that.
+    ``depth_samples``: depth-map samples of the isosurface in the region (:mod:`.samples`); not used
+    with ``pivot_samples = "none"``.
+    Raises MeshingError: the region holds no surface, or no Gaussian reaches it.
     """
     if len(cameras) == 0:
         raise MeshingError("The scene has no cameras.", "Check the scene.")
@@ -97,7 +74,10 @@ def mesh_by_pivots(
     points = np.concatenate([cloud.points, bounding_points(cloud.points, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
     cut = cut_to_region(points, tetrahedra, region)
-    inside = _inside(vacancy, cut.points, cut.tetrahedra, progress.span(0.3, 0.5))
+    used = np.unique(cut.tetrahedra)
+    progress.update(0.3, f"evaluating {len(used)} pivots")
+    inside = np.zeros(len(cut.points), np.bool_)  # points of no tetrahedron count as empty
+    inside[used] = ~vacancy.is_empty(cut.points[used])
     edges, faces = marching_closed(cut.tetrahedra, tetrahedron_neighbours(cut.tetrahedra), inside)
     if len(faces) == 0:
         raise no_surface_error(region)
@@ -125,10 +105,7 @@ def mesh_by_pivots(
         "tetrahedra": len(cut.tetrahedra),
         "notes": _notes(settings, cloud.gaussians, cloud.chosen),
         "seed": seed,
-        "components": floaters.kept,
-        "removed_solids": floaters.removed_solids,
-        "removed_cavities": floaters.removed_cavities,
-        "removed_area_share": floaters.removed_area_share,
+        **floaters.figures(),
         "degenerate_faces_left": degenerate,
         "vertices_on_surface": int((~capped).sum()),
         "vertices_on_region_boundary": int(capped.sum()),
@@ -136,18 +113,7 @@ def mesh_by_pivots(
     }
     progress.update(1.0, f"{len(kept)} faces")
     _logger.info("Meshed region %s by pivots: %d faces", region.name, len(kept))
-    return SurfaceMesh(vertices, kept.astype(np.int32), None, provenance)
-
-
-def _inside(
-    vacancy: Any, points: np.ndarray, tetrahedra: np.ndarray, progress: Progress
-) -> np.ndarray:
-    """Classify the points that tetrahedra use; the others count as empty, (n,) bool."""
-    used = np.unique(tetrahedra)
-    progress.update(0.0, f"evaluating {len(used)} pivots")
-    inside = np.zeros(len(points), np.bool_)
-    inside[used] = ~vacancy.is_empty(points[used])
-    return inside
+    return SurfaceMesh(vertices, kept.astype(np.int32), provenance)
 
 
 def _notes(settings: MeshingSettings, gaussians: int, chosen: int) -> list[dict[str, str]]:

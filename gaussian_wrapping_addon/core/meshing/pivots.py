@@ -14,8 +14,7 @@ from ..regions.shapes import Region
 PivotRule = Callable[[GaussianArrays, np.ndarray], np.ndarray]
 """Maps Gaussians and (k,) indices of some of them to the (p, 3) float64 pivots of these."""
 
-PIVOT_SIGMAS = 3.0
-"""Outer pivots lie at this many standard deviations along a direction."""
+PIVOT_SIGMAS = 3.0  # outer pivots lie at this many standard deviations along a direction
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 
@@ -31,12 +30,11 @@ def gaussians_reaching(
     Left out are Gaussians too faint to be rendered (opacity below 1/255) unless ``faint``, and
     those whose centre is farther away than 1.5 diagonals of the region.
     """
-    normals, offsets = region.half_spaces
     good = (arrays.log_opacities > np.log(limits.ALPHA_MIN)) | faint
     good &= np.isfinite(arrays.means).all(1) & np.isfinite(arrays.scales).all(1)
     local = arrays.means - region.center  # (n, 3)
     good &= np.linalg.norm(local, axis=1) < 1.5 * region.diagonal
-    for normal, offset in zip(normals, offsets, strict=True):
+    for normal, offset in zip(*region.half_spaces, strict=True):
         index = np.flatnonzero(good)
         width = directional_sigma(arrays, index, np.broadcast_to(normal, (len(index), 3)))
         good[index] = local[index] @ normal - offset <= PIVOT_SIGMAS * width + margin
@@ -52,15 +50,10 @@ def directional_sigma(
 
 
 def two_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
-    """Return centre and outer pivots of the Gaussians ``index``.
+    """Return centres, then outer pivots of the Gaussians ``index``, (p, 3) float64.
 
     A Gaussian without orientation (normal shorter than ``limits.ORIENTED_MIN_NORM``) gets
     outer pivots on both sides along its shortest axis.
-
-    Returns
-    -------
-    (p, 3) float64
-        Centres first, then outer pivots.
     """
     means, step, oriented = _outer_steps(arrays, index)
     return np.concatenate([means, means + step, means[~oriented] - step[~oriented]])
@@ -112,12 +105,8 @@ def nine_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
     """Return centre and the corners of the 3-sigma box of the Gaussians ``index`` on their normal.
 
     The box is that of :func:`normal_bases`, with the deviation ``sqrt(d^T Sigma d)`` along each
-    direction (docs/method.md, section 6.1).
-
-    Returns
-    -------
-    (9 k, 3) float64
-        Centres first, then the corners, Gaussian by Gaussian.
+    direction (docs/method.md, section 6.1). Returns (9 k, 3) float64: centres first, then the
+    corners, Gaussian by Gaussian.
     """
     bases = normal_bases(arrays, index)
     sigmas = [directional_sigma(arrays, index, bases[:, :, axis]) for axis in range(3)]

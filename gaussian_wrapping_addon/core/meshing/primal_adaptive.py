@@ -23,11 +23,11 @@ from ..progress import Progress
 from ..regions.shapes import Region
 from ..scene.camera import Camera
 from ..settings import MeshingSettings
-from .classification import boundary_faces, classify, on_one_sheet, tetrahedron_neighbours
+from .classification import boundary_faces, classify, tetrahedron_neighbours
 from .clean_up import without_small_handles
 from .delaunay import bounding_points, delaunay
 from .repair import remove_degenerate, split_nonmanifold
-from .spacing import DenseRequest, checked_request, dense_request, nominal_edge
+from .spacing import checked_request, dense_request, nominal_edge
 from .surface_points import (
     KIND_CAP,
     KIND_JUMP,
@@ -36,12 +36,12 @@ from .surface_points import (
     SurfacePoints,
     SurfaceSampler,
     candidate_surface,
+    no_surface_error,
 )
 
 _logger = logging.getLogger(__name__)
 
-KIND_SPLIT = 3
-"""Moved slightly off the isosurface to separate parts that would touch."""
+KIND_SPLIT = 3  # moved slightly off the isosurface to separate parts that would touch
 
 DEGENERATE_SHARE = 1e-3
 """Faces narrower than this share of the spacing are removed: collinear points on the region's edges
@@ -52,56 +52,26 @@ LONGEST_EDGE_SHARE = 1 / 8
 
 
 def mesh_region(
-    field: Field,
-    arrays: GaussianArrays,
-    cameras: Sequence[Camera],
-    region: Region,
-    settings: MeshingSettings,
-    progress: Progress,
-    *,
-    seed: int,
-    edge_length_scene: float = 0.0,
-    depth_samples: DepthSamples | None = None,
-) -> SurfaceMesh:
+    field: Field, arrays: GaussianArrays, cameras: Sequence[Camera], region: Region,
+    settings: MeshingSettings, progress: Progress, *,
+    seed: int, edge_length_scene: float = 0.0, depth_samples: DepthSamples | None = None,
+) -> SurfaceMesh:  # fmt: skip
     """Mesh the surface ``vacancy = 0.5`` inside a region, closed by caps on the region's boundary.
 
-    With adaptive spacing a denser mesh is extracted and simplified to the vertices that its shape
-    needs (:mod:`.simplification`). The vacancy decides about space that no
-    camera sees. Without an edge length or a number of points the mesh has about 50 thousand faces.
+    The mesh is a closed 2-manifold, oriented outward; its ``provenance`` holds counts, and
+    ``|v - 0.5|`` at the vertices on the isosurface. With adaptive spacing a denser mesh is
+    extracted and simplified to the vertices that its shape needs (:mod:`.simplification`). The
+    vacancy decides about space that no camera sees. The same seed gives the same mesh, for any
+    number of threads.
 
-    Parameters
-    ----------
-    field : Field
-    arrays : GaussianArrays
-        Scene frame.
-    cameras : sequence of Camera
-        The field's cameras; must not be empty.
-    region : Region
-        Scene frame.
-    settings : MeshingSettings
-        ``points``, ``spacing`` and ``min_component_share`` are used; the edge length is passed in
-        scene units. Smoothing, decimation and an open boundary are separate steps on the finished
-        mesh; ``unseen`` concerns the field.
-    seed : int
-        The same seed gives the same mesh, for any number of threads.
-    edge_length_scene : float
-        Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices.
-        0 means that ``settings.points`` applies.
-    depth_samples : DepthSamples, optional
-        Depth-map samples of the isosurface in the region (:mod:`.samples`).
-
-    Returns
-    -------
-    SurfaceMesh
-        Closed, 2-manifold, oriented outward. ``provenance`` holds counts, and ``|v - 0.5|`` at the
-        vertices on the isosurface.
-
-    Raises
-    ------
-    MeshingError
-        The region holds no surface.
-    UsageError, ResourceError
-        The request is invalid, or needs more points than the limit.
+    ``arrays``, ``region``: scene frame. ``cameras``: the field's.
+    ``settings``: ``points``, ``spacing``, ``min_component_share`` and ``most_parts`` are used.
+    Smoothing, decimation and an open boundary are separate steps on the finished mesh.
+    ``edge_length_scene``: of a uniform mesh, in scene units; an adaptive mesh has half as many
+    vertices. With 0 ``settings.points`` applies; with neither there are about 50 thousand faces.
+    ``depth_samples``: depth-map samples of the isosurface in the region (:mod:`.samples`).
+    Raises MeshingError: the region holds no surface; UsageError, ResourceError: the request is
+    invalid, or needs more points than the limit.
     """
     if len(cameras) == 0:
         raise MeshingError("The scene has no cameras.", "Check the scene.")
@@ -113,18 +83,13 @@ def mesh_region(
         depth_samples,
     )  # fmt: skip
     adaptive = settings.spacing == "adaptive"
-    sampler = SurfaceSampler(
-        vacancy, field.vectors, region, surface, field.threads, cameras=cameras if adaptive else ()
-    )
-    dense = (
-        dense_request(request, sampler.area, region) if adaptive else DenseRequest(request, 0, 1.0)
-    )
+    sampler = SurfaceSampler(field, region, surface, cameras if adaptive else ())
+    dense = dense_request(request, sampler.area, region, adaptive=adaptive)
     cloud = sampler.sample(dense.request, rng, progress.span(0.3, 0.6))
     vertices, faces, kind, figures = _connect(cloud, vacancy, region, settings, seed, rng, progress)
     figures["dense_vertices"] = len(vertices)
     vertices, faces, kind = simplified(vertices, faces, kind, dense.target, dense.share, region)
-    vertices, faces, kind, handles = small_handles_closed(vertices, faces, kind)
-    figures |= handles | vertex_counts(kind)
+    vertices, faces, kind, counts = small_handles_closed(vertices, faces, kind)
     provenance = {
         "method": "primal adaptive meshing",
         "region": region.name,
@@ -138,41 +103,30 @@ def mesh_region(
         "seed": seed,
         **cloud.figures,
         **figures,
-        **residuals_on_surface(vacancy, vertices, kind),
+        **counts,
+        **isosurface_residuals(vacancy, vertices[kind == KIND_SURFACE]),
     }
     progress.update(1.0, f"{len(faces)} faces")
     _logger.info("Meshed region %s: %d faces", region.name, len(faces))
-    return SurfaceMesh(vertices, faces.astype(np.int32), None, provenance)
+    return SurfaceMesh(vertices, faces.astype(np.int32), provenance)
 
 
 def _connect(
-    cloud: SurfacePoints,
-    vacancy: Any,
-    region: Region,
-    settings: MeshingSettings,
-    seed: int,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    cloud: SurfacePoints, vacancy: Any, region: Region, settings: MeshingSettings, seed: int,
+    rng: np.random.Generator, progress: Progress,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:  # fmt: skip
     """Connect points to a closed manifold: Delaunay, labels, boundary faces, repair."""
-    hint = "Draw the region around something that was photographed."
     if len(cloud.points) < 4:
-        raise MeshingError(f"Region {region.name!r} holds no surface.", hint)
+        raise no_surface_error(region)
     points = np.concatenate([cloud.points, bounding_points(cloud.points, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.6, 0.65))
     neighbours = tetrahedron_neighbours(tetrahedra)
     # The points lie in a convex body: only tetrahedra with a bounding point reach beyond it.
     outer = (tetrahedra >= len(cloud.points)).any(1)
     labels = classify(
-        points,
-        tetrahedra,
-        neighbours,
-        outer,
-        on_one_sheet(points, tetrahedra, cloud.normals, outer, cloud.radii),
-        lambda where: vacancy.vacancy(where).filled,
-        rng,
+        points, tetrahedra, neighbours, outer, cloud.normals, cloud.radii, vacancy, rng,
         progress.span(0.65, 0.9),
-    )
+    )  # fmt: skip
     faces = boundary_faces(tetrahedra, neighbours, labels.inside)
     figures = {
         "tetrahedra": len(tetrahedra),
@@ -185,37 +139,17 @@ def _connect(
 
 
 def made_manifold(
-    points: np.ndarray,
-    faces: np.ndarray,
-    cloud: SurfacePoints,
-    region: Region,
-    settings: MeshingSettings,
-    progress: Progress,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    points: np.ndarray, faces: np.ndarray, cloud: SurfacePoints, region: Region,
+    settings: MeshingSettings, progress: Progress,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:  # fmt: skip
     """Repair closed faces to a manifold; remove floaters and degenerate faces.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        The cloud's points first.
-    faces : (f, 3) int64
-        Closed: every edge has as many faces in one direction as in the other.
-
-    Returns
-    -------
-    vertices : (v, 3) float64
-    faces : (g, 3) int64
-    kind : (v,)
-    figures : dict
-
-    Raises
-    ------
-    MeshingError
-        There are no faces.
+    ``points`` (n, 3) begin with the cloud's; ``faces`` (f, 3) int64 are closed: every edge has as
+    many in one direction as in the other. Returns vertices, faces, kinds of vertices and figures.
+    Raises MeshingError: there are no faces.
     """
-    hint = "Draw the region around something that was photographed."
     if len(faces) == 0:
-        raise MeshingError(f"Region {region.name!r} holds no solid.", hint)
+        raise no_surface_error(region, "solid")
     progress.update(0.9, "repairing")
     repaired = split_nonmanifold(points, faces)
     floaters = without_floaters(
@@ -225,72 +159,61 @@ def made_manifold(
         repaired.vertices, floaters.faces, DEGENERATE_SHARE * float(cloud.radii.min()), region
     )
     vertices, kept, source = compacted(repaired.vertices, kept)
-    origin = repaired.origin[source]
-    kind = np.where(origin >= 0, cloud.kind[np.maximum(origin, 0)], KIND_SPLIT)
-    copies = np.bincount(repaired.origin[repaired.origin >= 0], minlength=len(cloud.kind))
-    kind[(origin >= 0) & (copies[np.maximum(origin, 0)] > 1)] = KIND_SPLIT
     figures = {
         "split_vertices": repaired.split_vertices,
         "split_edges": repaired.split_edges,
-        "components": floaters.kept,
-        "removed_solids": floaters.removed_solids,
-        "removed_cavities": floaters.removed_cavities,
-        "removed_area_share": floaters.removed_area_share,
+        **floaters.figures(),
         "degenerate_faces_left": degenerate,
     }
     progress.update(0.95, "repairing")
-    return vertices, kept, kind, figures
+    return vertices, kept, kinds_after(cloud.kind, repaired.origin)[source], figures
+
+
+def kinds_after(before: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Return the kinds of repaired vertices, (w,) uint8.
+
+    ``before``: (v,) uint8 kinds of the vertices before; ``origin``: see
+    :class:`.repair.RepairResult`.
+    """
+    copies = np.bincount(origin[origin >= 0], minlength=len(before))
+    moved = (origin < 0) | (copies[np.maximum(origin, 0)] > 1)
+    return np.where(moved, KIND_SPLIT, before[np.maximum(origin, 0)]).astype(np.uint8)
 
 
 def simplified(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    kind: np.ndarray,
-    target: int,
-    share: float,
+    vertices: np.ndarray, faces: np.ndarray, kind: np.ndarray, target: int, share: float,
     region: Region,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Simplify a closed 2-manifold to the vertices that its shape needs; return their kinds too.
 
-    Edges between the remaining vertices are flipped to stay closest to the given mesh.
-
-    Parameters
-    ----------
-    target : int
-        Least number of vertices to keep.
-    share : float
-        Share of the vertices to keep where that is more; 1, for uniform spacing, keeps all.
+    At least ``target`` vertices are kept, or this ``share`` of them where that is more: 1, for
+    uniform spacing, keeps all. Edges between them are flipped to stay closest to the given mesh.
     """
     target = max(target, round(share * len(vertices)))
     if len(vertices) <= target:
         return vertices, faces, kind
     longest = LONGEST_EDGE_SHARE * region.diagonal
-    coarse = select_vertices(vertices, faces, target, longest)
-    kept, coarse, chosen = compacted(vertices, coarse)
+    kept, coarse, chosen = compacted(vertices, select_vertices(vertices, faces, target, longest))
     return kept, flip_edges(kept, coarse, vertices, faces, longest), kind[chosen]
 
 
 def small_handles_closed(
     vertices: np.ndarray, faces: np.ndarray, kind: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, int]]:
-    """Close the handles of a closed 2-manifold that are too small for its edges to resolve."""
+    """Close the handles of a closed 2-manifold that are too small for its edges to resolve.
+
+    Returns vertices, faces, kinds, and counts for the report, also of the vertices of each kind.
+    """
     edge_length = float(np.median(edge_lengths(vertices, faces)))
-    closed = without_small_handles(vertices, faces, edge_length)
-    vertices, faces, chosen = compacted(vertices, closed.faces)
-    figures = {"small_handles_closed": closed.closed, "small_handles_left": closed.left}
-    return vertices, faces, kind[chosen], figures
-
-
-def vertex_counts(kind: np.ndarray) -> dict[str, int]:
-    """Count the vertices of each kind, for the report."""
-    return {
+    faces, closed, left = without_small_handles(vertices, faces, edge_length)
+    vertices, faces, chosen = compacted(vertices, faces)
+    kind = kind[chosen]
+    figures = {
+        "small_handles_closed": closed,
+        "small_handles_left": left,
         "vertices_on_surface": int((kind == KIND_SURFACE).sum()),
         "vertices_on_region_boundary": int((kind == KIND_CAP).sum()),
         "vertices_at_end_of_sight": int((kind == KIND_JUMP).sum()),
         "vertices_moved_apart": int((kind == KIND_SPLIT).sum()),
     }
-
-
-def residuals_on_surface(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> dict[str, Any]:
-    """Measure ``|v - 0.5|`` at the vertices that should lie on the isosurface."""
-    return isosurface_residuals(vacancy, vertices[kind == KIND_SURFACE])
+    return vertices, faces, kind, figures

@@ -6,10 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from ..errors import MeshingError
+from ..mesh.components import connected
 from ..mesh.surface_mesh import (
     edge_lengths,
     faces_per_edge,
@@ -22,11 +21,9 @@ from ..regions.shapes import Region
 
 # -- Remove degenerate faces from a closed manifold by edge flips and collapses -------------------
 
-
 MAX_PASSES = 14
 
-SHORT_HEIGHTS = 2.0
-"""Edges shorter than this many heights are collapsed."""
+SHORT_HEIGHTS = 2.0  # edges shorter than this many heights are collapsed
 
 PATIENT_PASSES = 5
 MAX_SHORT_HEIGHTS = 64.0
@@ -53,23 +50,11 @@ def remove_degenerate(
     Every step keeps a closed 2-manifold closed and manifold; faces that no step can remove
     stay. Vertices are not moved, so the surface changes by about ``height``.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int64
-        A closed 2-manifold.
-    region : Region, optional
-        Keeps caps on the region's planes: no vertex is merged into one that lies on fewer of these
-        planes, and no edge of the region is flipped unless the third vertex lies on it as well.
-    fixed : (v,) bool, optional
-        For a part of a mesh: vertices that have faces elsewhere.
-
-    Returns
-    -------
-    faces : (g, 3) int64
-        Over the same vertices, some of which may be unused.
-    left : int
-        Degenerate faces that remain.
+    ``region``: keeps caps on the region's planes: no vertex is merged into one that lies on fewer
+    of these planes, and no edge of the region is flipped unless the third vertex lies on it, too.
+    ``fixed``: (v,) bool, for a part of a mesh: vertices that have faces elsewhere.
+    Returns faces (g, 3) over the same vertices, some of which may be unused, and the number of
+    degenerate ones that remain.
     """
     narrow = narrow_faces(vertices, faces, height)
     planes = _plane_sets(vertices, faces, narrow, region)
@@ -147,27 +132,27 @@ class _HalfEdgeMesh:
         for index in range(len(self.faces)):
             self._link(index)
 
-    def _link(self, index: int) -> None:
+    def at(self, index: int) -> tuple[int, int, int]:
+        """Return a face that is there."""
         face = self.faces[index]
         assert face is not None
-        for k in range(3):
-            self.left_of[face[k], face[(k + 1) % 3]] = index
-            self.around.setdefault(face[k], set()).add(index)
+        return face
+
+    def _link(self, index: int) -> None:
+        a, b, c = self.at(index)
+        for begin, end in ((a, b), (b, c), (c, a)):
+            self.left_of[begin, end] = index
+            self.around.setdefault(begin, set()).add(index)
 
     def _unlink(self, index: int) -> None:
-        face = self.faces[index]
-        assert face is not None
-        for k in range(3):
-            if self.left_of.get((face[k], face[(k + 1) % 3])) == index:
-                del self.left_of[face[k], face[(k + 1) % 3]]
-            self.around[face[k]].discard(index)
+        a, b, c = self.at(index)
+        for begin, end in ((a, b), (b, c), (c, a)):
+            if self.left_of.get((begin, end)) == index:
+                del self.left_of[begin, end]
+            self.around[begin].discard(index)
 
     def ring(self, vertex: int) -> set[int]:
-        ring: set[int] = set()
-        for index in self.around[vertex]:
-            ring.update(self.faces[index] or ())
-        ring.discard(vertex)
-        return ring
+        return {v for index in self.around[vertex] for v in self.at(index)} - {vertex}
 
     def replace(self, old: list[int], new: list[tuple[int, int, int] | None]) -> None:
         for index in old:
@@ -192,38 +177,28 @@ class _HalfEdgeMesh:
         """Merge ``gone`` into ``stays`` where the link condition allows it."""
         if gone in self.frozen or stays in self.frozen:
             return False
-        common = self.ring(gone) & self.ring(stays)
-        if len(common) != 2 or len(self.ring(gone)) + len(self.ring(stays)) <= 6:
+        here, there = self.ring(gone), self.ring(stays)
+        if len(here & there) != 2 or len(here) + len(there) <= 6:
             return False
         old = sorted(self.around[gone])
         new: list[tuple[int, int, int] | None] = []
         for index in old:
-            face = self.faces[index]
-            assert face is not None
-            a, b, c = (stays if v == gone else v for v in face)
+            a, b, c = (stays if v == gone else v for v in self.at(index))
             new.append(None if a == b or b == c or c == a else (a, b, c))
         self.replace(old, new)
         return True
 
     def apex(self, index: int, begin: int, end: int) -> int:
-        face = self.faces[index]
-        assert face is not None
-        return next(v for v in face if v not in (begin, end))
+        return next(v for v in self.at(index) if v not in (begin, end))
 
 
 def _remove_face(
-    mesh: _HalfEdgeMesh,
-    vertices: np.ndarray,
-    face: int,
-    short: float,
+    mesh: _HalfEdgeMesh, vertices: np.ndarray, face: int, short: float,
     planes: dict[int, frozenset[int]],
-) -> bool:
-    corners = mesh.faces[face]
-    assert corners is not None
-    lengths = [
-        float(np.linalg.norm(vertices[corners[k]] - vertices[corners[(k + 1) % 3]]))
-        for k in range(3)
-    ]
+) -> bool:  # fmt: skip
+    corners = mesh.at(face)
+    ends = [(corners[k], corners[(k + 1) % 3]) for k in range(3)]
+    lengths = [float(np.linalg.norm(vertices[a] - vertices[b])) for a, b in ends]
     shortest, longest = int(np.argmin(lengths)), int(np.argmax(lengths))
 
     def merged(gone: int, stays: int) -> bool:
@@ -231,19 +206,16 @@ def _remove_face(
         return of_gone <= of_stays and mesh.collapse(gone, stays)
 
     if lengths[shortest] < short:
-        a, b = corners[shortest], corners[(shortest + 1) % 3]
+        a, b = ends[shortest]
         if merged(a, b) or merged(b, a):
             return True
         # The ends have a third neighbour in common. Often that is a tip whose three faces form a
         # fin without volume, since its base is as short as this edge.
         for tip in corners:
-            if (
-                len(mesh.around[tip]) == 3
-                and tip not in mesh.frozen
-                and any(merged(tip, v) for v in sorted(mesh.ring(tip)))
-            ):
+            is_tip = len(mesh.around[tip]) == 3 and tip not in mesh.frozen
+            if is_tip and any(merged(tip, v) for v in sorted(mesh.ring(tip))):
                 return True
-    a, b = corners[longest], corners[(longest + 1) % 3]
+    a, b = ends[longest]
     third = corners[(longest + 2) % 3]
     shared = planes.get(a, _NO_PLANES) & planes.get(b, _NO_PLANES)
     # Three points on an edge of the region: the other two sides run along it instead.
@@ -252,7 +224,6 @@ def _remove_face(
 
 
 # -- Turn closed triangle sets into 2-manifolds by splitting non-manifold edges and vertices ------
-
 
 SEPARATION_SHARE = 0.005
 """Copies of a vertex move this share of the way to the centroid of their own faces, so that the
@@ -269,16 +240,11 @@ _DEFECT = "Send the job folder's log.txt with a bug report."
 class RepairResult:
     """A closed 2-manifold."""
 
-    vertices: np.ndarray
-    """(v, 3) float64."""
-    faces: np.ndarray
-    """(f, 3) int64."""
-    origin: np.ndarray
-    """(v,) int64: the original vertex, or -1 for midpoints of split edges."""
-    split_vertices: int
-    """Copies that were added."""
-    split_edges: int
-    """Edges that were split at their midpoint."""
+    vertices: np.ndarray  # (v, 3) float64
+    faces: np.ndarray  # (f, 3) int64
+    origin: np.ndarray  # (v,) int64: the original vertex, or -1 for midpoints of split edges
+    split_vertices: int  # copies that were added
+    split_edges: int  # edges that were split at their midpoint
 
 
 def split_nonmanifold(
@@ -290,20 +256,10 @@ def split_nonmanifold(
     of such an edge would still join the same two vertices, each is split at its midpoint. No face
     is removed, so the enclosed solid is kept.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int
-        Closed and consistently oriented: along each edge as many half-edges run one way as the
-        other.
-    fixed : (v,) bool, optional
-        For a part of a closed set of faces: vertices that are not split, nor the edges between
-        them. All faces at the others are given.
-
-    Raises
-    ------
-    MeshingError
-        The set of faces is not closed.
+    ``faces`` (f, 3) are closed and consistently oriented: along each edge as many half-edges run
+    one way as the other. ``fixed`` (v,) bool, for a part of a closed set of faces, are vertices
+    that are not split, nor the edges between them; all faces at the others are given.
+    Raises MeshingError: the set of faces is not closed.
     """
     faces = np.asarray(faces, np.int64)
     fixed = np.zeros(len(vertices), np.bool_) if fixed is None else fixed
@@ -316,28 +272,21 @@ def split_nonmanifold(
         partner = _partners(vertices, faces, fixed)
         new_faces, source = _fans(faces, partner, fixed)
         vertices, origin, fixed = vertices[source], origin[source], fixed[source]
-        bad = _nonmanifold_half_edges(new_faces) & (partner >= 0)
+        bad = (faces_per_edge(new_faces, int(new_faces.max()) + 1) > 2) & (partner >= 0)
         if not bad.any():
             break
         pairs = _independent_pairs(bad, partner)
-        middles = (vertices[new_faces.reshape(-1)[pairs]] + vertices[_ends(new_faces)[pairs]]) / 2
-        new_faces = _split_at_middles(new_faces, pairs, partner, len(vertices))
+        begin, end = half_edges(new_faces)
+        middles = (vertices[begin[pairs]] + vertices[end[pairs]]) / 2
+        faces = _split_at_middles(new_faces, pairs, partner, len(vertices))
         vertices = np.concatenate([vertices, middles])
         origin = np.append(origin, np.full(len(pairs), -1))
         fixed = np.append(fixed, np.zeros(len(pairs), np.bool_))
         split_edges += len(pairs)
-        faces = new_faces
     else:
-        raise MeshingError(
-            "The surface could not be made manifold.",
-            _DEFECT,
-        )
+        raise MeshingError("The surface could not be made manifold.", _DEFECT)
     moved = _separate_copies(vertices, new_faces, origin)
     return RepairResult(moved, new_faces, origin, len(moved) - before - split_edges, split_edges)
-
-
-def _ends(faces: np.ndarray) -> np.ndarray:
-    return half_edges(faces)[1]
 
 
 def _partners(vertices: np.ndarray, faces: np.ndarray, fixed: np.ndarray) -> np.ndarray:
@@ -373,11 +322,9 @@ def _wedges(
     vertices: np.ndarray, faces: np.ndarray, group: np.ndarray, forward: np.ndarray
 ) -> list[tuple[int, int]]:
     """Pair the half-edges around one edge by the wedges of the solid, sorted by angle."""
-    begin, end = half_edges(faces[group // 3])
-    corner = group % 3
-    rows = 3 * np.arange(len(group)) + corner
-    low, high = np.minimum(begin[rows], end[rows])[0], np.maximum(begin[rows], end[rows])[0]
-    opposite = faces[group // 3, (corner + 2) % 3]  # (k,)
+    face, corner = np.divmod(group, 3)
+    low, high = sorted((faces[face[0], corner[0]], faces[face[0], (corner[0] + 1) % 3]))
+    opposite = faces[face, (corner + 2) % 3]  # (k,)
     axis = vertices[high] - vertices[low]
     axis = axis / max(float(np.linalg.norm(axis)), 1e-300)
     arms = vertices[opposite] - vertices[low]
@@ -393,8 +340,7 @@ def _wedges(
     for slot in [*order, *order]:
         if len(pairs) * 2 == len(group):
             break
-        used = any(group[slot] in pair for pair in pairs)
-        if used:
+        if any(group[slot] in pair for pair in pairs):
             continue
         if not forward[slot]:
             if slot not in waiting:
@@ -410,38 +356,25 @@ def _fans(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Split vertices that are not fixed so that each fan of faces has its own.
 
-    Returns
-    -------
-    faces : (f, 3) int64
-        With new vertex numbers, ordered by old vertex.
-    source : (w,) int64
-        Old vertex of each new one.
+    Returns (f, 3) faces of new vertices, which are ordered by old vertex, and the old vertex of
+    each new one, (w,).
     """
-    corners = np.arange(faces.size)
-    following = next_half_edges(corners)
+    vertex = faces.reshape(-1)
     # Half-edge h leads from corner h to the next; its partner runs the other way.
-    paired = partner >= 0
-    rows = np.concatenate([corners[paired], following[paired]])
-    columns = np.concatenate([following[partner[paired]], partner[paired]])
-    whole = np.flatnonzero(fixed[faces.reshape(-1)])
-    if len(whole):
-        first = np.zeros(len(fixed), np.int64)
-        first[faces.reshape(-1)[whole]] = whole  # any one corner of each
-        rows = np.concatenate([rows, whole])
-        columns = np.concatenate([columns, first[faces.reshape(-1)[whole]]])
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(faces.size,) * 2)
-    _, label = connected_components(graph, directed=False)
+    here = np.flatnonzero(partner >= 0)
+    there = partner[here]
+    whole = np.flatnonzero(fixed[vertex])
+    first = np.zeros(len(fixed), np.int64)
+    first[vertex[whole]] = whole  # any one corner of each
+    rows = np.concatenate([here, next_half_edges(here), whole])
+    columns = np.concatenate([next_half_edges(there), there, first[vertex[whole]]])
+    _, label = connected(rows, columns, faces.size)
     _, least = np.unique(label, return_index=True)
-    old = faces.reshape(-1)[least]
+    old = vertex[least]
     order = np.lexsort((least, old))
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
     return rank[label].reshape(-1, 3), old[order]
-
-
-def _nonmanifold_half_edges(faces: np.ndarray) -> np.ndarray:
-    """(3f,) bool: half-edges whose edge still has more than two faces."""
-    return faces_per_edge(faces, int(faces.max()) + 1) > 2
 
 
 def _independent_pairs(bad: np.ndarray, partner: np.ndarray) -> np.ndarray:
@@ -473,7 +406,7 @@ def _split_at_middles(
 def _separate_copies(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """Move copies of vertices slightly towards their own faces."""
     copies = np.bincount(origin[origin >= 0], minlength=int(origin.max(initial=0)) + 1)
-    moving = np.where(origin >= 0, copies[origin] > 1, True)
+    moving = (origin < 0) | (copies[origin] > 1)
     if not moving.any():
         return vertices
     total, count = np.zeros_like(vertices), np.zeros(len(vertices))

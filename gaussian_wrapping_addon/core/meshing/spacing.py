@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,13 +20,11 @@ from ..scene.camera import Camera
 
 # -- Resolution of a mesh: requested edge length or number of points, and their limits ------------
 
-
 AUTOMATIC_POINTS = 24_000
 """Surface points without a request: about 50 thousand faces (48 to 55 thousand in jobs; caps add
 some where the region cuts the solid)."""
 
-MIN_VERTICES = 100
-"""Least number of vertices of an adaptive mesh."""
+MIN_VERTICES = 100  # least number of vertices of an adaptive mesh
 
 COARSEST_SHARE = 1 / 8
 """Edges longer than this share of the diagonal would not show a region's contents."""
@@ -40,30 +39,23 @@ VERTICES_PER_UNIFORM = 0.5
 """Vertices of an adaptive mesh, as a share of the uniform mesh with the requested edge length; both
 have the same distance to the surface (benchmarks/meshing_tables.py)."""
 
-FINEST_SHARE = 1e-6
-"""Edges shorter than this share of the diagonal are refused outright."""
+FINEST_SHARE = 1e-6  # edges shorter than this share of the diagonal are refused outright
 
 
 @dataclass(frozen=True)
 class ResolutionRequest:
     """A requested edge length or number of points, or neither (0 and 0)."""
 
-    edge_length: float
-    """Scene units."""
+    edge_length: float  # scene units
     points: int
-    notes: tuple[ReportWarning, ...] = ()
-    """Changes to the request, for the report."""
+    notes: tuple[ReportWarning, ...] = ()  # changes to the request, for the report
 
 
 def checked_request(edge_length: float, points: int, region: Region) -> ResolutionRequest:
     """Validate a request before any work is done; clamp edges that are too long.
 
-    Raises
-    ------
-    UsageError
-        A value is not finite or negative, or both are given.
-    ResourceError
-        The resolution is too fine.
+    Raises UsageError: a value is not finite or negative, or both are given; ResourceError: it is
+    too fine.
     """
     if not math.isfinite(edge_length) or edge_length < 0 or points < 0:
         raise UsageError(
@@ -91,13 +83,7 @@ def checked_request(edge_length: float, points: int, region: Region) -> Resoluti
 
 
 def thinning_radius(request: ResolutionRequest, area: float, region: Region) -> float:
-    """Return the thinning radius that meets the request with uniform spacing.
-
-    Parameters
-    ----------
-    area : float
-        Area of the candidate surface in the region.
-    """
+    """Return the radius that meets the request evenly on a candidate surface of this area."""
     if request.edge_length > 0:
         return request.edge_length / EDGE_PER_RADIUS
     points = request.points or AUTOMATIC_POINTS
@@ -106,13 +92,7 @@ def thinning_radius(request: ResolutionRequest, area: float, region: Region) -> 
 
 
 def check_expected_points(points: float, request: ResolutionRequest) -> None:
-    """Refuse an edge length that needs too many points.
-
-    Raises
-    ------
-    ResourceError
-        More than ``limits.MAX_MESH_POINTS`` are expected.
-    """
+    """Refuse an edge length that needs more than ``limits.MAX_MESH_POINTS``: ResourceError."""
     if request.edge_length > 0 and points > limits.MAX_MESH_POINTS:
         factor = times_longer(points, limits.MAX_MESH_POINTS)
         raise ResourceError(
@@ -132,10 +112,8 @@ class DenseRequest:
     """Resolution of the dense mesh that an adaptive mesh is simplified from."""
 
     request: ResolutionRequest
-    target: int
-    """Vertices to keep, for the surface without caps."""
-    share: float
-    """The same as a share of the dense mesh, which also has vertices on caps."""
+    target: int  # vertices to keep, for the surface without caps
+    share: float  # the same as a share of the dense mesh, which also has vertices on caps
 
 
 def dense_points(stay: float) -> float:
@@ -148,30 +126,31 @@ def kept_from_dense(points: float) -> float:
     return points / (LEAST_DENSE_FACTOR if points >= DENSE_POINTS else DENSE_FACTOR)
 
 
-def dense_request(request: ResolutionRequest, area: float, region: Region) -> DenseRequest:
-    """Return the resolution of the dense mesh, and how many of its vertices to keep.
+def dense_request(
+    request: ResolutionRequest, area: float, region: Region, *, adaptive: bool = True
+) -> DenseRequest:
+    """Return the resolution of the dense mesh, and how many vertices to keep: all if not adaptive.
 
-    Raises
-    ------
-    ResourceError
-        The dense mesh needs more points than the limit.
+    Raises ResourceError: the dense mesh needs more points than the limit.
     """
+    if not adaptive:
+        return DenseRequest(request, 0, 1.0)
     expected = POINTS_PER_SQUARE * area / thinning_radius(request, area, region) ** 2
     share = VERTICES_PER_UNIFORM if request.edge_length > 0 else 1.0
     target, notes = round(share * expected), request.notes
     if target < MIN_VERTICES:
         asked = request.points or target  # with an edge length, the points that it implies
-        text = (
-            f"An adaptive mesh has at least {MIN_VERTICES} surface points; {asked} were requested."
-        )
-        notes = (*notes, ReportWarning("points-raised", text))
+        least = f"An adaptive mesh has at least {MIN_VERTICES} surface points"
+        notes = (*notes, ReportWarning("points-raised", f"{least}; {asked} were requested."))
         target = MIN_VERTICES
     dense = dense_points(target)
     if request.edge_length > 0:
         check_expected_points(dense, request)
         edge = request.edge_length * math.sqrt(expected / dense)
-        return DenseRequest(ResolutionRequest(edge, 0, notes), target, target / dense)
-    return DenseRequest(ResolutionRequest(0.0, round(dense), notes), target, target / dense)
+        of_dense = ResolutionRequest(edge, 0, notes)
+    else:
+        of_dense = ResolutionRequest(0.0, round(dense), notes)
+    return DenseRequest(of_dense, target, target / dense)
 
 
 def nominal_edge(request: ResolutionRequest, area: float, region: Region) -> float:
@@ -180,7 +159,6 @@ def nominal_edge(request: ResolutionRequest, area: float, region: Region) -> flo
 
 
 # -- Local spacing of surface points: no finer than the photos resolve, with bounded gradation ----
-
 
 EDGE_PER_PIXEL = 0.5
 """Shortest edge, in pixels of the nearest camera. The finest pattern in a photo has a period of two
@@ -194,10 +172,7 @@ LONGEST_SHARE = 8.0
 
 
 def footprints(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the smallest pixel footprint over the cameras at each point, (n,).
-
-    0 where no camera sees the point.
-    """
+    """Return the smallest pixel footprint over the cameras at each point, (n,); 0 where unseen."""
     finest = np.full(len(points), np.inf)
     for camera in cameras:
         pixel, depth = camera.project(points)
@@ -217,17 +192,14 @@ def resolved_edges(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 class Spacing:
     """Local thinning radii, sampled at points of the surface."""
 
-    points: np.ndarray
-    """(n, 3) float64."""
-    radii: np.ndarray
-    """(n,) float64."""
-    nominal: float
-    """Radius where the photos do not limit it: the smallest one."""
-    limited: float
-    """Share of the area where the photos limit the radius."""
+    points: np.ndarray  # (n, 3) float64
+    radii: np.ndarray  # (n,) float64
+    nominal: float  # radius where the photos do not limit it: the smallest one
+    limited: float  # share of the area where the photos limit the radius
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_tree", cKDTree(self.points))
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points)
 
     @classmethod
     def uniform(cls, radius: float) -> Spacing:
@@ -239,7 +211,7 @@ class Spacing:
         if len(self.points) == 1:
             return np.full(len(where), self.radii[0])
         k = min(4, len(self.points))
-        distance, index = self._tree.query(where, k=k, workers=threads)  # type: ignore[attr-defined]
+        distance, index = self._tree.query(where, k=k, workers=threads)
         weight = 1.0 / (distance**2 + (0.5 * self.radii[index]) ** 2)
         mean = (weight * self.radii[index]).sum(1) / weight.sum(1)
         return mean + GRADING / EDGE_PER_RADIUS * np.maximum(distance[:, 0] - mean, 0.0)
@@ -248,39 +220,19 @@ class Spacing:
 def footprint_spacing(points: np.ndarray, cameras: Sequence[Camera], radius: float) -> Spacing:
     """Return a radius everywhere, larger where the photos resolve no edges so short.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Spread evenly over the surface.
-    cameras : sequence of Camera
-    radius : float
-        Thinning radius of the nominal edge length.
+    ``points`` (n, 3) are spread evenly over the surface; ``radius`` is that of the nominal edge.
     """
     edge = EDGE_PER_RADIUS * radius
     resolved = np.minimum(resolved_edges(points, cameras), LONGEST_SHARE * edge)
     limited = float(np.mean(resolved > edge)) if len(points) else 0.0
     if limited == 0.0:
         return Spacing.uniform(radius)
-    near = cKDTree(points).query(points, k=min(8, len(points)))
-    edges = graded(np.maximum(resolved, edge), *near)
-    return Spacing(points, edges / EDGE_PER_RADIUS, radius, limited)
-
-
-def graded(edges: np.ndarray, distance: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Shorten edges until neighbours differ by at most :data:`GRADING` times their distance.
-
-    Parameters
-    ----------
-    edges : (n,) float64
-    distance, index : (n, k)
-        Nearest neighbours of each point.
-    """
-    result = edges
-    step = GRADING * distance
-    while True:
+    distance, index = cKDTree(points).query(points, k=min(8, len(points)))
+    edges, step = np.maximum(resolved, edge), GRADING * distance
+    while True:  # shorten edges until those of neighbours differ by no more than their grading
         # In both directions: nearest-neighbour relations are not symmetric.
-        lower = np.minimum(result, (result[index] + step).min(1))
+        lower = np.minimum(edges, (edges[index] + step).min(1))
         np.minimum.at(lower, index, lower[:, None] + step)
-        if (lower > 0.99 * result).all():
-            return lower
-        result = lower
+        if (lower > 0.99 * edges).all():
+            return Spacing(points, lower / EDGE_PER_RADIUS, radius, limited)
+        edges = lower

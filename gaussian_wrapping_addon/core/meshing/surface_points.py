@@ -41,16 +41,12 @@ from .spacing import (
 
 # -- Cap points: samples of a region's boundary where it cuts the solid, to close the mesh there
 
-
 MAX_CANDIDATES = 1_500_000
 """Most samples of the region's boundary; finer requests get coarser caps, which are flat anyway."""
 
 OVERSAMPLING = 5.0
-RIM_TOLERANCE_SHARE = 1e-3
-"""Length of the bracket around the rim of a cap, in edge lengths."""
-
-INNER_RADII = 2.0
-"""Spacing inside a cap, in local radii: caps are flat."""
+RIM_TOLERANCE_SHARE = 1e-3  # length of the bracket around the rim of a cap, in edge lengths
+INNER_RADII = 2.0  # spacing inside a cap, in local radii: caps are flat
 
 # Corners first, then edges, rims and the interior: the points that define the shape are kept.
 PRIORITY_CORNER, PRIORITY_EDGE, PRIORITY_RIM, PRIORITY_INNER = 0.0, 1.0, 2.0, 4.0
@@ -60,14 +56,10 @@ PRIORITY_CORNER, PRIORITY_EDGE, PRIORITY_RIM, PRIORITY_INNER = 0.0, 1.0, 2.0, 4.
 class Caps:
     """Occupied points on a region's boundary, thinned."""
 
-    points: np.ndarray
-    """(n, 3) float64."""
-    normals: np.ndarray
-    """(n, 3) float64: outward normal of the face; zero on edges and corners."""
-    radii: np.ndarray
-    """(n,) float64 for :func:`.sampling.thin`."""
-    priority: np.ndarray
-    """(n,) float64 for the same."""
+    points: np.ndarray  # (n, 3) float64
+    normals: np.ndarray  # (n, 3) float64: outward normal of the face; zero on edges and corners
+    radii: np.ndarray  # (n,) float64 for :func:`.sampling.thin`
+    priority: np.ndarray  # (n,) float64 for the same
 
 
 def no_caps() -> Caps:
@@ -76,21 +68,14 @@ def no_caps() -> Caps:
 
 
 def cap_points(
-    region: Region,
-    is_empty: IsEmpty,
-    spacing: Spacing,
-    rng: np.random.Generator,
+    region: Region, is_empty: IsEmpty, spacing: Spacing, rng: np.random.Generator,
     progress: Progress,
-) -> Caps:
+) -> Caps:  # fmt: skip
     """Sample the region's faces, sharp edges and corners where they lie in the solid.
 
     Segments between neighbouring occupied and empty samples of one face are bisected; the resulting
-    points form the rim, where the isosurface meets the face.
-
-    Parameters
-    ----------
-    spacing : Spacing
-        Spacing of the surface; inside a cap it grows with the distance to the rim.
+    points form the rim, where the isosurface meets the face. Inside a cap the surface's ``spacing``
+    grows with the distance to the rim.
     """
     radius = max(spacing.nominal, np.sqrt(region.area * OVERSAMPLING / MAX_CANDIDATES))
     points, normals, face = _face_samples(region, radius, rng)
@@ -100,25 +85,20 @@ def cap_points(
     edge_points, edge_in, edge_out, corner_points = _edge_samples(region, is_empty, radius)
     progress.update(0.5, "sampling the region's boundary")
     inside, _ = bisect(
-        np.concatenate([rim_in, edge_in]),
-        np.concatenate([rim_out, edge_out]),
-        is_empty,
-        RIM_TOLERANCE_SHARE * radius,
-        progress.span(0.5, 1.0),
-    )
-    face_normals = region.half_spaces[0]
+        np.concatenate([rim_in, edge_in]), np.concatenate([rim_out, edge_out]), is_empty,
+        RIM_TOLERANCE_SHARE * radius, progress.span(0.5, 1.0),
+    )  # fmt: skip
     rim, edge_rim = inside[: len(rim_in)], inside[len(rim_in) :]
-    inner = ~empty
     groups = (
-        (corner_points, None, PRIORITY_CORNER),
-        (edge_rim, None, PRIORITY_CORNER),
-        (edge_points, None, PRIORITY_EDGE),
-        (rim, face_normals[rim_face], PRIORITY_RIM),
-        (points[inner], normals[inner], PRIORITY_INNER),
+        (corner_points, np.zeros_like(corner_points), PRIORITY_CORNER),
+        (edge_rim, np.zeros_like(edge_rim), PRIORITY_CORNER),
+        (edge_points, np.zeros_like(edge_points), PRIORITY_EDGE),
+        (rim, region.half_spaces[0][rim_face], PRIORITY_RIM),
+        (points[~empty], normals[~empty], PRIORITY_INNER),
     )
-    all_points = np.concatenate([g[0] for g in groups])
-    all_normals = np.concatenate([np.zeros_like(g[0]) if g[1] is None else g[1] for g in groups])
-    priority = np.concatenate([np.full(len(g[0]), g[2]) for g in groups])
+    all_points = np.concatenate([points for points, _, _ in groups])
+    all_normals = np.concatenate([normals for _, normals, _ in groups])
+    priority = np.concatenate([np.full(len(points), level) for points, _, level in groups])
     local = spacing.at(all_points)  # (n,)
     radii = np.where(priority == PRIORITY_INNER, INNER_RADII * local, local)
     kept = thin(all_points, all_normals, radii, priority)
@@ -145,10 +125,9 @@ def _face_crossings(
     points: np.ndarray, empty: np.ndarray, face: np.ndarray, radius: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pair occupied with empty neighbours on one planar face."""
-    none = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)
     occupied, vacant = np.flatnonzero(~empty), np.flatnonzero(empty)
     if len(occupied) == 0 or len(vacant) == 0:
-        return none
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)
     pairs = cKDTree(points[occupied]).sparse_distance_matrix(
         cKDTree(points[vacant]), 1.6 * radius, output_type="coo_matrix"
     )
@@ -172,9 +151,7 @@ def _edge_samples(
     empty = is_empty(points)
     ends = np.append(True, owner[1:] != owner[:-1]) | np.append(owner[1:] != owner[:-1], True)
     change = np.flatnonzero((empty[1:] != empty[:-1]) & (owner[1:] == owner[:-1]))
-    low_empty = empty[change]
-    inside = np.where(low_empty, change + 1, change)
-    outside = np.where(low_empty, change, change + 1)
+    inside, outside = change + empty[change], change + ~empty[change]
     corners = np.unique(points[ends & ~empty], axis=0)
     return points[~empty & ~ends], points[inside], points[outside], corners
 
@@ -182,7 +159,6 @@ def _edge_samples(
 # -- Candidate surface: a first, coarse isosurface by two-pivot marching tetrahedra ---------------
 #
 # See docs/method.md, section 6.
-
 
 PROBES = 4096
 """Sample points through the region besides the pivots: a Gaussian as large as the region may have
@@ -206,38 +182,21 @@ BRACKET_SHARE = 0.003
 class CandidateSurface:
     """A triangle soup near the isosurface, in the region and slightly beyond it."""
 
-    vertices: np.ndarray
-    """(v, 3) float64."""
-    faces: np.ndarray
-    """(f, 3) int64, facing the empty side."""
-    gaussians: int
-    """Gaussians that reach the region."""
-    pivots: int
-    """Points that were triangulated."""
+    vertices: np.ndarray  # (v, 3) float64
+    faces: np.ndarray  # (f, 3) int64, facing the empty side
+    gaussians: int  # Gaussians that reach the region
+    pivots: int  # points that were triangulated
 
 
 def candidate_surface(
-    arrays: GaussianArrays,
-    region: Region,
-    is_empty: IsEmpty,
-    tolerance: float,
-    seed: int,
-    progress: Progress,
-    depth_samples: DepthSamples | None = None,
-) -> CandidateSurface:
+    arrays: GaussianArrays, region: Region, is_empty: IsEmpty, tolerance: float, seed: int,
+    progress: Progress, depth_samples: DepthSamples | None = None,
+) -> CandidateSurface:  # fmt: skip
     """Extract the isosurface on the Delaunay edges of two pivots per Gaussian and depth sample.
 
-    Parameters
-    ----------
-    tolerance : float
-        Length of the bracket on crossing edges; 0 stands for :data:`BRACKET_SHARE`.
-    depth_samples : DepthSamples, optional
-        Of the region: parts about as thin as a pixel are found only by these.
-
-    Raises
-    ------
-    MeshingError
-        No Gaussian reaches the region, or nothing in it is occupied by the solid.
+    ``tolerance``: length of the bracket on crossing edges; 0 stands for :data:`BRACKET_SHARE`.
+    ``depth_samples``: of the region: parts about as thin as a pixel are found only by these.
+    Raises MeshingError: no Gaussian reaches the region, or nothing in it is occupied by the solid.
     """
     margin = MARGIN_SHARE * region.diagonal
     is_empty = _within_halo(is_empty, region)
@@ -265,29 +224,18 @@ def candidate_surface(
 class PivotCloud:
     """Points whose Delaunay edges are searched for the isosurface of a region."""
 
-    points: np.ndarray
-    """(p, 3) float64, all within :func:`halo_bounds`."""
-    gaussians: int
-    """Gaussians that reach the region."""
-    chosen: int
-    """Those of them that contributed pivots."""
+    points: np.ndarray  # (p, 3) float64, all within :func:`halo_bounds`
+    gaussians: int  # Gaussians that reach the region
+    chosen: int  # those of them that contributed pivots
 
 
 def pivot_cloud(
-    arrays: GaussianArrays,
-    region: Region,
-    is_empty: IsEmpty,
-    seed: int,
-    depth_samples: DepthSamples | None,
-    *,
-    pivots_of: PivotRule = two_pivots,
-) -> PivotCloud:
+    arrays: GaussianArrays, region: Region, is_empty: IsEmpty, seed: int,
+    depth_samples: DepthSamples | None, *, pivots_of: PivotRule = two_pivots,
+) -> PivotCloud:  # fmt: skip
     """Collect pivots, probes and pairs that bracket the visible surface, in and around a region.
 
-    Raises
-    ------
-    MeshingError
-        No Gaussian reaches the region.
+    Raises MeshingError: no Gaussian reaches the region.
     """
     own = pivots_and_probes(arrays, region, seed, pivots_of)
     if depth_samples is None:
@@ -297,26 +245,17 @@ def pivot_cloud(
 
 
 def pivots_and_probes(
-    arrays: GaussianArrays,
-    region: Region,
-    seed: int,
-    pivots_of: PivotRule,
+    arrays: GaussianArrays, region: Region, seed: int, pivots_of: PivotRule
 ) -> PivotCloud:
     """Collect pivots and probes alone, in and around a region, without evaluating the field.
 
-    Raises
-    ------
-    MeshingError
-        No Gaussian reaches the region.
+    Raises MeshingError: no Gaussian reaches the region.
     """
-    margin = MARGIN_SHARE * region.diagonal
-    index = gaussians_reaching(arrays, region, margin)
-    if len(index) == 0:
-        raise no_gaussian_error(region)
+    index = _reaching(arrays, region)
     chosen = representative_gaussians(arrays, index, MAX_PIVOT_GAUSSIANS)
     pivots = pivots_of(arrays, chosen)
     near = pivots[region.distance(pivots) <= HALO_SHARE * region.diagonal]
-    points = np.concatenate([near, _probes(region, margin, seed)])
+    points = np.concatenate([near, _probes(region, MARGIN_SHARE * region.diagonal, seed)])
     return PivotCloud(_in_halo(points, region), len(index), len(chosen))
 
 
@@ -324,22 +263,27 @@ def pivots_alone(arrays: GaussianArrays, region: Region, pivots_of: PivotRule) -
     """Collect the pivots of all Gaussians that reach a region, faint ones too, and nothing else.
 
     These are the points of the paper (docs/method.md, section 6.1): without samples of depth maps,
-    probes, or a limit on the number of Gaussians. Pivots in the region's halo are kept.
-
-    Raises
-    ------
-    MeshingError
-        No Gaussian reaches the region.
+    probes, or a limit on the number of Gaussians. Pivots in the region's halo are kept. Raises
+    MeshingError: no Gaussian reaches the region.
     """
-    index = gaussians_reaching(arrays, region, MARGIN_SHARE * region.diagonal, faint=True)
-    if len(index) == 0:
-        raise no_gaussian_error(region)
+    index = _reaching(arrays, region, faint=True)
     return PivotCloud(_in_halo(pivots_of(arrays, index), region), len(index), len(index))
 
 
+def _reaching(arrays: GaussianArrays, region: Region, *, faint: bool = False) -> np.ndarray:
+    index = gaussians_reaching(arrays, region, MARGIN_SHARE * region.diagonal, faint=faint)
+    if len(index) == 0:
+        raise MeshingError(f"No Gaussian reaches region {region.name!r}.", NO_SURFACE_HINT)
+    return index
+
+
 def _in_halo(points: np.ndarray, region: Region) -> np.ndarray:
+    return points[_is_in_halo(points, region)]
+
+
+def _is_in_halo(points: np.ndarray, region: Region) -> np.ndarray:
     low, high = halo_bounds(region)
-    return points[((points >= low) & (points <= high)).all(1)]
+    return np.asarray(((points >= low) & (points <= high)).all(1))
 
 
 def halo_bounds(region: Region) -> np.ndarray:
@@ -351,10 +295,9 @@ def halo_bounds(region: Region) -> np.ndarray:
 
 def _within_halo(is_empty: IsEmpty, region: Region) -> IsEmpty:
     """Restrict ``is_empty`` to the halo; all other points are empty, as the bounding points are."""
-    low, high = halo_bounds(region)
 
     def inside_only(points: np.ndarray) -> np.ndarray:
-        near = ((points >= low) & (points <= high)).all(1)
+        near = _is_in_halo(points, region)
         empty = np.ones(len(points), np.bool_)
         empty[near] = is_empty(points[near])
         return empty
@@ -362,14 +305,9 @@ def _within_halo(is_empty: IsEmpty, region: Region) -> IsEmpty:
     return inside_only
 
 
-def no_gaussian_error(region: Region) -> MeshingError:
-    """Return the error of a region that no Gaussian reaches."""
-    return MeshingError(f"No Gaussian reaches region {region.name!r}.", NO_SURFACE_HINT)
-
-
-def no_surface_error(region: Region) -> MeshingError:
+def no_surface_error(region: Region, missing: str = "surface") -> MeshingError:
     """Return the error of a region without a surface."""
-    return MeshingError(f"Region {region.name!r} holds no surface.", NO_SURFACE_HINT)
+    return MeshingError(f"Region {region.name!r} holds no {missing}.", NO_SURFACE_HINT)
 
 
 def _probes(region: Region, margin: float, seed: int) -> np.ndarray:
@@ -398,21 +336,16 @@ def _near(points: np.ndarray, tetrahedra: np.ndarray, region: Region, margin: fl
 #
 # See docs/method.md, section 7.2.
 
-
 KIND_SURFACE, KIND_CAP, KIND_JUMP = 0, 1, 2
 """On the isosurface; on the region's boundary; where vacancy jumps across 0.5 (at the limit of what
 the cameras see)."""
 
-PRIORITY_SURFACE = 3.0
-"""Between the rims and the inner part of the caps; see region_caps."""
-
-POINT_OVERSAMPLING = 20.0
-"""Candidates per point before the first thinning."""
+PRIORITY_SURFACE = 3.0  # between the rims and the inner part of the caps
+POINT_OVERSAMPLING = 20.0  # candidates per point before the first thinning
 FIRST_THINNING = 0.4
 """Candidates closer than this share of the radius are not projected. These two constants determine
-how even the points are (and surface_sampling.POINTS_PER_SQUARE)."""
-MAX_BLOCK = 2_000_000
-"""Candidates drawn at a time, to limit memory."""
+how even the points are (and sampling.POINTS_PER_SQUARE)."""
+MAX_BLOCK = 2_000_000  # candidates drawn at a time, to limit memory
 FOOTPRINT_SAMPLES = 20_000
 """Samples of the candidate surface at which the photos' pixel footprint is evaluated."""
 REPORTED_SHARE = 0.1
@@ -424,39 +357,21 @@ MAX_PROJECTION_STEPS = 14
 
 SEARCH_SHARES = (0.25, -0.25, 0.5, -0.5, 1.0, -1.0)
 """Offsets along the normal, in radii, at which points that did not converge search a crossing."""
-SURFACE_POINTS_BRACKET_SHARE = 1e-3
-"""A found crossing is bracketed to this share of the radius."""
+SURFACE_POINTS_BRACKET_SHARE = 1e-3  # a found crossing is bracketed to this share of the radius
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
     """Points to become vertices of the mesh."""
 
-    points: np.ndarray
-    """(n, 3) float64."""
+    points: np.ndarray  # (n, 3) float64
     normals: np.ndarray
     """(n, 3) float64 unit vectors towards the empty side; 0 on edges of the region."""
-    kind: np.ndarray
-    """(n,) uint8."""
-    radii: np.ndarray
-    """(n,) float64 local thinning radius."""
-    radius: float
-    """Nominal thinning radius, the smallest."""
+    kind: np.ndarray  # (n,) uint8
+    radii: np.ndarray  # (n,) float64 local thinning radius
+    radius: float  # nominal thinning radius, the smallest
     notes: tuple[ReportWarning, ...]
     figures: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class _ProjectedPoints:
-    """Candidates that converged to a surface."""
-
-    points: np.ndarray
-    """(n, 3) float64."""
-    normals: np.ndarray
-    """(n, 3) float64."""
-    kind: np.ndarray
-    """(n,) uint8."""
-    evaluations: int
 
 
 @dataclass(frozen=True)
@@ -465,8 +380,7 @@ class Field:
 
     vacancy: Any
     """``VacancyField``, or any object with ``vacancy(points)`` and ``is_empty(points)``."""
-    vectors: Any
-    """``VectorField``, or any object with ``evaluate(points)``."""
+    vectors: Any  # ``VectorField``, or any object with ``evaluate(points)``
     threads: int
 
 
@@ -474,36 +388,25 @@ class SurfaceSampler:
     """Samples a candidate surface and projects the points onto the isosurface."""
 
     def __init__(
-        self,
-        vacancy: Any,
-        vectors: Any,
-        region: Region,
-        surface: CandidateSurface,
-        threads: int,
-        *,
+        self, field: Field, region: Region, surface: CandidateSurface,
         cameras: Sequence[Camera] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Limit the spacing to what ``cameras`` resolve, if any are given."""
-        self._vacancy, self._vectors, self._region = vacancy, vectors, region
-        self._cameras = cameras
-        self._vertices = surface.vertices
+        self._vacancy, self._vectors, self._threads = field.vacancy, field.vectors, field.threads
+        self._region, self._cameras, self._vertices = region, cameras, surface.vertices
         centers = surface.vertices[surface.faces].mean(1)
         self._faces = surface.faces[region.contains(centers, 0.0)]
         if len(self._faces) == 0:  # the whole surface lies in the margin
             self._faces = surface.faces
-        self._normals, areas = normals_and_areas(self._vertices, self._faces)
-        self.area = float(areas.sum())
-        self._threads = threads
+        self._normals, self._areas = normals_and_areas(self._vertices, self._faces)
+        self.area = float(self._areas.sum())
 
     def spacing(
         self, request: ResolutionRequest, rng: np.random.Generator
     ) -> tuple[Spacing, tuple[ReportWarning, ...]]:
         """Return the local radii that meet a request, and notes for the report.
 
-        Raises
-        ------
-        ResourceError
-            The request needs more points than the limit.
+        Raises ResourceError: the request needs more points than the limit.
         """
         spacing, notes = self._spacing(request, rng)
         check_expected_points(self._expected(spacing)[1], request)
@@ -512,33 +415,19 @@ class SurfaceSampler:
     def _expected(self, spacing: Spacing) -> tuple[np.ndarray, float]:
         """Return the radius at each face as a share of the nominal one, and the expected points."""
         share = spacing.at(self._vertices[self._faces].mean(1), self._threads) / spacing.nominal
-        _, areas = normals_and_areas(self._vertices, self._faces)
-        weight = float((areas * share**-2.0).sum())
+        weight = float((self._areas * share**-2.0).sum())
         return share, POINTS_PER_SQUARE * weight / spacing.nominal**2
 
     def sample(
-        self,
-        request: ResolutionRequest,
-        rng: np.random.Generator,
-        progress: Progress,
-        *,
-        spacing: Spacing | None = None,
-        owned: Callable[[np.ndarray], np.ndarray] | None = None,
-    ) -> SurfacePoints:
+        self, request: ResolutionRequest, rng: np.random.Generator, progress: Progress, *,
+        spacing: Spacing | None = None, owned: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> SurfacePoints:  # fmt: skip
         """Return surface, jump and cap points at the requested density.
 
-        Parameters
-        ----------
-        spacing : Spacing, optional
-            Precomputed by :meth:`spacing` for the whole surface.
-        owned : callable, optional
-            Maps (n, 3) points to (n,) bool: only these are kept, and no cap points are made. For
-            tiles, whose boundary does not bound the solid.
-
-        Raises
-        ------
-        ResourceError
-            The request needs more points than the limit.
+        Tiles, whose boundary does not bound the solid, give the ``spacing`` of the whole surface
+        (:meth:`spacing`), and ``owned``, which maps (n, 3) points to (n,) bool: only these are
+        kept, and no cap points are made.
+        Raises ResourceError: the request needs more points than the limit.
         """
         notes: tuple[ReportWarning, ...] = ()
         if spacing is None:
@@ -546,13 +435,13 @@ class SurfaceSampler:
         progress.update(0.0, "sampling the surface")
         share, expected = self._expected(spacing)
         check_expected_points(expected, request)
-        points, face = self._candidates(
-            spacing.nominal, share, int(POINT_OVERSAMPLING * expected) + 64, rng
-        )
+        count = int(POINT_OVERSAMPLING * expected) + 64
+        points, face = self._candidates(spacing.nominal, share, count, rng)
         progress.update(0.1, f"projecting {len(points)} points onto the surface")
         radii = spacing.at(points, self._threads)
-        projected = self._project(points, face, radii, progress.span(0.1, 0.8))
-        moved, normals, kind = projected.points, projected.normals, projected.kind
+        moved, normals, kind, evaluations = self._project(
+            points, face, radii, progress.span(0.1, 0.8)
+        )
         caps = no_caps()
         if owned is None:
             caps = cap_points(
@@ -575,7 +464,7 @@ class SurfaceSampler:
             "surface_points": int((kinds == KIND_SURFACE).sum()),
             "jump_points": int((kinds == KIND_JUMP).sum()),
             "cap_points": int((kinds == KIND_CAP).sum()),
-            "projection_evaluations": projected.evaluations,
+            "projection_evaluations": evaluations,
             "shortest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].min(initial=np.inf)),
             "longest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].max(initial=0.0)),
             "limited_by_photos_share": spacing.limited,
@@ -593,53 +482,42 @@ class SurfaceSampler:
             return Spacing.uniform(radius), ()
         points, _ = sample_triangles(self._vertices, self._faces, FOOTPRINT_SAMPLES, rng)
         spacing = footprint_spacing(points, self._cameras, radius)
-        notes: tuple[ReportWarning, ...] = ()
-        if spacing.limited > REPORTED_SHARE:
-            share = f"On {spacing.limited:.0%} of the surface"
-            text = f"{share} the photos resolve no shorter edges; uniform spacing would make them."
-            notes = (ReportWarning("photos-limit-edges", text),)
-        return spacing, notes
+        if spacing.limited <= REPORTED_SHARE:
+            return spacing, ()
+        share = f"On {spacing.limited:.0%} of the surface"
+        text = f"{share} the photos resolve no shorter edges; uniform spacing would make them."
+        return spacing, (ReportWarning("photos-limit-edges", text),)
 
     def _project(
         self, points: np.ndarray, face: np.ndarray, radii: np.ndarray, progress: Progress
-    ) -> _ProjectedPoints:
-        """Project points of the candidate surface onto the isosurface or a jump of vacancy."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+        """Project points of the candidate surface onto the isosurface or a jump of vacancy.
+
+        Returns those that converged, their normals and kinds, and the number of evaluations.
+        """
         normals = self._normals_at(points, self._normals[face])
         found = project_to_isosurface(
-            points,
-            self._vacancy,
-            self._vectors,
-            progress.span(0.0, 0.8),
+            points, self._vacancy, self._vectors, progress.span(0.0, 0.8),
             max_steps=MAX_PROJECTION_STEPS,
-        )
+        )  # fmt: skip
         kind = np.full(len(points), KIND_SURFACE, np.uint8)
         lost = np.flatnonzero(~found.on_surface)
-        moved = found.points.copy()
-        searched, kind_of_lost = self._search_along_normals(
+        moved, good = found.points.copy(), found.on_surface.copy()
+        moved[lost], kind_of_lost = self._search_along_normals(
             points[lost], normals[lost], radii[lost], progress.span(0.8, 1.0)
         )
-        moved[lost] = searched
-        good = found.on_surface.copy()
         good[lost] = kind_of_lost >= 0
         kind[lost] = np.maximum(kind_of_lost, 0)
         good &= self._region.contains(moved, 0.0)
         normals = self._normals_at(moved[good], normals[good])
-        return _ProjectedPoints(moved[good], normals, kind[good], int(found.vacancy_evaluations))
+        return moved[good], normals, kind[good], int(found.vacancy_evaluations)
 
     def _candidates(
         self, radius: float, share: np.ndarray, count: int, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw ``count`` candidates and thin them, block by block.
-
-        Returns
-        -------
-        points : (n, 3) float64
-        face : (n,) int64
-        """
-        _, areas = normals_and_areas(self._vertices, self._faces)
-        weight = areas * share**-2.0  # (f,)
-        blocks = -(-count // MAX_BLOCK)
-        bounds = balanced_bounds(weight, blocks)
+        """Draw ``count`` candidates and thin them, block by block; return points and faces."""
+        weight = self._areas * share**-2.0  # (f,)
+        bounds = balanced_bounds(weight, -(-count // MAX_BLOCK))
         points, face = [], []
         for begin, end in itertools.pairwise(bounds.tolist()):
             part = int(count * weight[begin:end].sum() / weight.sum()) + 1
@@ -673,12 +551,8 @@ class SurfaceSampler:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Search a crossing along the normal where the projection found none.
 
-        Returns
-        -------
-        points : (k, 3)
-            Midpoint of the bracket.
-        kind : (k,) int
-            :data:`KIND_SURFACE`, :data:`KIND_JUMP`, or -1 without a crossing.
+        Returns midpoints of the brackets (k, 3), and :data:`KIND_SURFACE`, :data:`KIND_JUMP`, or -1
+        without a crossing.
         """
         kind = np.full(len(points), -1)
         moved = points.copy()
@@ -696,14 +570,10 @@ class SurfaceSampler:
         rows = np.flatnonzero(kind >= 0)
         empty = start[rows, None]
         inside, outside = bisect(
-            np.where(empty, other[rows], points[rows]),
-            np.where(empty, points[rows], other[rows]),
-            self._vacancy.is_empty,
-            SURFACE_POINTS_BRACKET_SHARE * float(radii.min()),
-            progress,
-        )
+            np.where(empty, other[rows], points[rows]), np.where(empty, points[rows], other[rows]),
+            self._vacancy.is_empty, SURFACE_POINTS_BRACKET_SHARE * float(radii.min()), progress,
+        )  # fmt: skip
         moved[rows] = (inside + outside) / 2
         value = self._vacancy.vacancy(moved[rows]).vacancy
-        exact = np.abs(value - limits.ISO_LEVEL) <= TOLERANCE
-        kind[rows[exact]] = KIND_SURFACE
+        kind[rows[np.abs(value - limits.ISO_LEVEL) <= TOLERANCE]] = KIND_SURFACE
         return moved, kind

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,13 +14,13 @@ import numpy as np
 from ...errors import MeshingError
 from ...mesh.components import compacted
 from ...mesh.edge_collapse import COLUMNS
-from ...mesh.simplification import Units, flip_edges, left_of, merge_vertices, quadrics_of
+from ...mesh.simplification import flip_edges, left_of, merge_vertices, quadrics_of
+from ...mesh.surface_mesh import summed
 from ...progress import Progress
-from ...regions.shapes import Region
-from ..primal_adaptive import KIND_SPLIT
+from ..primal_adaptive import KIND_SPLIT, kinds_after
 from ..repair import remove_degenerate, split_nonmanifold
 from .plan import TilePlan
-from .tile import BorderFaces, TileSurface, cost_units, kinds_after, longest_edge, tiles_disagree
+from .tile import BorderFaces, TileSurface, cost_units, longest_edge, tiles_disagree
 
 # -- A simplified mesh that grows by one tile after another ---------------------------------------
 #
@@ -28,20 +29,18 @@ from .tile import BorderFaces, TileSurface, cost_units, kinds_after, longest_edg
 # repaired and its vertices merged up to the same cost. So dense faces exist of one tile, and
 # along the border of what has been joined so far.
 
+RINGS = 2  # rings of faces around a band's points that are merged along with it
 
-RINGS = 2
-"""Rings of faces around a band's points that are merged along with it."""
+LoadTile = Callable[[int], TileSurface]  # returns the surface of a tile
 
-BLOCK = 1 << 20
-"""Faces that are looked through at once."""
+BLOCK = 1 << 20  # faces that are looked through at once
 
 
 class Joined(NamedTuple):
     """All tiles, simplified alike; :class:`GrowingMesh` has the arrays' descriptions."""
 
     vertices: np.ndarray
-    faces: np.ndarray
-    """(f, 3) int64."""
+    faces: np.ndarray  # (f, 3) int64
     kind: np.ndarray
     quadrics: np.ndarray
     stand_for: np.ndarray
@@ -50,43 +49,19 @@ class Joined(NamedTuple):
 class GrowingMesh:
     """Rows of vertices and faces; rows that become free are used again.
 
-    Parameters
-    ----------
-    region : Region
-    units : Units
-        Of costs.
-    level : float
-        Highest cost of a merger; negative: nothing is merged.
-    longest : float
-        Greatest length of a new edge.
-    least_height : float
-        Faces with a smaller height are removed.
-    vertices : int
-        How many rows to begin with.
+    ``level``: highest cost of a merger; negative: nothing is merged.
+    ``least_height``: faces with a smaller height are removed.
+    ``vertices``: how many rows to begin with.
     """
 
-    def __init__(
-        self,
-        region: Region,
-        units: Units,
-        *,
-        level: float,
-        longest: float,
-        least_height: float,
-        vertices: int,
-    ) -> None:
-        self._region, self._units, self._level = region, units, level
-        self._longest, self._least_height = longest, least_height
+    def __init__(self, plan: TilePlan, *, level: float, least_height: float, vertices: int) -> None:
+        self._region, self._units = plan.region, cost_units(plan.region)
+        self._level, self._longest, self._least_height = level, longest_edge(plan), least_height
         self.points = np.empty((vertices, 3))
-        """(v, 3) float64."""
-        self.quadrics = np.empty((vertices, COLUMNS))
-        """(v, 11) float64: of each vertex with all that merged into it."""
-        self.stand_for = np.empty(vertices, np.int32)
-        """(v,) int32: how many vertices of the dense surface each one stands for."""
+        self.quadrics = np.empty((vertices, COLUMNS))  # of each with all that merged into it
+        self.stand_for = np.empty(vertices, np.int32)  # how many vertices of the dense surface
         self.kind = np.empty(vertices, np.uint8)
-        """(v,) uint8."""
-        self.faces = np.empty((2 * vertices, 3), np.int32)
-        """(f, 3) int32, -1 in free rows."""
+        self.faces = np.empty((2 * vertices, 3), np.int32)  # -1 in free rows
         self._vertex_end = self._face_end = 0
         self._free_vertices = self._free_faces = np.zeros(0, np.int64)
         self._open_numbers = self._open_rows = np.zeros(0, np.int64)
@@ -103,10 +78,7 @@ class GrowingMesh:
         shared = surface.number >= 0
         stays = (stands == np.arange(count)) & shared
         stays[faces] = True
-        each = quadrics_of(surface.vertices, dense, self._units)
-        quadrics = np.stack(
-            [np.bincount(stands, column, minlength=count) for column in each.T], axis=1
-        )
+        quadrics = summed(stands, quadrics_of(surface.vertices, dense, self._units), count)
         where = np.full(count, -1)
         known = self._rows_of(surface.number[shared])
         where[np.flatnonzero(shared)] = known
@@ -126,10 +98,7 @@ class GrowingMesh:
     def add_between(self, faces: np.ndarray) -> np.ndarray:
         """Add faces between tiles, (f, 3) points' numbers; return their corners, (f, 3, 3).
 
-        Raises
-        ------
-        MeshingError
-            No tile has one of the corners.
+        Raises MeshingError: no tile has one of the corners.
         """
         corners = self._rows_of(faces.reshape(-1)).reshape(-1, 3)
         if (corners < 0).any():
@@ -142,10 +111,7 @@ class GrowingMesh:
     def close(self, numbers: np.ndarray) -> None:
         """Repair and simplify around points whose faces are all there.
 
-        Raises
-        ------
-        MeshingError
-            The faces around them are not closed.
+        Raises MeshingError: the faces around them are not closed.
         """
         ready = self._close(numbers)
         rows, inner = self._around(ready)
@@ -155,9 +121,7 @@ class GrowingMesh:
             return
         is_ready = np.isin(used, ready)
         held = ~inner[used] | np.isin(used, self._open_rows)
-        repaired = split_nonmanifold(
-            self.points[used], local.reshape(-1, 3).astype(np.int64), ~is_ready
-        )
+        repaired = split_nonmanifold(self.points[used], local.reshape(-1, 3), ~is_ready)
         origin = np.maximum(repaired.origin, 0)
         fixed = (repaired.origin >= 0) & held[origin]
         faces, _ = remove_degenerate(
@@ -165,8 +129,7 @@ class GrowingMesh:
         )
         kind = kinds_after(self.kind[used], repaired.origin)
         quadrics, stand_for = self.quadrics[used][origin], self.stand_for[used][origin]
-        parted = kind == KIND_SPLIT
-        parted &= is_ready[origin] | (repaired.origin < 0)
+        parted = (kind == KIND_SPLIT) & (is_ready[origin] | (repaired.origin < 0))
         if parted.any():
             # A copy has the planes of its own faces only.
             alone = quadrics_of(repaired.vertices, repaired.faces, self._units)
@@ -269,39 +232,19 @@ def _with_room(array: np.ndarray, count: int) -> np.ndarray:
 
 # -- Flip edges of the joined mesh, tile by tile, to follow the dense surface of each -------------
 
-
 ROOM_RADII = 8.0
 """The dense surface is given this far, in the largest radii, around the edges that are flipped."""
 
 
 def flip_by_tiles(
-    plan: TilePlan,
-    load: Callable[[int], TileSurface],
-    boxes: np.ndarray,
-    between: np.ndarray,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    progress: Progress,
-) -> np.ndarray:
-    """Flip edges as :func:`~.simplification.flip_edges`, with little memory.
+    plan: TilePlan, load: LoadTile, boxes: np.ndarray, between: np.ndarray, vertices: np.ndarray,
+    faces: np.ndarray, progress: Progress,
+) -> np.ndarray:  # fmt: skip
+    """Flip edges of a simplified mesh as :func:`~.simplification.flip_edges`, in little memory.
 
     Each tile's turn includes the faces just outside, so that edges across borders are flipped as
-    well.
-
-    Parameters
-    ----------
-    load : callable
-        Returns the surface of a tile.
-    boxes : (t, 2, 3) float64
-        Bounds of each tile's surface.
-    between : (b, 3, 3) float64
-        Corners of the dense faces between tiles.
-    vertices, faces : (v, 3) float64, (f, 3) int64
-        The simplified mesh.
-
-    Returns
-    -------
-    (f, 3) int64
+    well. ``boxes`` (t, 2, 3) are the bounds of each tile's surface, ``between`` (b, 3, 3) the
+    corners of the dense faces between tiles. Returns (f, 3) int64.
     """
     faces = faces.copy()
     owner = plan.tiling.owner(vertices[faces].mean(1))
@@ -316,12 +259,9 @@ def flip_by_tiles(
         low = vertices[at].min(0) - ROOM_RADII * plan.radius
         high = vertices[at].max(0) + ROOM_RADII * plan.radius
         near = np.flatnonzero((boxes[:, 0] <= high).all(1) & (boxes[:, 1] >= low).all(1))
-        soups = [_in_box(between, low, high)]
-        for number in near.tolist():
-            surface = load(number)
-            soups.append(_in_box(surface.vertices[surface.faces], low, high))
-        dense = np.concatenate(soups)
-        del soups
+        surfaces = (load(number) for number in near.tolist())  # one at a time
+        others = (_in_box(near_by.vertices[near_by.faces], low, high) for near_by in surfaces)
+        dense = np.concatenate([_in_box(between, low, high), *others])
         rows = np.flatnonzero(at[faces].any(1))
         points, local, source = compacted(vertices, faces[rows])
         turned = flip_edges(
@@ -339,10 +279,7 @@ def _in_box(corners: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarra
 
 # -- Join the surfaces of tiles, one after another, simplified to one highest cost ----------------
 
-
 _logger = logging.getLogger(__name__)
-
-LoadTile = Callable[[int], TileSurface]
 
 _COST_SHIFT = 46
 """Bits of a float64 that are dropped where costs are counted: 6 of the fraction are left."""
@@ -352,12 +289,9 @@ _COST_SHIFT = 46
 class TileOverview:
     """What is known of all tiles before they are joined."""
 
-    counts: np.ndarray
-    """(k,) int64: vertices whose cost of a merger lies in each interval."""
-    kept: int
-    """Vertices that no tile merges, without shared ones."""
-    shared: int
-    """Points at borders, each counted once."""
+    counts: np.ndarray  # (k,) int64: vertices whose cost of a merger lies in each interval
+    kept: int  # vertices that no tile merges, without shared ones
+    shared: int  # points at borders, each counted once
     order: tuple[int, ...]
     """In which tiles are joined: neighbours soon after each other, so that few borders are open."""
     ready: tuple[np.ndarray, ...]
@@ -366,8 +300,7 @@ class TileOverview:
     boxes: np.ndarray
     """(t, 2, 3) float64: bounds of each tile's surface; empty tiles have infinite ones."""
     least_height: float
-    figures: dict[str, int]
-    """Sums over the tiles."""
+    figures: Counter[str]  # sums over the tiles
 
     @property
     def vertices(self) -> int:
@@ -399,7 +332,7 @@ def overview(plan: TilePlan, load: LoadTile, progress: Progress) -> TileOverview
     counts = np.zeros(1 << (63 - _COST_SHIFT), np.int64)
     boxes = np.full((count, 2, 3), np.inf)
     kept, height = 0, np.inf
-    figures: dict[str, int] = {}
+    figures: Counter[str] = Counter()
     numbers, places = [], []
     for place, tile in enumerate(order):
         progress.update(place / count, f"counting tile {place + 1} of {count}")
@@ -412,15 +345,13 @@ def overview(plan: TilePlan, load: LoadTile, progress: Progress) -> TileOverview
         height = min(height, surface.least_height)
         if len(surface.vertices):
             boxes[tile] = surface.vertices.min(0), surface.vertices.max(0)
-        for name, value in surface.figures.items():
-            figures[name] = figures.get(name, 0) + int(value)
+        figures.update(surface.figures)
         numbers.append(np.union1d(surface.number[~own], surface.border).astype(np.int32))
         places.append(np.full(len(numbers[-1]), place, np.int32))
     number, place_of = np.concatenate(numbers), np.concatenate(places)
     rows = np.lexsort((place_of, number))
     number, place_of = number[rows], place_of[rows]
-    last = np.ones(len(number), np.bool_)
-    last[:-1] = number[1:] != number[:-1]
+    last = np.append(number[1:] != number[:-1], True)[: len(number)]
     number, place_of = number[last], place_of[last]
     ready = tuple(number[place_of == place] for place in range(count))
     return TileOverview(counts, kept, len(number), tuple(order), ready, boxes, height, figures)
@@ -431,32 +362,21 @@ def joined(
 ) -> tuple[GrowingMesh, np.ndarray]:
     """Join all tiles, with all vertices merged up to a cost.
 
-    Returns
-    -------
-    mesh : GrowingMesh
-        A closed 2-manifold.
-    between : (b, 3, 3) float64
-        Corners of the dense faces between tiles.
-
-    Raises
-    ------
-    MeshingError
-        Tiles do not agree on their border.
+    Returns a closed 2-manifold, and the corners of the dense faces between tiles, (b, 3, 3).
+    Raises MeshingError: tiles do not agree on their border.
     """
     left = int(known.counts[_bin_after(level) :].sum()) + known.kept
     mesh = GrowingMesh(
-        plan.region, cost_units(plan.region), level=level, longest=longest_edge(plan),
-        least_height=known.least_height, vertices=left + known.shared // 2,
-    )  # fmt: skip
+        plan, level=level, least_height=known.least_height, vertices=left + known.shared // 2
+    )
     border, between = BorderFaces(), []
     count = len(plan.tiling)
     for place, (tile, ready) in enumerate(zip(known.order, known.ready, strict=True)):
         progress.update(place / count, f"joining tile {place + 1} of {count}")
         surface = load(tile)
         mesh.add(surface)
-        faces = border.add(surface.border, surface.solid)
-        faces = np.concatenate([faces, border.close(ready)])
-        between.append(mesh.add_between(faces))
+        faces = [border.add(surface.border, surface.solid), border.close(ready)]
+        between.append(mesh.add_between(np.concatenate(faces)))
         try:
             mesh.close(ready)
         except MeshingError as error:

@@ -11,10 +11,11 @@ from scipy.spatial import cKDTree
 
 from ... import limits
 from ...mesh.sampling import POINTS_PER_SQUARE
+from ...mesh.surface_mesh import area_vectors
 from ...progress import Progress, ReportWarning
 from ...regions.shapes import Region, Tiling, split_evenly
 from ...scene.camera import Camera
-from ..spacing import DenseRequest, ResolutionRequest, Spacing, dense_request, nominal_edge
+from ..spacing import ResolutionRequest, Spacing, dense_request, nominal_edge
 from ..surface_points import CandidateSurface, Caps, Field, SurfaceSampler, cap_points
 
 # -- Steiner points on a jittered lattice, which bound empty balls and so make Delaunay cells
@@ -28,7 +29,6 @@ from ..surface_points import CandidateSurface, Caps, Field, SurfaceSampler, cap_
 # the lattice, whose nearest Steiner point, or the surface point for which that one was removed,
 # is closer.
 
-
 STEINER_POINTS_JITTER_SHARE = 0.1
 """Largest jitter of a Steiner point along each axis, as a share of the lattice's side."""
 
@@ -41,11 +41,8 @@ CLEARANCE_RADII = 8.0
 flat that it dips less than a radius below the surface, and a thin plate stays whole (with 2.5 it
 got holes)."""
 
-CLEARANCE_CAP_RADII = 2.5
-"""The same from cap points, which have no gaps."""
-
-SIDES_PER_TILE = 16.0
-"""Lattice sides along the side of a square with the area of a tile's surface."""
+CLEARANCE_CAP_RADII = 2.5  # the same from cap points, which have no gaps
+SIDES_PER_TILE = 16.0  # lattice sides along the side of a square with the area of a tile's surface
 
 MIN_SIDE_RADII = 4.0
 MAX_STEINER_POINTS = 400_000
@@ -55,8 +52,7 @@ MAX_STEINER_POINTS = 400_000
 class SteinerPoints:
     """A jittered lattice in and around a region."""
 
-    points: np.ndarray
-    """(n, 3) float64."""
+    points: np.ndarray  # (n, 3) float64
     ball_radius: float
     """Greatest radius of an empty ball that touches the region; see the module docstring."""
 
@@ -74,11 +70,7 @@ def lattice_side(region: Region, radius: float, area_per_tile: float) -> float:
 def steiner_lattice(region: Region, side: float, clearance: float, seed: int) -> SteinerPoints:
     """Return the Steiner points before those near surface points are removed.
 
-    Parameters
-    ----------
-    side : float
-    clearance : float
-        Greatest distance at which a surface point removes Steiner points.
+    A surface point will remove those up to ``clearance`` away.
     """
     ball_radius = 1.01 * (FARTHEST_SHARE * side + clearance)
     low, high = region.bounds[0] - ball_radius - side, region.bounds[1] + ball_radius + side
@@ -88,9 +80,8 @@ def steiner_lattice(region: Region, side: float, clearance: float, seed: int) ->
     jitter = np.random.default_rng(seed).uniform(-1.0, 1.0, centers.shape)
     # Every cell that intersects the covered body, even by a corner.
     covered = region.distance(centers) <= ball_radius + 0.5 * np.sqrt(3.0) * side
-    return SteinerPoints(
-        (centers + STEINER_POINTS_JITTER_SHARE * side * jitter)[covered], ball_radius
-    )
+    points = centers + STEINER_POINTS_JITTER_SHARE * side * jitter
+    return SteinerPoints(points[covered], ball_radius)
 
 
 def outside_clearance(
@@ -99,15 +90,13 @@ def outside_clearance(
     """Return which of (n, 3) Steiner points lie beyond their nearest point's (m,) clearance."""
     if len(points) == 0 or len(steiner_points) == 0:
         return np.ones(len(steiner_points), np.bool_)
-    nearest, index = cKDTree(points).query(
-        steiner_points, distance_upper_bound=float(distances.max())
-    )
+    farthest = float(distances.max())
+    nearest, index = cKDTree(points).query(steiner_points, distance_upper_bound=farthest)
     found = np.isfinite(nearest)
     return np.asarray(~found | (nearest > distances[np.where(found, index, 0)]))
 
 
 # -- Plan of a tiled mesh: the candidate surface, spacing, borders and Steiner points of all tiles
-
 
 TILE_POINTS = 75_000
 """Most surface points of a tile if the number of tiles is automatic: its memory stays small
@@ -127,8 +116,7 @@ class TilePlan:
 
     region: Region
     surface: CandidateSurface
-    area: float
-    """Area of the candidate surface in the region."""
+    area: float  # area of the candidate surface in the region
     spacing: Spacing
     """Local thinning radii of the whole surface; with adaptive spacing, of the dense mesh."""
     tiling: Tiling
@@ -139,11 +127,9 @@ class TilePlan:
     caps: Caps
     seed: int
     notes: tuple[ReportWarning, ...]
-    edge_length: float
-    """Edge length of the uniform mesh that meets the request."""
+    edge_length: float  # edge length of the uniform mesh that meets the request
     target: int
-    share: float
-    """Vertices to keep, as for :func:`.primal_adaptive.simplified`: 0 and 1 keep all."""
+    share: float  # vertices to keep, as for :func:`.primal_adaptive.simplified`: 0 and 1 keep all
     depth_samples: int = 0
 
     @property
@@ -170,42 +156,20 @@ class _CapSpacing(Spacing):
 
 
 def make_plan(
-    field: Field,
-    region: Region,
-    surface: CandidateSurface,
-    request: ResolutionRequest,
-    progress: Progress,
-    *,
-    tiles: int,
-    seed: int,
-    cameras: Sequence[Camera],
-    adaptive: bool,
-    depth_samples: int,
-) -> TilePlan:
-    """Compute the data that tiles share.
+    field: Field, region: Region, surface: CandidateSurface, request: ResolutionRequest,
+    progress: Progress, *,
+    tiles: int, seed: int, cameras: Sequence[Camera], adaptive: bool, depth_samples: int,
+) -> TilePlan:  # fmt: skip
+    """Compute the data that tiles share; 0 ``tiles`` stand for :data:`TILE_POINTS` in each.
 
-    Parameters
-    ----------
-    tiles : int
-        Number of tiles; 0 chooses it by :data:`TILE_POINTS`.
-
-    Raises
-    ------
-    ResourceError
-        The request needs more points than the limit.
+    Raises ResourceError: the request needs more points than the limit.
     """
     rng = np.random.default_rng(seed)
-    sampler = SurfaceSampler(
-        field.vacancy, field.vectors, region, surface, field.threads,
-        cameras=cameras if adaptive else (),
-    )  # fmt: skip
-    dense = (
-        dense_request(request, sampler.area, region) if adaptive else DenseRequest(request, 0, 1.0)
-    )
+    sampler = SurfaceSampler(field, region, surface, cameras if adaptive else ())
+    dense = dense_request(request, sampler.area, region, adaptive=adaptive)
     spacing, notes = sampler.spacing(dense.request, rng)
-    corners = surface.vertices[surface.faces]  # (f, 3, 3)
-    centers = corners.mean(1)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    centers = surface.vertices[surface.faces].mean(1)
+    cross = area_vectors(surface.vertices, surface.faces)
     expected = POINTS_PER_SQUARE * spacing.at(centers, field.threads) ** -2.0
     expected *= 0.5 * np.linalg.norm(cross, axis=1) * region.contains(centers)  # (f,) points
 
@@ -215,11 +179,8 @@ def make_plan(
         return heaviest <= TILE_POINTS or count >= limits.MAX_TILES
 
     tiling = split_evenly(centers, expected, region.bounds, enough)
-    caps = cap_points(
-        region, field.vacancy.is_empty,
-        _CapSpacing(spacing.points, spacing.radii, spacing.nominal, spacing.limited), rng,
-        progress,
-    )  # fmt: skip
+    on_caps = _CapSpacing(spacing.points, spacing.radii, spacing.nominal, spacing.limited)
+    caps = cap_points(region, field.vacancy.is_empty, on_caps, rng, progress)
     largest = float(spacing.radii.max())
     clearance = max(
         CLEARANCE_RADII * largest, CLEARANCE_CAP_RADII * float(caps.radii.max(initial=0.0))

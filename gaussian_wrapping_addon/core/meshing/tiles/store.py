@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ...array_file import read_arrays
+from ...array_file import read_arrays, write_arrays
 from ...errors import ParseError
-from ...files import read_json, write_bytes, write_json
+from ...files import read_json, write_json
 from ...progress import read_warnings
 from ...regions.shapes import Region, Tiling
 from ..spacing import Spacing
@@ -61,15 +60,9 @@ def is_planned(folder: Path) -> bool:
 
 
 def save_plan(folder: Path, plan: TilePlan, noted: dict[str, Any]) -> None:
-    """Write a plan; its JSON file comes last.
-
-    Parameters
-    ----------
-    noted : dict
-        JSON values that are kept with it for whoever joins the tiles.
-    """
+    """Write a plan, and JSON values noted for whoever joins the tiles; its JSON file comes last."""
     folder.mkdir(parents=True, exist_ok=True)
-    _save(
+    write_arrays(
         folder / "plan.npz",
         vertices=plan.surface.vertices, faces=plan.surface.faces, fillers=plan.steiner_points,
         region=plan.region.vertices, cap_points=plan.caps.points, cap_normals=plan.caps.normals,
@@ -80,25 +73,15 @@ def save_plan(folder: Path, plan: TilePlan, noted: dict[str, Any]) -> None:
     write_json(
         folder / LIST_NAME,
         {
-            "version": VERSION,
-            "region": plan.region.name,
-            "noted": noted,
-            "seed": plan.seed,
-            "radius": plan.spacing.nominal,
-            "limited": plan.spacing.limited,
-            "notes": [note.to_json() for note in plan.notes],
-            "edge_length": plan.edge_length,
-            "target": plan.target,
-            "share": plan.share,
-            "sightings": plan.depth_samples,
-            "ball": plan.ball_radius,
-            "area": plan.area,
-            "gaussians": plan.surface.gaussians,
-            "pivots": plan.surface.pivots,
-            "splits": plan.tiling.to_json(),
+            "version": VERSION, "region": plan.region.name, "noted": noted, "seed": plan.seed,
+            "radius": plan.spacing.nominal, "limited": plan.spacing.limited,
+            "notes": [note.to_json() for note in plan.notes], "edge_length": plan.edge_length,
+            "target": plan.target, "share": plan.share, "sightings": plan.depth_samples,
+            "ball": plan.ball_radius, "area": plan.area, "gaussians": plan.surface.gaussians,
+            "pivots": plan.surface.pivots, "splits": plan.tiling.to_json(),
             "tiles": [[_finite(low), _finite(high)] for low, high in boxes],
         },
-    )
+    )  # fmt: skip
 
 
 def _finite(corner: np.ndarray) -> list[float | None]:
@@ -108,10 +91,7 @@ def _finite(corner: np.ndarray) -> list[float | None]:
 def load_plan(folder: Path) -> tuple[TilePlan, dict[str, Any]]:
     """Read a plan and what was noted with it.
 
-    Raises
-    ------
-    ParseError
-        The JSON file has another version, or a file is damaged.
+    Raises ParseError: the JSON file has another version, or a file is damaged.
     """
     path = folder / LIST_NAME
     try:
@@ -122,8 +102,7 @@ def load_plan(folder: Path) -> tuple[TilePlan, dict[str, Any]]:
         plan = TilePlan(
             Region(str(values["region"]), arrays["region"]),
             CandidateSurface(
-                arrays["vertices"], arrays["faces"], int(values["gaussians"]),
-                int(values["pivots"]),
+                arrays["vertices"], arrays["faces"], int(values["gaussians"]), int(values["pivots"])
             ),
             float(values["area"]),
             Spacing(
@@ -133,16 +112,9 @@ def load_plan(folder: Path) -> tuple[TilePlan, dict[str, Any]]:
             Tiling.from_json(values["splits"]),
             arrays["fillers"],
             float(values["ball"]),
-            Caps(
-                arrays["cap_points"], arrays["cap_normals"], arrays["cap_radii"],
-                arrays["cap_priority"],
-            ),
-            int(values["seed"]),
-            read_warnings(values["notes"]),
-            float(values["edge_length"]),
-            int(values["target"]),
-            float(values["share"]),
-            int(values["sightings"]),
+            Caps(*(arrays[f"cap_{name}"] for name in ("points", "normals", "radii", "priority"))),
+            int(values["seed"]), read_warnings(values["notes"]), float(values["edge_length"]),
+            int(values["target"]), float(values["share"]), int(values["sightings"]),
         )  # fmt: skip
         return plan, dict(values["noted"])
     except (OSError, KeyError, TypeError, ValueError) as error:
@@ -151,7 +123,7 @@ def load_plan(folder: Path) -> tuple[TilePlan, dict[str, Any]]:
 
 def save_points(path: Path, cloud: SurfacePoints) -> None:
     """Write the points of a tile."""
-    _save(path, **_of_cloud(cloud))
+    write_arrays(path, **_of_cloud(cloud))
 
 
 def load_points(path: Path) -> SurfacePoints:
@@ -161,7 +133,7 @@ def load_points(path: Path) -> SurfacePoints:
 
 def save_gathered(path: Path, gathered: GatheredPoints) -> None:
     """Write the points of all tiles."""
-    _save(path, shifted=gathered.shifted, inner=gathered.inner, **_of_cloud(gathered.cloud))
+    write_arrays(path, shifted=gathered.shifted, inner=gathered.inner, **_of_cloud(gathered.cloud))
 
 
 def load_gathered(path: Path) -> GatheredPoints:
@@ -182,7 +154,7 @@ def save_surface(path: Path, surface: TileSurface) -> None:
     values = {name: getattr(surface, name) for name in _SURFACE_ARRAYS}
     values["least_height"] = np.array(surface.least_height)
     values["figures"] = np.array(json.dumps(surface.figures))
-    _save(path, **values)
+    write_arrays(path, **values)
 
 
 def load_surface(path: Path) -> TileSurface:
@@ -196,14 +168,11 @@ def load_surface(path: Path) -> TileSurface:
 
 def _of_cloud(cloud: SurfacePoints) -> dict[str, np.ndarray]:
     return {
-        "points": cloud.points,
-        "normals": cloud.normals,
-        "kind": cloud.kind,
-        "radius": np.array(cloud.radius),
-        "radii": cloud.radii,
+        "points": cloud.points, "normals": cloud.normals, "kind": cloud.kind,
+        "radius": np.array(cloud.radius), "radii": cloud.radii,
         "notes": np.array(json.dumps([note.to_json() for note in cloud.notes])),
         "figures": np.array(json.dumps(cloud.figures)),
-    }
+    }  # fmt: skip
 
 
 def _cloud_of(path: Path, arrays: dict[str, np.ndarray]) -> SurfacePoints:
@@ -221,9 +190,3 @@ def _damaged(path: Path) -> Iterator[None]:
         yield
     except (TypeError, ValueError) as error:
         raise ParseError(path, "whole file", f"{error}.", _AGAIN) from None
-
-
-def _save(path: Path, **arrays: np.ndarray) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    write_bytes(path, buffer.getvalue())

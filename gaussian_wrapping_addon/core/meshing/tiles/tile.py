@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,9 @@ from ...mesh.sampling import EDGE_PER_RADIUS, thin
 from ...mesh.simplification import Units, merge_vertices
 from ...progress import Progress
 from ...regions.shapes import Region
-from ..classification import OUTWARD_FACES, classify, on_one_sheet, tetrahedron_neighbours
+from ..classification import classify, faces_opposite, of_neighbours, tetrahedron_neighbours
 from ..delaunay import bounding_points, delaunay
-from ..primal_adaptive import DEGENERATE_SHARE, KIND_SPLIT, LONGEST_EDGE_SHARE
+from ..primal_adaptive import DEGENERATE_SHARE, LONGEST_EDGE_SHARE, kinds_after
 from ..repair import remove_degenerate, split_nonmanifold
 from ..spacing import ResolutionRequest
 from ..surface_points import (
@@ -30,7 +30,6 @@ from ..surface_points import (
 from .plan import CLEARANCE_CAP_RADII, CLEARANCE_RADII, JITTER_SHARE, TilePlan, outside_clearance
 
 # -- Sample the surface points of one tile, and gather the points of all tiles --------------------
-
 
 KIND_STEINER = 4
 """A Steiner point between inside and outside, where the field is ambiguous away from a surface."""
@@ -54,14 +53,13 @@ def tile_points(field: Field, plan: TilePlan, tile: int, progress: Progress) -> 
         plan.surface.vertices, plan.surface.faces, low - margin, high + margin,
         PIECE_RADII * plan.radius,
     )  # fmt: skip
-    inside = plan.region.contains(vertices[faces].mean(1), margin)
-    faces = faces[inside]
+    faces = faces[plan.region.contains(vertices[faces].mean(1), margin)]
     if len(faces) == 0:
-        return empty_points(plan)
+        return _no_points(plan)
     surface = replace(plan.surface, vertices=vertices, faces=faces)
-    sampler = SurfaceSampler(field.vacancy, field.vectors, plan.region, surface, field.threads)
+    sampler = SurfaceSampler(field, plan.region, surface)
     if sampler.area <= 0.0:
-        return empty_points(plan)
+        return _no_points(plan)
     rng = np.random.default_rng([plan.seed, tile, 0])
     return sampler.sample(
         ResolutionRequest(0.0, 0), rng, progress, spacing=plan.spacing,
@@ -69,12 +67,9 @@ def tile_points(field: Field, plan: TilePlan, tile: int, progress: Progress) -> 
     )  # fmt: skip
 
 
-def empty_points(plan: TilePlan) -> SurfacePoints:
-    """Return the points of a tile that holds no surface."""
-    none = np.zeros((0, 3))
-    return SurfacePoints(
-        none, none, np.zeros(0, np.uint8), np.zeros(0), plan.spacing.nominal, (), {}
-    )
+def _no_points(plan: TilePlan) -> SurfacePoints:
+    none, kind = np.zeros((0, 3)), np.zeros(0, np.uint8)
+    return SurfacePoints(none, none, kind, np.zeros(0), plan.spacing.nominal, (), {})
 
 
 def pieces_in_box(
@@ -109,25 +104,18 @@ class GatheredPoints:
 
     cloud: SurfacePoints
     """Surface points, cap points and Steiner points (normal 0, ``KIND_STEINER``)."""
-    shifted: np.ndarray
-    """(n, 3) float64: perturbed positions for the triangulation."""
-    inner: np.ndarray
-    """(n,) bool: false for Steiner points beyond the region."""
+    shifted: np.ndarray  # (n, 3) float64: perturbed positions for the triangulation
+    inner: np.ndarray  # (n,) bool: false for Steiner points beyond the region
 
 
 def gather(plan: TilePlan, parts: list[SurfacePoints]) -> GatheredPoints:
-    """Thin the points of all tiles together with the caps; drop Steiner points near them.
-
-    Parameters
-    ----------
-    parts : list of SurfacePoints
-        In the order of the tiles.
-    """
+    """Thin the points of all tiles, in order, with the caps; drop Steiner points near them."""
     rng = np.random.default_rng([plan.seed, len(plan.tiling), 1])
     caps = plan.caps
-    points = np.concatenate([caps.points, *(part.points for part in parts)])
-    normals = np.concatenate([caps.normals, *(part.normals for part in parts)])
-    radii = np.concatenate([caps.radii, *(part.radii for part in parts)])
+    points, normals, radii = (
+        np.concatenate([getattr(some, name) for some in (caps, *parts)])
+        for name in ("points", "normals", "radii")
+    )
     kind = np.full(len(points), KIND_CAP, np.uint8)
     kind[len(caps.points) :] = np.concatenate([part.kind for part in parts])
     # As within a tile: jumps come last among surface points.
@@ -136,10 +124,9 @@ def gather(plan: TilePlan, parts: list[SurfacePoints]) -> GatheredPoints:
     kept = thin(points, normals, radii, priority)
     points, normals, radii, kind = points[kept], normals[kept], radii[kept], kind[kept]
     is_cap = kind == KIND_CAP
-    free = outside_clearance(plan.steiner_points, points[~is_cap], CLEARANCE_RADII * radii[~is_cap])
-    free &= outside_clearance(
-        plan.steiner_points, points[is_cap], CLEARANCE_CAP_RADII * radii[is_cap]
-    )
+    free = np.ones(len(plan.steiner_points), np.bool_)
+    for chosen, clear in ((~is_cap, CLEARANCE_RADII), (is_cap, CLEARANCE_CAP_RADII)):
+        free &= outside_clearance(plan.steiner_points, points[chosen], clear * radii[chosen])
     steiner_points = plan.steiner_points[free]
     figures = {
         "surface_points": int((~is_cap).sum()),
@@ -151,18 +138,14 @@ def gather(plan: TilePlan, parts: list[SurfacePoints]) -> GatheredPoints:
     }
     for name in ("candidates", "dropped_candidates", "jump_points", "projection_evaluations"):
         figures[name] = sum(part.figures.get(name, 0) for part in parts)
-    inner = np.concatenate(
-        [np.ones(len(points), np.bool_), plan.region.distance(steiner_points) < 0]
-    )
+    inner = np.append(np.ones(len(points), np.bool_), plan.region.distance(steiner_points) < 0)
     cloud = SurfacePoints(
         np.concatenate([points, steiner_points]),
         np.concatenate([normals, np.zeros_like(steiner_points)]),
         np.concatenate([kind, np.full(len(steiner_points), KIND_STEINER, np.uint8)]),
         np.concatenate([radii, np.full(len(steiner_points), np.inf)]),
-        plan.spacing.nominal,
-        plan.notes,
-        figures,
-    )
+        plan.spacing.nominal, plan.notes, figures,
+    )  # fmt: skip
     shift = JITTER_SHARE * plan.region.diagonal * rng.uniform(-1.0, 1.0, cloud.points.shape)
     return GatheredPoints(cloud, cloud.points + shift, inner)
 
@@ -170,13 +153,11 @@ def gather(plan: TilePlan, parts: list[SurfacePoints]) -> GatheredPoints:
 # -- Faces between the tetrahedra of different tiles: on the surface where one of them is solid
 
 
-_NO_FACES = np.zeros((0, 3), np.int64)
-
-
 def tiles_disagree() -> MeshingError:
     """Return the error that the faces of tiles do not fit together."""
-    hint = "Use another seed or number of tiles."
-    return MeshingError("Tiles do not agree on their border.", hint)
+    return MeshingError(
+        "Tiles do not agree on their border.", "Use another seed or number of tiles."
+    )
 
 
 class BorderFaces:
@@ -187,28 +168,16 @@ class BorderFaces:
     """
 
     def __init__(self) -> None:
-        self._faces, self._solid = _NO_FACES, np.zeros(0, np.bool_)
-        self._settled = np.zeros(0, np.bool_)
+        self._faces = np.zeros((0, 3), np.int64)
+        self._solid = self._settled = np.zeros(0, np.bool_)
 
     def add(self, faces: np.ndarray, solid: np.ndarray) -> np.ndarray:
         """Add the border faces of a tile; return those of the surface that this settles.
 
-        Parameters
-        ----------
-        faces : (b, 3) int
-            Indices of points, oriented out of the tile.
-        solid : (b,) bool
-            Whether the tile's tetrahedron at each is inside.
-
-        Returns
-        -------
-        (k, 3) int64
-            Oriented outward.
-
-        Raises
-        ------
-        MeshingError
-            Two tiles have triangulated the points near their border differently.
+        ``faces`` (b, 3) hold indices of points and are oriented out of the tile; ``solid`` (b,)
+        tells whether the tile's tetrahedron at each is inside. Returns (k, 3) int64, oriented
+        outward.
+        Raises MeshingError: two tiles have triangulated the points near their border differently.
         """
         border = np.concatenate([self._faces, faces])
         solid = np.concatenate([self._solid, solid])
@@ -231,13 +200,7 @@ class BorderFaces:
         return surface.astype(np.int64)
 
     def close(self, points: np.ndarray) -> np.ndarray:
-        """Forget the faces at points whose tiles are all there; return those of the surface.
-
-        Parameters
-        ----------
-        points : (p,) int
-            Indices, increasing.
-        """
+        """Forget the faces at points whose tiles are all there; return those of the surface."""
         closed = np.isin(self._faces, points).any(1)
         surface = self._faces[closed & self._solid & ~self._settled]
         self._faces, self._solid = self._faces[~closed], self._solid[~closed]
@@ -258,7 +221,6 @@ def _parity(faces: np.ndarray) -> np.ndarray:
 # the faces of all tiles together bound a set of tetrahedra of one triangulation: they are closed,
 # whatever the labels are.
 
-
 CONTEXT_RADII = 4.0
 """Tetrahedra of other tiles within this distance are labelled as well, as neighbours of the own."""
 
@@ -272,10 +234,9 @@ class TileFaces:
     boundary."""
     border: np.ndarray
     """(b, 3) int64: faces between the tile's tetrahedra and others, oriented out of the tile's."""
-    solid: np.ndarray
-    """(b,) bool: whether the tile's tetrahedron at that face is inside."""
+    solid: np.ndarray  # (b,) bool: whether the tile's tetrahedron at that face is inside
     figures: dict[str, Any]
-    whole: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    whole: np.ndarray
     """(p,) int64, increasing: points whose faces are all in ``faces``, since no other tile has a
     tetrahedron there."""
 
@@ -287,51 +248,36 @@ def tile_faces(
     numbers = np.flatnonzero(plan.tiling.within(tile, gathered.shifted, plan.halo))
     own = plan.tiling.owner(gathered.cloud.points[numbers]) == tile
     if not (own & gathered.inner[numbers]).any():
-        return _no_faces()
+        none = np.zeros((0, 3), np.int64)
+        return TileFaces(none, none, np.zeros(0, np.bool_), {}, np.zeros(0, np.int64))
     seed = int(np.random.default_rng([plan.seed, tile, 2]).integers(2**31))
     numbers, tetrahedra = local_tetrahedra(plan, gathered, tile, seed, progress.span(0.0, 0.2))
     # Farther away they may differ from the triangulation of the whole region.
-    near = np.zeros(len(numbers) + 8, np.bool_)
-    near[: len(numbers)] = plan.tiling.within(
-        tile, gathered.cloud.points[numbers], CONTEXT_RADII * plan.radius
+    near = plan.tiling.within(tile, gathered.cloud.points[numbers], CONTEXT_RADII * plan.radius)
+    near, inner, own = (  # the bounding points are none of these
+        np.append(flags, np.zeros(8, np.bool_)) for flags in (near, gathered.inner[numbers], own)
     )
     tetrahedra = tetrahedra[near[tetrahedra].any(1)]
     neighbours = tetrahedron_neighbours(tetrahedra)
-    inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
     outer = ~inner[tetrahedra].all(1)
     # Indices of the region's points increase with the local ones.
-    first = tetrahedra.min(1)
-    owned = ~outer & np.append(own, np.zeros(8, np.bool_))[first]
+    owned = ~outer & own[tetrahedra.min(1)]
     # Only outer tetrahedra have bounding points as corners, whose positions are not used.
     points = np.concatenate([gathered.cloud.points[numbers], np.zeros((8, 3))])
+    rng = np.random.default_rng([plan.seed, tile, 3])
     labels = classify(
-        points,
-        tetrahedra,
-        neighbours,
-        outer,
-        on_one_sheet(
-            points,
-            tetrahedra,
-            gathered.cloud.normals[numbers],
-            outer,
-            gathered.cloud.radii[numbers],
-        ),
-        lambda where: field.vacancy.vacancy(where).filled,
-        np.random.default_rng([plan.seed, tile, 3]),
-        progress.span(0.2, 1.0),
-    )
+        points, tetrahedra, neighbours, outer, gathered.cloud.normals[numbers],
+        gathered.cloud.radii[numbers], field.vacancy, rng, progress.span(0.2, 1.0),
+    )  # fmt: skip
     inside = labels.inside
-    known = np.where(neighbours >= 0, owned[neighbours], False)  # (m, 4)
-    theirs = np.where(neighbours >= 0, inside[neighbours], False)
+    known, theirs = of_neighbours(owned, neighbours), of_neighbours(inside, neighbours)  # (m, 4)
     # A neighbour with a corner in the tile is the same in all tiles.
-    own = np.append(own, np.zeros(8, np.bool_))
-    beyond = np.nonzero(owned[:, None] & (neighbours >= 0) & outer[neighbours])
-    known[beyond] = own[tetrahedra[beyond[0][:, None], OUTWARD_FACES[beyond[1]]]].any(1)
+    beyond = owned[:, None] & (neighbours >= 0) & outer[neighbours]
+    known[beyond] = own[faces_opposite(tetrahedra, beyond)].any(1)
     theirs[beyond] = False
-    tetrahedron, corner = np.nonzero((owned & inside)[:, None] & known & ~theirs)
-    faces = numbers[tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]]
-    tetrahedron, corner = np.nonzero(owned[:, None] & ~known)
-    border = numbers[tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]]
+    faces = faces_opposite(tetrahedra, (owned & inside)[:, None] & known & ~theirs)
+    at_border = owned[:, None] & ~known
+    border = faces_opposite(tetrahedra, at_border)
     # All tetrahedra at points of the tile are there.
     whole = own.copy()
     whole[tetrahedra[~owned & ~outer]] = False
@@ -342,7 +288,8 @@ def tile_faces(
         "undecided_tetrahedra": labels.undecided,
     }
     whole = numbers[whole[:-8] & gathered.inner[numbers]]
-    return TileFaces(faces, border, inside[tetrahedron], figures, whole)
+    solid = inside[np.nonzero(at_border)[0]]
+    return TileFaces(numbers[faces], numbers[border], solid, figures, whole)
 
 
 def local_tetrahedra(
@@ -351,24 +298,13 @@ def local_tetrahedra(
     """Triangulate the points in and around a tile.
 
     Tetrahedra with a corner in the tile and one in the region are those of the whole region.
-
-    Returns
-    -------
-    numbers : (n,) int64
-        Indices of the points, increasing.
-    tetrahedra : (m, 4) int64
-        Indices into ``numbers``; n and above are bounding points.
+    Returns increasing indices of the points, (n,) int64, and tetrahedra of indices into these,
+    (m, 4) int64; n and above are bounding points.
     """
     numbers = np.flatnonzero(plan.tiling.within(tile, gathered.shifted, plan.halo))
     shifted = gathered.shifted[numbers]
     shifted = np.concatenate([shifted, bounding_points(shifted, seed)])
-    tetrahedra = delaunay(shifted, seed=seed, progress=progress, jitter_share=0.0)
-    return numbers, tetrahedra
-
-
-def _no_faces() -> TileFaces:
-    none = np.zeros((0, 3), np.int64)
-    return TileFaces(none, none, np.zeros(0, np.bool_), {})
+    return numbers, delaunay(shifted, seed=seed, progress=progress, jitter_share=0.0)
 
 
 # -- The surface of one tile: made manifold where it is the tile's alone, and prepared to be
@@ -381,7 +317,6 @@ def _no_faces() -> TileFaces:
 # joins the tiles chooses one highest cost for all. The other points stay as they are, in a band
 # along the tile's border.
 
-
 DEEPER = 4
 """Mergers go on until this many times fewer vertices are left than stay on average: in tiles that
 are flatter than others fewer stay."""
@@ -391,26 +326,19 @@ are flatter than others fewer stay."""
 class TileSurface:
     """Dense faces of a tile, and the order in which its vertices may be merged."""
 
-    vertices: np.ndarray
-    """(v, 3) float64, scene frame."""
-    faces: np.ndarray
-    """(f, 3) int32, oriented outward; open along the tile's border."""
+    vertices: np.ndarray  # (v, 3) float64, scene frame
+    faces: np.ndarray  # (f, 3) int32, oriented outward; open along the tile's border
     number: np.ndarray
     """(v,) int32: index in the region's points of those that other tiles may have as well, else
     -1."""
-    kind: np.ndarray
-    """(v,) uint8."""
-    into: np.ndarray
-    """(v,) int32, and ..."""
-    level: np.ndarray
-    """... (v,) float64: see :class:`~.simplification.Merged`."""
-    border: np.ndarray
-    """(b, 3) int32: faces towards other tiles, as indices in the region's points."""
+    kind: np.ndarray  # (v,) uint8
+    into: np.ndarray  # (v,) int32: see :class:`~.simplification.Merged`
+    level: np.ndarray  # (v,) float64: see there
+    border: np.ndarray  # (b, 3) int32: faces towards other tiles, as indices in the region's points
     solid: np.ndarray
     """(b,) bool: which of those have the tile's solid behind them; ``vertices`` has their
     corners."""
-    least_height: float
-    """Faces with a smaller height are removed; the same for all tiles."""
+    least_height: float  # faces with a smaller height are removed; the same for all tiles
     figures: dict[str, Any]
 
 
@@ -449,40 +377,14 @@ def tile_surface(plan: TilePlan, gathered: GatheredPoints, part: TileFaces) -> T
             vertices, faces, cost_units(plan.region), least, longest_edge(plan), locked=fixed
         )
         into, level = merged.into, merged.level
-    figures = {
-        **part.figures,
-        "split_vertices": repaired.split_vertices,
-        "split_edges": repaired.split_edges,
-    }
+    splits = {"split_vertices": repaired.split_vertices, "split_edges": repaired.split_edges}
+    number = np.where(fixed, number[np.maximum(origin, 0)], -1)
     return TileSurface(
-        vertices,
-        faces.astype(np.int32),
-        np.where(fixed, number[np.maximum(origin, 0)], -1).astype(np.int32),
-        kind,
-        into.astype(np.int32),
-        level,
-        part.border.astype(np.int32),
-        part.solid,
-        height,
-        figures,
-    )
+        vertices, faces.astype(np.int32), number.astype(np.int32), kind, into.astype(np.int32),
+        level, part.border.astype(np.int32), part.solid, height, {**part.figures, **splits},
+    )  # fmt: skip
 
 
 def longest_edge(plan: TilePlan) -> float:
     """Return the greatest length of an edge of the simplified mesh."""
     return LONGEST_EDGE_SHARE * plan.region.diagonal
-
-
-def kinds_after(before: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Return the kinds of repaired vertices, (w,) uint8.
-
-    Parameters
-    ----------
-    before : (v,) uint8
-        Of the vertices before.
-    origin : (w,) int64
-        See :class:`.repair.RepairResult`.
-    """
-    copies = np.bincount(origin[origin >= 0], minlength=len(before))
-    moved = (origin < 0) | (copies[np.maximum(origin, 0)] > 1)
-    return np.where(moved, KIND_SPLIT, before[np.maximum(origin, 0)]).astype(np.uint8)

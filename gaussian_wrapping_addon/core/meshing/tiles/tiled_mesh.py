@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import MeshingError
+from ...field.isosurface_projection import isosurface_residuals
 from ...field.samples import DepthSamples
 from ...gaussians.model import GaussianArrays
 from ...mesh.components import compacted, without_floaters
@@ -19,10 +19,10 @@ from ...progress import Progress
 from ...regions.shapes import Region
 from ...scene.camera import Camera
 from ...settings import MeshingSettings
-from ..primal_adaptive import residuals_on_surface, small_handles_closed, vertex_counts
+from ..primal_adaptive import small_handles_closed
 from ..repair import remove_degenerate
 from ..spacing import checked_request
-from ..surface_points import Field, candidate_surface
+from ..surface_points import KIND_SURFACE, Field, candidate_surface, no_surface_error
 from .join import Joined, LoadTile, flip_by_tiles, joined, overview
 from .plan import TilePlan, make_plan
 from .tile import KIND_STEINER, cost_units, longest_edge
@@ -38,31 +38,15 @@ MAX_ATTEMPTS = 3
 
 
 def plan_tiles(
-    field: Field,
-    arrays: GaussianArrays,
-    cameras: Sequence[Camera],
-    region: Region,
-    settings: MeshingSettings,
-    progress: Progress,
-    *,
-    tiles: int,
-    seed: int,
-    edge_length_scene: float = 0.0,
+    field: Field, arrays: GaussianArrays, cameras: Sequence[Camera], region: Region,
+    settings: MeshingSettings, progress: Progress, *,
+    tiles: int, seed: int, edge_length_scene: float = 0.0,
     depth_samples: DepthSamples | None = None,
-) -> TilePlan:
-    """Extract the region's candidate surface and split it into tiles.
+) -> TilePlan:  # fmt: skip
+    """Extract the region's candidate surface and split it; 0 ``tiles``: as many as it needs.
 
-    Parameters
-    ----------
-    tiles : int
-        Number of tiles; 0 chooses it by the request.
-
-    Raises
-    ------
-    MeshingError
-        The region holds no surface.
-    UsageError, ResourceError
-        The request is invalid, or needs more points than the limit.
+    Raises MeshingError: the region holds no surface; UsageError, ResourceError: the request is
+    invalid, or needs more points than the limit.
     """
     request = checked_request(edge_length_scene, settings.points, region)
     surface = candidate_surface(
@@ -79,29 +63,17 @@ def plan_tiles(
 
 
 def join_tiles(
-    field: Field,
-    plan: TilePlan,
-    point_figures: dict[str, Any],
-    load: LoadTile,
-    settings: MeshingSettings,
-    progress: Progress,
-) -> SurfaceMesh:
+    field: Field, plan: TilePlan, point_figures: dict[str, Any], load: LoadTile,
+    settings: MeshingSettings, progress: Progress,
+) -> SurfaceMesh:  # fmt: skip
     """Join the surfaces of all tiles into one closed 2-manifold, simplified.
 
     Memory is proportional to the simplified mesh: of the dense surface there is one tile at a time,
     and a band along the borders of those that have been joined.
 
-    Parameters
-    ----------
-    point_figures : dict
-        ``figures`` of the gathered points.
-    load : callable
-        Returns the surface of a tile; called several times for each.
-
-    Raises
-    ------
-    MeshingError
-        The region holds no solid, or tiles do not agree on their border.
+    ``point_figures`` are the ``figures`` of the gathered points; ``load``, which returns the
+    surface of a tile, is called several times for each.
+    Raises MeshingError: the region holds no solid, or tiles do not agree on their border.
     """
     known = overview(plan, load, progress.span(0.0, 0.05))
     # With uniform spacing all vertices stay.
@@ -111,8 +83,8 @@ def join_tiles(
         step = progress.span(0.05 + 0.15 * attempt, 0.2 + 0.15 * attempt)
         mesh, between = joined(plan, load, known, level, step)
         figures: dict[str, Any] = {
-            "split_vertices": known.figures.get("split_vertices", 0) + mesh.split_vertices,
-            "split_edges": known.figures.get("split_edges", 0) + mesh.split_edges,
+            "split_vertices": known.figures["split_vertices"] + mesh.split_vertices,
+            "split_edges": known.figures["split_edges"] + mesh.split_edges,
         }
         whole = mesh.compacted()
         del mesh
@@ -126,8 +98,7 @@ def join_tiles(
     faces, narrow = remove_degenerate(part.vertices, part.faces, known.least_height, plan.region)
     figures |= floaters | {"degenerate_faces_left": narrow, "dense_vertices": dense}
     progress.update(0.5, f"simplifying {dense} vertices")
-    simplifies = dense > target
-    if simplifies:
+    if dense > target:
         faces = merge_vertices(
             part.vertices, faces, cost_units(plan.region), target, longest_edge(plan),
             quadrics=part.quadrics,
@@ -135,12 +106,11 @@ def join_tiles(
     vertices, faces, chosen = compacted(part.vertices, faces)
     kind = part.kind[chosen]
     del part
-    if simplifies:
+    if dense > target:
         faces = flip_by_tiles(
             plan, load, known.boxes, between, vertices, faces, progress.span(0.6, 0.95)
         )
-    vertices, faces, kind, handles = small_handles_closed(vertices, faces, kind)
-    figures |= handles | vertex_counts(kind)
+    vertices, faces, kind, counts = small_handles_closed(vertices, faces, kind)
     sums = ("tetrahedra", "interior_samples", "relabelled_tetrahedra", "undecided_tetrahedra")
     provenance: dict[str, Any] = {
         "method": "primal adaptive meshing",
@@ -155,14 +125,15 @@ def join_tiles(
         "notes": [note.to_json() for note in plan.notes],
         "seed": plan.seed,
         **point_figures,
-        **{name: known.figures.get(name, 0) for name in sums},
+        **{name: known.figures[name] for name in sums},
         **figures,
+        **counts,
         "vertices_of_fillers": int((kind == KIND_STEINER).sum()),
-        **residuals_on_surface(field.vacancy, vertices, kind),
+        **isosurface_residuals(field.vacancy, vertices[kind == KIND_SURFACE]),
     }
     progress.update(1.0, f"{len(faces)} faces")
     _logger.info("Meshed region %s: %d faces", plan.region.name, len(faces))
-    return SurfaceMesh(vertices, faces.astype(np.int32), None, provenance)
+    return SurfaceMesh(vertices, faces.astype(np.int32), provenance)
 
 
 def _without_floaters(
@@ -170,10 +141,7 @@ def _without_floaters(
 ) -> tuple[Joined, dict[str, Any]]:
     """Return what has been joined without floaters, and their figures."""
     if len(whole.faces) == 0:
-        raise MeshingError(
-            f"Region {plan.region.name!r} holds no solid.",
-            "Draw the region around something that was photographed.",
-        )
+        raise no_surface_error(plan.region, "solid")
     # Closed triangle meshes have twice as many faces as vertices.
     valence = np.bincount(whole.faces.ravel(), minlength=len(whole.vertices))
     each = 2.0 * whole.stand_for / np.maximum(valence, 1)
@@ -181,14 +149,8 @@ def _without_floaters(
         whole.vertices, whole.faces, settings.min_component_share, settings.most_parts,
         each[whole.faces].sum(1),
     )  # fmt: skip
-    figures = {
-        "components": floaters.kept,
-        "removed_solids": floaters.removed_solids,
-        "removed_cavities": floaters.removed_cavities,
-        "removed_area_share": floaters.removed_area_share,
-    }
     vertices, faces, source = compacted(whole.vertices, floaters.faces)
     part = Joined(
         vertices, faces, whole.kind[source], whole.quadrics[source], whole.stand_for[source]
     )
-    return part, figures
+    return part, floaters.figures()
