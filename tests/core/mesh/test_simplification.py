@@ -185,14 +185,6 @@ def test_vertices_on_the_region_stay_on_it_and_none_leaves_it() -> None:
     assert (np.abs(result.vertices - 1.0).max(1) < 1e-12).sum() == 1, "the corner of three caps"
 
 
-def test_source_tells_where_a_vertex_came_from() -> None:
-    vertices, faces = slab((1, 1, 1), 0.2)
-    result = decimated((vertices, faces), len(faces) - 2)
-    same = (result.vertices == vertices[result.source]).all(1)
-    assert (~same).sum() <= 1
-    np.testing.assert_array_equal(np.unique(result.source), np.sort(result.source))
-
-
 def test_an_open_boundary_stays_as_it_is() -> None:
     vertices, faces = ball(4)
     faces = faces[(vertices[faces][:, :, 2] <= 0.0).all(1)]
@@ -467,7 +459,7 @@ def test_error_falls_and_the_shape_stays_closed() -> None:
     better = flip_edges(vertices, coarse, points, faces, 10.0)
     errors = []
     for each in (coarse, better):
-        figures = assert_closed_manifold(SurfaceMesh(vertices, each.astype(np.int32), None, {}))
+        figures = assert_closed_manifold(SurfaceMesh(vertices, each.astype(np.int32), {}))
         assert (figures.vertices, figures.genus, figures.components) == (400, 1, 1)
         where, _ = sample_triangles(vertices, each, 40_000, np.random.default_rng(0))
         errors.append(np.abs(torus()(where)).mean())
@@ -516,5 +508,5 @@ def test_a_part_is_flipped_like_the_whole_and_nothing_else() -> None:
     part[rows] = source[flip_edges(local_vertices, local, points, faces, 10.0, movable[rows])]
     np.testing.assert_array_equal(part[~movable], coarse[~movable])
     assert (part != coarse).any(1).sum() > 10
-    figures = assert_closed_manifold(SurfaceMesh(vertices, part.astype(np.int32), None, {}))
+    figures = assert_closed_manifold(SurfaceMesh(vertices, part.astype(np.int32), {}))
     assert (figures.vertices, figures.genus, figures.components) == (400, 1, 1)

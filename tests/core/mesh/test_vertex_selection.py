@@ -49,7 +49,7 @@ def selected(
     points: np.ndarray, faces: np.ndarray, target: int, longest: float = 10.0
 ) -> SurfaceMesh:
     vertices, chosen, _ = compacted(points, select_vertices(points, faces, target, longest))
-    return SurfaceMesh(vertices, chosen.astype(np.int32), None, {})
+    return SurfaceMesh(vertices, chosen.astype(np.int32), {})
 
 
 def test_vertices_stay_in_place_and_genus_stays() -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -107,15 +106,6 @@ def test_a_target_out_of_reach_is_said(mesh: SurfaceMesh) -> None:
     assert validate_manifold(result.vertices, result.faces).good
     assert len(result.faces) > 4
     assert any("4 requested" in note["text"] for note in result.provenance["notes"])
-
-
-def test_colours_follow_their_vertices(mesh: SurfaceMesh) -> None:
-    share = (mesh.vertices - mesh.vertices.min(0)) / np.ptp(mesh.vertices, axis=0)
-    colored = replace(mesh, colors=np.round(255 * share).astype(np.uint8))
-    result = cleaned(colored, target_faces=len(mesh.faces) // 2)
-    expected = 255 * (result.vertices - mesh.vertices.min(0)) / np.ptp(mesh.vertices, axis=0)
-    assert result.colors is not None
-    assert np.median(np.abs(result.colors - expected)) < 3
 
 
 def smoothed(mesh: Mesh, steps: int, region: Region | None = None) -> np.ndarray:

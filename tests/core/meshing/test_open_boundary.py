@@ -152,16 +152,6 @@ def test_fans_that_meet_in_one_vertex_are_parted() -> None:
     assert len(source) == 4
 
 
-def test_colours_follow_their_vertices() -> None:
-    vertices, faces = slab((2, 2, 2), 0.5)
-    low, high = vertices.min(0), vertices.max(0)
-    region = Region.box("r", np.array([low[0], low[1] - 1, low[2] - 1]), high + 1)
-    colors = np.arange(3 * len(vertices)).reshape(-1, 3).astype(np.uint8)
-    mesh = without_caps(replace(mesh_from(vertices, faces), colors=colors), region)
-    for vertex, color in zip(mesh.vertices, mesh.colors, strict=True):
-        assert np.array_equal(color, colors[np.argmin(np.abs(vertices - vertex).sum(1))])
-
-
 def test_open_edges_elsewhere_are_defects() -> None:
     vertices, faces = slab((2, 2, 2), 0.5)
     region = Region.box("r", vertices.min(0) - [0, 1, 1], vertices.max(0) + 1)

@@ -90,7 +90,7 @@ def at_once(tiles: LabelledTiles, settings: MeshingSettings = ALL_PARTS) -> Surf
     figures["dense_vertices"] = len(vertices)
     vertices, faces, kind = simplified(vertices, faces, kind, plan.target, plan.share, plan.region)
     vertices, faces, kind, handles = small_handles_closed(vertices, faces, kind)
-    return SurfaceMesh(vertices, faces.astype(np.int32), None, figures | handles)
+    return SurfaceMesh(vertices, faces.astype(np.int32), figures | handles)
 
 
 def corner_set(mesh: SurfaceMesh) -> set[tuple[Any, ...]]:
