@@ -189,8 +189,5 @@ def _evaluate(options: Namespace) -> int:
         "out": None if options.out is None else str(options.out),
     }
     return run_in_worker(
-        request,
-        python=worker_python(),
-        module="jobs.commands.evaluate_command",
-        what="evaluation",
+        request, python=worker_python(), module="jobs.commands.evaluate_command", what="evaluation"
     )

@@ -122,10 +122,7 @@ def add_bake(commands: Commands) -> None:
         "--mesh", type=Path, required=True, metavar="FILE", help="OBJ, PLY, GLB, STL or OFF"
     )
     parser.add_argument(
-        "--name",
-        default="",
-        metavar="NAME",
-        help="folder below DIR/baked (default: as the file)",
+        "--name", default="", metavar="NAME", help="folder below DIR/baked (default: as the file)"
     )
     parser.add_argument(
         "--uvs", choices=UV_CHOICES, default="auto",

@@ -519,10 +519,7 @@ def _set_uvs(thing: bpy.types.Object, frame: bpy.types.Object, baked: BakedFiles
 
 
 def _refuse_changed(
-    thing: bpy.types.Object,
-    frame: bpy.types.Object,
-    triangles: Triangulation,
-    baked: BakedFiles,
+    thing: bpy.types.Object, frame: bpy.types.Object, triangles: Triangulation, baked: BakedFiles
 ) -> None:
     same = triangles.is_own and triangles.faces.shape == baked.faces.shape
     if same:

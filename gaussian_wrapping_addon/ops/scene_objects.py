@@ -92,10 +92,7 @@ def create_material(
 
 
 def create_materials(
-    name: str,
-    albedo: Sequence[Path],
-    normal_map: Sequence[Path],
-    occlusion: Sequence[Path] = (),
+    name: str, albedo: Sequence[Path], normal_map: Sequence[Path], occlusion: Sequence[Path] = ()
 ) -> list[bpy.types.Material]:
     """Create a material for each atlas: ``name``, then ``name 2`` and on.
 

@@ -241,12 +241,7 @@ def _keep_search(found: tuple[bool, list[FoundPython]]) -> None:
 
 
 def request_for(
-    python: str,
-    torch: str,
-    wheel_folder: str,
-    extras: Iterable[str] = (),
-    *,
-    adds: bool = False,
+    python: str, torch: str, wheel_folder: str, extras: Iterable[str] = (), *, adds: bool = False
 ) -> SetupRequest:
     """Return the request of a set-up with these choices, or of adding extras to the present one.
 

@@ -34,9 +34,7 @@ class GWRAP_PG_computers(bpy.types.PropertyGroup):
     """Which computers run the jobs of a scene."""
 
     kind: EnumProperty(  # type: ignore[valid-type]
-        name="Computers",
-        description="Computers that run the jobs of this scene",
-        items=_KINDS,
+        name="Computers", description="Computers that run the jobs of this scene", items=_KINDS
     )
     dask_address: StringProperty(  # type: ignore[valid-type]
         name="Scheduler",

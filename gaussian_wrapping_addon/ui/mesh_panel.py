@@ -214,9 +214,4 @@ class GWRAP_PT_bake(TabPanel, bpy.types.Panel):
         wrapped_label(layout, text, characters, icon="INFO")
 
 
-CLASSES: Final = (
-    GWRAP_PT_mesh,
-    GWRAP_PT_mesh_advanced,
-    GWRAP_PT_texture,
-    GWRAP_PT_bake,
-)
+CLASSES: Final = (GWRAP_PT_mesh, GWRAP_PT_mesh_advanced, GWRAP_PT_texture, GWRAP_PT_bake)

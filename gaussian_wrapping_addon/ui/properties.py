@@ -75,8 +75,7 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     training: PointerProperty(type=GWRAP_PG_training)  # type: ignore[valid-type]
     job_folder: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     job_command: EnumProperty(  # type: ignore[valid-type]
-        items=(("WRAP", "Wrap", ""), ("MESH", "Mesh", ""), ("BAKE", "Bake", "")),
-        options={"HIDDEN"},
+        items=(("WRAP", "Wrap", ""), ("MESH", "Mesh", ""), ("BAKE", "Bake", "")), options={"HIDDEN"}
     )
     bake: PointerProperty(type=GWRAP_PG_bake)  # type: ignore[valid-type]
     computers: PointerProperty(type=GWRAP_PG_computers)  # type: ignore[valid-type]

@@ -421,7 +421,4 @@ class GWRAP_GGT_region_box(bpy.types.GizmoGroup):
             bpy.app.timers.register(_end_later, first_interval=_POLL_S)
 
 
-CLASSES: Final = (
-    GWRAP_PT_region,
-    GWRAP_GGT_region_box,
-)
+CLASSES: Final = (GWRAP_PT_region, GWRAP_GGT_region_box)

@@ -204,8 +204,4 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
         row.operator("gwrap.reset_placement", text="Reset", icon="LOOP_BACK")
 
 
-CLASSES: Final = (
-    GWRAP_PT_result,
-    GWRAP_PT_report,
-    GWRAP_PT_scene_tools,
-)
+CLASSES: Final = (GWRAP_PT_result, GWRAP_PT_report, GWRAP_PT_scene_tools)

@@ -199,8 +199,4 @@ class GWRAP_PT_train_advanced(bpy.types.Panel):
         column.operator("gwrap.reset_training", icon="LOOP_BACK")
 
 
-CLASSES: Final = (
-    GWRAP_MT_presets,
-    GWRAP_PT_train,
-    GWRAP_PT_train_advanced,
-)
+CLASSES: Final = (GWRAP_MT_presets, GWRAP_PT_train, GWRAP_PT_train_advanced)
