@@ -129,10 +129,7 @@ class SetAction(Action):
 def add_option(parser: Any, entry: Declaration, **changes: Any) -> None:
     """Add the option of one setting to a parser or argument group.
 
-    Parameters
-    ----------
-    changes : dict
-        Keywords of ``add_argument`` that replace the declared ones.
+    ``changes``: keywords of ``add_argument`` that replace the declared ones.
     """
     option = entry.option
     assert option is not None
@@ -171,10 +168,7 @@ def _number_reader(entry: Declaration) -> Callable[[str], Any]:
 def given_settings(options: Namespace, scope: Scope) -> dict[str, Any]:
     """Return the settings, by path, whose options were given.
 
-    Raises
-    ------
-    UsageError
-        A value cannot be parsed.
+    Raises UsageError: a value cannot be parsed.
     """
     values = {}
     for entry in declared_options(scope):
@@ -232,15 +226,8 @@ def _saved_values(options: Namespace, given_preset: str | None) -> dict[str, Any
 
     Settings of meshes are left out, and what the file leaves to the preset.
 
-    Parameters
-    ----------
-    given_preset : str, optional
-        Overrides that of the file.
-
-    Raises
-    ------
-    UsageError, ParseError
-        The file cannot be used.
+    ``given_preset``: overrides that of the file.
+    Raises UsageError, ParseError: the file cannot be used.
     """
     if options.user_preset is None:
         return {}
@@ -286,12 +273,8 @@ _ONLY_BY_PIVOTS = ("pivots", "pivot_box", "pivot_samples")
 def method_settings(options: Namespace) -> dict[str, Any]:
     """Return the meshing settings, by name, of the scope ``method``.
 
-    Options that are not given have their defaults, not the values of an earlier mesh.
-
-    Raises
-    ------
-    UsageError
-        An option is given that the method ignores.
+    Options that are not given have their defaults, not the values of an earlier mesh. Raises
+    UsageError: an option is given that the method ignores.
     """
     values = given_settings(options, "method")
     given = {path.removeprefix("meshing."): value for path, value in values.items()}
@@ -321,12 +304,8 @@ def region_settings(
     """Return settings with the options of the scopes ``method`` and ``region``.
 
     Options that are not given have their defaults, not the values of an earlier mesh; with
-    ``texture_stays``, those of the texture have the values of ``settings``.
-
-    Raises
-    ------
-    UsageError
-        An option is given that the method ignores, or a value cannot be parsed.
+    ``texture_stays``, those of the texture have the values of ``settings``. Raises UsageError: an
+    option is given that the method ignores, or a value cannot be parsed.
     """
     given = given_settings(options, "region")
     values = {

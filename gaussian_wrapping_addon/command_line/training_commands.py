@@ -70,10 +70,8 @@ def _wrap(options: Namespace) -> int:
 def checked_job(photos: Path, options: Namespace) -> JobFile:
     """Return the job that wraps photos with the options given; warn of what they show.
 
-    Raises
-    ------
-    DatasetError, UsageError, DeviceError
-        The photos, an option or the device cannot be used.
+    Raises DatasetError, UsageError, DeviceError: the photos, an option or the device cannot be
+    used.
     """
     from ..core.errors import DatasetError, UsageError
     from ..core.jobs.client import worker_if_any
@@ -288,10 +286,7 @@ def _queue(options: Namespace) -> int:
 def _folders(root: Path) -> list[Path]:
     """Return the folders of a folder, by name.
 
-    Raises
-    ------
-    UsageError
-        There is no such folder, or it holds none, or too many.
+    Raises UsageError: there is no such folder, or it holds none, or too many.
     """
     from ..core.errors import UsageError
 

@@ -166,13 +166,7 @@ def current_frame(
 
 
 def result_folder(frame: bpy.types.Object) -> Path:
-    """Return the result folder that a frame names.
-
-    Raises
-    ------
-    UsageError
-        The frame has none.
-    """
+    """Return the result folder that a frame names. Raises UsageError: the frame has none."""
     text = frame.get(RESULT, "")
     if not isinstance(text, str) or not text:
         raise UsageError(f"{frame.name} has no result folder.", "Import the result again.")
@@ -182,10 +176,7 @@ def result_folder(frame: bpy.types.Object) -> Path:
 def world_from_scene(frame: bpy.types.Object) -> Similarity:
     """Return the similarity from the scene frame to the world of the input.
 
-    Raises
-    ------
-    UsageError
-        The custom property is missing or was edited.
+    Raises UsageError: the custom property is missing or was edited.
     """
     try:
         return Similarity.from_json(json.loads(frame[WORLD_FROM_SCENE]))

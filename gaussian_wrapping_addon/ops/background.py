@@ -39,17 +39,11 @@ Result = TypeVar("Result")
 class Task(Generic[Result]):
     """One call of a :class:`Lane` and its outcome.
 
-    Parameters
-    ----------
-    call : callable
-        Runs in the lane's thread.
-    then : callable, optional
-        Receives the result on the main thread. Without it, the caller polls :meth:`finished` and
-        reads :meth:`result`.
-    failed : callable, optional
-        Receives the exception if ``call`` raised one; by default it is logged.
-    end : callable, optional
-        Called by :meth:`cancel` to end what the call waits for; must not block.
+    ``call``: runs in the lane's thread.
+    ``then``: receives the result on the main thread. Without it, the caller polls :meth:`finished`
+    and reads :meth:`result`.
+    ``failed``: receives the exception if ``call`` raised one; by default it is logged.
+    ``end``: called by :meth:`cancel` to end what the call waits for; must not block.
     """
 
     def __init__(
@@ -125,10 +119,7 @@ class Lane:
     Starting a thread blocks until it runs, which takes long while a worker keeps all processors
     busy: :meth:`start` does it ahead of time.
 
-    Parameters
-    ----------
-    of_file : bool
-        Tasks concern the open file and are cancelled before another one is loaded.
+    ``of_file``: tasks concern the open file and are cancelled before another one is loaded.
     """
 
     def __init__(self, *, of_file: bool = False) -> None:
@@ -270,24 +261,12 @@ def run_child(
 ) -> tuple[list[dict[str, Any]], str]:
     """Run a child to its end; touches nothing of Blender.
 
-    Parameters
-    ----------
-    on_start : callable
-        Receives the process; returns false if the estimate is no longer wanted, which ends it.
-    late : WorkerError, optional
-        Raised where it takes too long, in place of the error of an estimate.
-
-    Returns
-    -------
-    messages : list of dict
-        JSON objects from standard output, one a line.
-    last_words : str
-        The last line of standard error.
-
-    Raises
-    ------
-    WorkerError
-        The child does not start, or takes too long.
+    ``on_start``: receives the process; returns false if the estimate is no longer wanted, which
+    ends it.
+    ``late``: raised where it takes too long, in place of the error of an estimate.
+    Returns ``messages``: JSON objects from standard output, one a line; ``last_words``: the last
+    line of standard error.
+    Raises WorkerError: the child does not start, or takes too long.
     """
     try:
         process = spawn(command)

@@ -60,10 +60,8 @@ class Triangulation:
 def triangulation_of(thing: bpy.types.Object) -> Triangulation:
     """Triangulate a mesh object as it is shown.
 
-    Raises
-    ------
-    UsageError
-        It is no mesh, is not evaluated, has no faces, or has vertices that are not finite.
+    Raises UsageError: it is no mesh, is not evaluated, has no faces, or has vertices that are not
+    finite.
     """
     if thing.type != "MESH":
         raise UsageError(f"{thing.name} is no mesh.", "Select a mesh object.")
@@ -109,10 +107,7 @@ def _same_faces(evaluated: bpy.types.Mesh, own: bpy.types.Mesh) -> bool:
 def scene_points(frame: bpy.types.Object, vertices: np.ndarray) -> np.ndarray:
     """Bring (n, 3) points of Blender's world into the scene frame of a result.
 
-    Raises
-    ------
-    UsageError
-        The frame is scaled differently along its axes, mirrored or has no size.
+    Raises UsageError: the frame is scaled differently along its axes, mirrored or has no size.
     """
     return placement_of(frame).inverse().points(vertices)
 
@@ -126,15 +121,9 @@ def world_mesh(
 ) -> FileMesh:
     """Return a mesh in the world of the input, wherever the result and the object stand.
 
-    Parameters
-    ----------
-    with_uvs, with_polygons : bool
-        Whether it has the UVs of the triangles, and what these are parts of.
-
-    Raises
-    ------
-    UsageError
-        The frame has no valid transform, or has lost its world coordinates.
+    ``with_uvs``, ``with_polygons``: whether it has the UVs of the triangles, and what these are
+    parts of.
+    Raises UsageError: the frame has no valid transform, or has lost its world coordinates.
     """
     world = addon.world_from_scene(frame).points(scene_points(frame, triangles.vertices))
     polygons = Polygons(triangles.polygons.astype(np.int64), triangles.loops.astype(np.int64))
@@ -172,19 +161,10 @@ _MEND = (
 def quads_of(name: str, triangles: Triangulation, quads: int) -> Triangulation:
     """Return about so many quads along a mesh, as triangles that are parts of them.
 
-    Parameters
-    ----------
-    name : str
-        Of the object, for errors.
-    triangles : Triangulation
-        Finite.
-    quads : int
-        QuadriFlow makes up to a quarter fewer, or a few more.
-
-    Raises
-    ------
-    UsageError
-        QuadriFlow refuses the mesh, fails or is cancelled.
+    ``name``: of the object, for errors.
+    ``triangles``: finite.
+    ``quads``: QuadriFlow makes up to a quarter fewer, or a few more.
+    Raises UsageError: QuadriFlow refuses the mesh, fails or is cancelled.
     """
     vertices, faces = _joined(triangles)
     edges = edge_lengths(vertices, faces)
@@ -337,10 +317,7 @@ class BakedFiles:
 def read_baked(folder: Path) -> BakedFiles:
     """Read and check a folder of a bake.
 
-    Raises
-    ------
-    DatasetError, ParseError
-        A file is missing or invalid, or the folder holds links.
+    Raises DatasetError, ParseError: a file is missing or invalid, or the folder holds links.
     """
     reject_foreign_entries(folder)
     path = folder / "mesh.npz"
@@ -402,19 +379,11 @@ def apply_bake(
     Polygons that new UVs cut are divided; all others stay. A bake with fewer faces or with quads
     becomes a new object under the frame, and the dense one is hidden.
 
-    Parameters
-    ----------
-    scene : Scene
-    frame : Object
-        Frame of the result whose photos were baked.
-    baked : BakedFiles
-    target_uid : int, optional
-        Session uid of the object that was handed over; otherwise it is found by its tag.
-
-    Raises
-    ------
-    UsageError
-        The object is gone, or its faces have changed since; nothing has been changed.
+    ``frame``: frame of the result whose photos were baked.
+    ``target_uid``: session uid of the object that was handed over; otherwise it is found by its
+    tag.
+    Raises UsageError: the object is gone, or its faces have changed since; nothing has been
+    changed.
     """
     thing = _target(scene, baked.name, target_uid)
     if not baked.has_own_faces or baked.polygons is not None:

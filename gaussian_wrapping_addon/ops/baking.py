@@ -46,22 +46,12 @@ def start_bake(
 ) -> Path:
     """Bake the photos of a result onto a mesh object; return the job folder.
 
-    Parameters
-    ----------
-    frame : Object
-        The frame of the result.
-    thing : Object
-        Any mesh; it need not belong to the result.
+    ``thing`` is any mesh, which need not belong to the result. Quads are made here, in Blender,
+    which waits for them. They become an object when the bake is done: until then, and where it
+    fails, the scene stays as it is.
 
-    Raises
-    ------
-    WrapError
-        The mesh cannot be baked onto or made of quads, or the job has no finished training.
-
-    Notes
-    -----
-    Quads are made here, in Blender, which waits for them. They become an object when the bake is
-    done: until then, and where it fails, the scene stays as it is.
+    Raises WrapError: the mesh cannot be baked onto or made of quads, or the job has no finished
+    training.
     """
     folder = JobFolder(job_folder_of(frame))
     if job_timer.is_running(str(folder.root)):

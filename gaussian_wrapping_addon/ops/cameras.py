@@ -141,10 +141,7 @@ def photo_of(thing: bpy.types.Object) -> Path:
 def show_photo(thing: bpy.types.Object) -> None:
     """Show a camera's photo behind what it sees; the file is read when it is drawn, not packed.
 
-    Raises
-    ------
-    DatasetError
-        The photo is not there.
+    Raises DatasetError: the photo is not there.
     """
     path = photo_of(thing)
     hint = "Restore it, or look through the camera without it."

@@ -84,16 +84,10 @@ def call(
 ) -> None:
     """Run a request in the thread.
 
-    Parameters
-    ----------
-    about : str
-        The address or folder that it is about.
-    request : callable
-        Runs in the thread; touches nothing of Blender.
-    then : callable
-        Receives the result on the main thread; returns sentences on it, or an outcome.
-    end : callable, optional
-        Ends what the request waits for, where nobody waits for it any more.
+    ``about``: the address or folder that it is about.
+    ``request``: runs in the thread; touches nothing of Blender.
+    ``then``: receives the result on the main thread; returns sentences on it, or an outcome.
+    ``end``: ends what the request waits for, where nobody waits for it any more.
     """
     _lane.cancel()
     _memory.outcome, _memory.about = None, about
@@ -136,12 +130,8 @@ MAX_TEXT = 600
 def start(scene: bpy.types.Scene, address: Address, choice: WorkerChoice) -> None:
     """Ask all workers of a scheduler in the background; the panel shows a row for each.
 
-    Raises
-    ------
-    UsageError
-        There is no folder to test, or the certificates are on another computer.
-    WorkerError
-        No worker is set up on this computer.
+    Raises UsageError: there is no folder to test, or the certificates are on another computer;
+    WorkerError: no worker is set up on this computer.
     """
     request = {
         "address": str(address), "certificates": certificates_of(scene),
@@ -161,10 +151,7 @@ def start(scene: bpy.types.Scene, address: Address, choice: WorkerChoice) -> Non
 def folder_of_jobs(scene: bpy.types.Scene) -> Path:
     """Return the folder that workers must see: where the scene's job is or will be written.
 
-    Raises
-    ------
-    UsageError
-        Neither photos nor the environment name one.
+    Raises UsageError: neither photos nor the environment name one.
     """
     if properties_of(scene).source:
         folder = output_of(scene, source_of(scene))
@@ -183,12 +170,8 @@ def folder_of_jobs(scene: bpy.types.Scene) -> Path:
 def outcome_of(messages: list[dict[str, Any]], last_words: str) -> Outcome:
     """Return what the panel shows of what the process has written.
 
-    Parameters
-    ----------
-    messages : list of dict
-        ``{"worker": {...}}`` for each worker, ``{"error", "hint"}``.
-    last_words : str
-        The last line of its standard error.
+    ``messages``: ``{"worker": {...}}`` for each worker, ``{"error", "hint"}``.
+    ``last_words``: the last line of its standard error.
     """
     workers = [m["worker"] for m in messages if isinstance(m.get("worker"), dict)]
     errors = [m for m in messages if m.get("error")]
@@ -260,10 +243,7 @@ def look_at(folder: str) -> Look | None:
 
     Reads nothing. Asks for a new reading where this one is old.
 
-    Parameters
-    ----------
-    folder : str
-        Absolute path; ``""`` for none.
+    ``folder``: absolute path; ``""`` for none.
     """
     if not folder:
         return None
@@ -345,10 +325,8 @@ def shown_folder(scene: bpy.types.Scene) -> str:
 def test_computers(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
     """Ask in the background whether the chosen computers can be used.
 
-    Raises
-    ------
-    WrapError
-        The address or a folder cannot be used, or no worker is set up on this computer.
+    Raises WrapError: the address or a folder cannot be used, or no worker is set up on this
+    computer.
     """
     address = scheduler_address(properties_of(scene).computers.dask_address)
     if not address.is_this_computer and not bpy.app.online_access:

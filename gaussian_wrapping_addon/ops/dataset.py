@@ -83,12 +83,9 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
 def rows_of(messages: list[dict[str, Any]], last_words: str = "") -> list[dict[str, str]]:
     """Return the rows for the panel of what the worker wrote.
 
-    Parameters
-    ----------
-    messages : list of dict
-        ``{"finding": {"severity", "message", "hint"}}``, or ``{"error", "hint", "extras"}``.
-    last_words : str
-        The last line of the worker's standard error, shown if there is nothing else.
+    ``messages``: ``{"finding": {"severity", "message", "hint"}}``, or ``{"error", "hint",
+    "extras"}``.
+    ``last_words``: the last line of the worker's standard error, shown if there is nothing else.
     """
     rows = []
     for values in messages:
@@ -131,15 +128,8 @@ def is_checking() -> bool:
 def check_now(scene: bpy.types.Scene, python: str = "") -> None:
     """Check a scene's input and store the findings; blocks Blender.
 
-    Parameters
-    ----------
-    python : str
-        The worker's Python in the preferences, which opens videos.
-
-    Raises
-    ------
-    UsageError
-        No input is chosen.
+    ``python``: the worker's Python in the preferences, which opens videos.
+    Raises UsageError: no input is chosen.
     """
     from ..core.loading.check import check_input
 
@@ -153,17 +143,9 @@ def start_check(
 ) -> None:
     """Begin to check a scene's input.
 
-    Parameters
-    ----------
-    choice : WorkerChoice, optional
-        If there are no errors, request an estimate of the training from this worker.
-    python : str
-        As for :func:`check_now`.
-
-    Raises
-    ------
-    UsageError
-        No input is chosen.
+    ``choice``: if there are no errors, request an estimate of the training from this worker.
+    ``python``: as for :func:`check_now`.
+    Raises UsageError: no input is chosen.
     """
     from ..core.loading.check import Finding, check_input
 

@@ -52,17 +52,11 @@ _UNSAFE = re.compile(r"[^\w.-]+")
 class MaterialCopies:
     """Copies of the materials of one exported mesh; :meth:`remove` takes them out again.
 
-    Parameters
-    ----------
-    stem : str
-        Name of the exported file without its suffix; prefix of the image names.
-    folder : Path
-        Where images are written to.
-    unlit : str
-        What becomes of our unlit materials: ``"keep"`` (glTF has them), ``"emission"`` or
-        ``"lit"``, for formats without unlit materials, which would drop the texture.
-    fold_specular : bool
-        Whether the format describes reflectance by the index of refraction alone.
+    ``stem``: name of the exported file without its suffix; prefix of the image names.
+    ``folder``: where images are written to.
+    ``unlit``: what becomes of our unlit materials: ``"keep"`` (glTF has them), ``"emission"`` or
+    ``"lit"``, for formats without unlit materials, which would drop the texture.
+    ``fold_specular``: whether the format describes reflectance by the index of refraction alone.
     """
 
     def __init__(self, stem: str, folder: Path, *, unlit: str, fold_specular: bool = False) -> None:
@@ -80,10 +74,7 @@ class MaterialCopies:
     def copy_of(self, material: bpy.types.Material) -> bpy.types.Material:
         """Return a copy whose images lie beside the exported file.
 
-        Raises
-        ------
-        UsageError
-            An image is missing, or of a kind that cannot be written as one file.
+        Raises UsageError: an image is missing, or of a kind that cannot be written as one file.
         """
         copy = material.copy()
         self._materials.append((material, copy))
@@ -203,10 +194,7 @@ def _save_as_png(image: bpy.types.Image, path: Path) -> None:
 def pixels_of(image: bpy.types.Image) -> np.ndarray:
     """Return (h, w, 3) uint8 of an sRGB image, the first row on top.
 
-    Raises
-    ------
-    UsageError
-        The image cannot be read.
+    Raises UsageError: the image cannot be read.
     """
     width, height = image.size
     if width * height == 0:
@@ -258,22 +246,10 @@ def export_objects(
 ) -> list[Path]:
     """Write one file for each mesh, its sidecar beside it.
 
-    Parameters
-    ----------
-    frame : Object
-        The parent empty of the result.
-    things : list of Object
-        Meshes and levels of detail of that result.
-
-    Raises
-    ------
-    UsageError
-        Nothing to write, an unknown format, an exporter that is missing or fails, a missing image,
-        or a frame with non-uniform scale.
-    MeshingError
-        A mesh has no faces or values that are not finite; it is not written.
-    ResourceError
-        The folder cannot be written.
+    ``frame``: the parent empty of the result that ``things``, meshes and levels, belong to.
+    Raises UsageError: nothing to write, an unknown format, an exporter that is missing or fails, a
+    missing image, or a frame with non-uniform scale; MeshingError: a mesh has no faces or values
+    that are not finite; it is not written; ResourceError: the folder cannot be written.
     """
     if request.format not in MESH_FORMATS:
         raise UsageError(
@@ -525,25 +501,10 @@ def export_result(
 ) -> list[Path]:
     """Write meshes of a result; the open file is closed without saving.
 
-    Parameters
-    ----------
-    result : Path
-        The result folder.
-    requests : list of ObjectExport
-        One for each format.
-    regions : tuple of str
-        Names; empty for all.
-    levels : bool
-        Whether levels of detail are written too.
-    shading : str
-        ``"unlit"``, or lit.
-
-    Raises
-    ------
-    UsageError
-        Blender has a window, or there is no such region; what :func:`export_objects` raises.
-    DatasetError, ParseError
-        The folder contains no valid result.
+    ``requests``: one for each format. ``regions``: names; empty for all. ``levels``: whether levels
+    of detail are written too. ``shading``: ``"unlit"``, or lit.
+    Raises UsageError: Blender has a window, or there is no such region; what :func:`export_objects`
+    raises; DatasetError, ParseError: the folder contains no valid result.
     """
     start_empty("Exporting a result")
     imported = import_result(result, bpy.context.scene)

@@ -273,10 +273,7 @@ def stop() -> None:
 def _read_preview(folder: Path, known: Stamp | None) -> _Read | None:
     """Return the newest image, cut in two if it is wide; None if there is no new one.
 
-    Raises
-    ------
-    Exception
-        The file cannot be read or contains no image; NumPy raises many types.
+    Raises Exception: the file cannot be read or contains no image; NumPy raises many types.
     """
     stamp = newest_picture(folder)
     if stamp is None or stamp == known or stamp[2] > MAX_BYTES:
@@ -436,12 +433,8 @@ def watch(
 ) -> None:
     """Show a job in a scene and follow it to its end.
 
-    Parameters
-    ----------
-    imports : bool
-        Whether its result is wanted in the scene.
-    target_uid : int, optional
-        Session uid of the object that photos are baked onto.
+    ``imports``: whether its result is wanted in the scene.
+    ``target_uid``: session uid of the object that photos are baked onto.
     """
     addon.remember(folder)
     job = WatchedJob(client, client.poll(), scene.session_uid, imports, target_uid=target_uid)
@@ -452,12 +445,8 @@ def watch(
 def cancel(folder: str) -> None:
     """Request a job to stop; it is killed if it does not.
 
-    A finished job whose result is being read stays finished, and its result is offered.
-
-    Raises
-    ------
-    UsageError
-        No job is watched in this folder.
+    A finished job whose result is being read stays finished, and its result is offered. Raises
+    UsageError: no job is watched in this folder.
     """
     job = jobs.get(key_of(folder))
     if job is None:

@@ -122,10 +122,7 @@ def find_job_folder(stored: str) -> Path | None:
 def attach(scene: bpy.types.Scene, folder: Path) -> JobStatus:
     """Watch the job of a folder; a running one is imported when done.
 
-    Raises
-    ------
-    UsageError
-        The folder contains no job.
+    Raises UsageError: the folder contains no job.
     """
     client = JobClient.attach(folder)
     status = client.poll()
@@ -191,10 +188,7 @@ def after_undo(_scene: object = None, _unused: object = None) -> None:
 def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     """Start the whole pipeline for a scene's photos; return the job folder.
 
-    Raises
-    ------
-    WrapError
-        The source, the output or a setting cannot be used.
+    Raises WrapError: the source, the output or a setting cannot be used.
     """
     properties = properties_of(scene)
     source = source_of(scene)
@@ -215,15 +209,7 @@ def start_mesh(
 ) -> Path:
     """Mesh regions of a finished training, each at its resolution; return the job folder.
 
-    Parameters
-    ----------
-    regions : list of Object
-        Region objects under the frame of one result.
-
-    Raises
-    ------
-    WrapError
-        A region cannot be used, or the job folder contains no finished training.
+    Raises WrapError: a region cannot be used, or the job folder contains no finished training.
     """
     frame = common_frame(regions)
     folder = job_folder_of(frame)
@@ -245,16 +231,7 @@ def start_on_regions(
 ) -> Path:
     """Start a job in the folder of a result that meshes regions; return the folder.
 
-    Parameters
-    ----------
-    regions : list of Object
-        Region objects under the frame of the result.
-    command : str
-        Of the job.
-    source : str
-        Input of the job.
-    settings : JobSettings
-        Those of the regions, of meshing and texture are taken from the scene.
+    Of ``settings``, those of the regions, of meshing and texture are taken from the scene.
     """
     frame = common_frame(regions)
     folder = job_folder_of(frame)
@@ -286,15 +263,8 @@ def start_on_regions(
 def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerChoice) -> Path:
     """Train a finished job further, then mesh and texture it again; return the job folder.
 
-    Parameters
-    ----------
-    frame : Object
-        The frame of the job's result.
-
-    Raises
-    ------
-    WrapError
-        The job folder contains no finished training, or too many iterations are requested.
+    Raises WrapError: the job folder contains no finished training, or too many iterations are
+    requested.
     """
     folder = job_folder_of(frame)
     refuse_running(folder)
@@ -331,10 +301,7 @@ def export_requests(
 ) -> list[str]:
     """Write the files of regions into their job's folder; return their paths.
 
-    Raises
-    ------
-    WrapError
-        A region is linked from a library, or has no body.
+    Raises WrapError: a region is linked from a library, or has no body.
     """
     _refuse_linked(regions)
     requests = []
@@ -400,10 +367,7 @@ def refuse_running(folder: Path) -> None:
 def common_frame(regions: list[bpy.types.Object]) -> bpy.types.Object:
     """Return the common frame of regions.
 
-    Raises
-    ------
-    UsageError
-        There is none, or there are several.
+    Raises UsageError: there is none, or there are several.
     """
     if not regions:
         raise UsageError("No region is selected.", "Select a region box.")

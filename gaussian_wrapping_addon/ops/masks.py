@@ -46,15 +46,7 @@ def start_region_masks(
 
     Cameras are re-used; so are masks that were made of the same regions.
 
-    Parameters
-    ----------
-    regions : list of Object
-        Region objects under the frame of one result.
-
-    Raises
-    ------
-    WrapError
-        A region or a setting cannot be used, or the job folder holds no job.
+    Raises WrapError: a region or a setting cannot be used, or the job folder holds no job.
     """
     folder = job_folder_of(common_frame(regions))
     refuse_running(folder)
@@ -99,14 +91,8 @@ _count = 0
 def begin(folder: Path) -> None:
     """Begin the review of a job's masks with the first photo.
 
-    Raises
-    ------
-    UsageError
-        The job has made no masks.
-    ParseError
-        Its list of masks is damaged.
-    DatasetError
-        A photo or mask cannot be read.
+    Raises UsageError: the job has made no masks; ParseError: its list of masks is damaged;
+    DatasetError: a photo or mask cannot be read.
     """
     global _review
     masks = read_list(folder / FOLDER)
@@ -126,12 +112,8 @@ def step(by: int) -> None:
 def decide(*, accepted: bool) -> None:
     """Accept or reject the photo that is shown, and write that down.
 
-    The list is read again first: the job may have replaced it by other masks.
-
-    Raises
-    ------
-    UsageError
-        Other masks were made meanwhile.
+    The list is read again first: the job may have replaced it by other masks. Raises UsageError:
+    other masks were made meanwhile.
     """
     review = _current()
     photo = review.masks.masks[review.index].photo

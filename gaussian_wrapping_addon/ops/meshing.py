@@ -126,17 +126,9 @@ def start(
 ) -> None:
     """Begin estimates for regions of one result; those of other regions stay.
 
-    Parameters
-    ----------
-    folder : Path
-        The job folder of the finished training.
-    python : str
-        From the preferences.
-
-    Raises
-    ------
-    WrapError
-        A region, its resolution or the interpreter cannot be used; no estimate is started.
+    ``folder``: the job folder of the finished training. ``python``: from the preferences.
+    Raises WrapError: a region, its resolution or the interpreter cannot be used; no estimate is
+    started.
     """
     interpreter = worker_python(python)
     requests = [_request(scene, region, folder, interpreter) for region in regions]

@@ -25,13 +25,7 @@ from .addon import properties_of, tr
 
 
 def source_of(scene: bpy.types.Scene) -> Path:
-    """Return the photo folder of a scene.
-
-    Raises
-    ------
-    UsageError
-        None is chosen.
-    """
+    """Return the photo folder of a scene. Raises UsageError: none is chosen."""
     if not properties_of(scene).source:
         raise UsageError("No photo folder is chosen.", "Choose one in Dataset.")
     return real_path(bpy.path.abspath(properties_of(scene).source))
@@ -40,10 +34,7 @@ def source_of(scene: bpy.types.Scene) -> Path:
 def output_of(scene: bpy.types.Scene, source: Path) -> Path:
     """Return the job folder for a source: the one chosen, or a sibling of the source.
 
-    Raises
-    ------
-    UsageError
-        It lies inside the photo folder, which is never written to.
+    Raises UsageError: it lies inside the photo folder, which is never written to.
     """
     text = "" if _is_of_other_photos(scene, source) else properties_of(scene).output
     if source.suffix.lower() == ".ply" or (is_video_path(source) and not source.is_dir()):
@@ -83,10 +74,7 @@ def _is_of_other_photos(scene: bpy.types.Scene, source: Path) -> bool:
 def job_folder_of(frame: bpy.types.Object) -> Path:
     """Return the job folder of a result's frame.
 
-    Raises
-    ------
-    UsageError
-        It has been moved or deleted.
+    Raises UsageError: it has been moved or deleted.
     """
     folder = real_path(addon.result_folder(frame)).parent
     if not JobFolder(folder).is_job():
@@ -124,10 +112,7 @@ def chosen_values(
 
     Numbers left to the preset are omitted.
 
-    Parameters
-    ----------
-    properties : bpy.types.PropertyGroup
-        ``Scene.gwrap``.
+    ``properties``: ``Scene.gwrap``.
     """
     values = {}
     for declared in settings:
@@ -148,12 +133,8 @@ def _stored(declared: Declaration, properties: bpy.types.PropertyGroup) -> Any:
 def job_settings(scene: bpy.types.Scene, threads: int, device: str = "auto") -> JobSettings:
     """Return the job settings of a scene's panels: the preset, then the choices.
 
-    Meshing settings are omitted: a job that trains uses their defaults.
-
-    Raises
-    ------
-    UsageError
-        The splat to start from or the control points do not exist, or the markers are none.
+    Meshing settings are omitted: a job that trains uses their defaults. Raises UsageError: the
+    splat to start from or the control points do not exist, or the markers are none.
     """
     settings = [declared for declared in settings_of_scene() if declared.group != "meshing"]
     values = chosen_values(properties_of(scene), settings)
@@ -177,11 +158,8 @@ def job_settings(scene: bpy.types.Scene, threads: int, device: str = "auto") -> 
 def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
     """Return the settings, by path, that say where the parts of a job run.
 
-    Raises
-    ------
-    UsageError
-        The address of the Dask scheduler is none, or not encrypted; the folder of the certificates
-        is on another computer.
+    Raises UsageError: the address of the Dask scheduler is none, or not encrypted; the folder of
+    the certificates is on another computer.
     """
     properties = properties_of(scene)
     choices, processes = properties.computers, properties.processes
@@ -199,10 +177,7 @@ def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
 def certificates_of(scene: bpy.types.Scene) -> str:
     """Return the folder of the farm's certificates; ``""`` leaves it to the environment.
 
-    Raises
-    ------
-    UsageError
-        It is on another computer.
+    Raises UsageError: it is on another computer.
     """
     stored = properties_of(scene).computers.certificates
     return str(_local(stored, "folder of certificates")) if stored else ""
@@ -211,10 +186,7 @@ def certificates_of(scene: bpy.types.Scene) -> str:
 def meshing_choices(scene: bpy.types.Scene, world_per_blender: float) -> dict[str, Any]:
     """Return the meshing settings, by path, of a scene's panels.
 
-    Parameters
-    ----------
-    world_per_blender : float
-        World units of the input per unit of length in Blender.
+    ``world_per_blender``: world units of the input per unit of length in Blender.
     """
     settings = [declared for declared in settings_of_scene() if declared.group == "meshing"]
     values = chosen_values(properties_of(scene), settings)

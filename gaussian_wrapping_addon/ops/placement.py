@@ -45,11 +45,8 @@ _FLIP_YZ = np.array([1.0, -1.0, -1.0])
 def camera_poses(frame: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     """Return the poses of a result's photo cameras in Blender's world.
 
-    Returns
-    -------
-    rotations : (n, 3, 3) float64
-        ``cam_from_world``: x right, y down, z forward.
-    centers : (n, 3) float64
+    Returns ``rotations``, (n, 3, 3) float64: ``cam_from_world``: x right, y down, z forward;
+    ``centers``, (n, 3) float64.
     """
     rotations, centers = [], []
     for camera in cameras_under(frame):
@@ -63,13 +60,9 @@ def camera_poses(frame: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
 def automatic_plane(frame: bpy.types.Object) -> tuple[Plane, str]:
     """Find the ground of a result; return the plane and the rule used.
 
-    Up comes from the cameras. The ground is the main level plane of the meshes; if none is
-    clear, it passes through their lowest point; without meshes, through the regions' lowest corner.
-
-    Raises
-    ------
-    UsageError
-        The cameras do not determine up, or nothing determines the ground.
+    Up comes from the cameras. The ground is the main level plane of the meshes; if none is clear,
+    it passes through their lowest point; without meshes, through the regions' lowest corner. Raises
+    UsageError: the cameras do not determine up, or nothing determines the ground.
     """
     up, rule = camera_up(*camera_poses(frame))
     meshes = [c for c in frame.children if addon.kind_of(c) == "mesh" and c.type == "MESH"]
@@ -128,15 +121,8 @@ def picked_points(context: bpy.types.Context, frame: bpy.types.Object) -> np.nda
     In Edit Mode the selected vertices of its meshes, else the selected empties; one without
     a parent becomes a child of the frame in place, so that it moves along.
 
-    Returns
-    -------
-    points : (n, 3) float64
-        Blender's world.
-
-    Raises
-    ------
-    UsageError
-        A mesh in Edit Mode, or an empty, belongs to something else.
+    Returns ``points``, (n, 3) float64: Blender's world.
+    Raises UsageError: a mesh in Edit Mode, or an empty, belongs to something else.
     """
     if context.mode == "EDIT_MESH":
         found = [_selected_vertices(thing, frame) for thing in context.objects_in_mode]
@@ -225,10 +211,7 @@ _written: dict[Path, tuple[str, str]] = {}
 def placement_of(frame: bpy.types.Object) -> Similarity:
     """Return ``blender_from_scene``: in double if it was set so, else Blender's matrix.
 
-    Raises
-    ------
-    UsageError
-        The empty is scaled differently along its axes, mirrored or has no size.
+    Raises UsageError: the empty is scaled differently along its axes, mirrored or has no size.
     """
     matrix = matrix_of(frame)
     stored = _stored(frame)
@@ -249,15 +232,8 @@ def place(frame: bpy.types.Object, placement: Similarity) -> str:
     Nothing but the empty is moved; clipping and frustum size of the photo cameras follow its
     scale, since Blender does not let them.
 
-    Returns
-    -------
-    note : str
-        Why the placement could not be saved beside the result; ``""`` if it was.
-
-    Raises
-    ------
-    UsageError
-        The scale is out of range, or something else holds the empty in place.
+    Returns ``note``: why the placement could not be saved beside the result; ``""`` if it was.
+    Raises UsageError: the scale is out of range, or something else holds the empty in place.
     """
     check_scale(placement)
     before = frame.matrix_basis.copy()

@@ -42,10 +42,7 @@ def shown_name(name: str) -> str:
 def save_preset(scene: bpy.types.Scene, wanted: str) -> str:
     """Save the settings of a scene's panels; return the preset's name.
 
-    Raises
-    ------
-    UsageError
-        The name is empty, there are too many, or the file cannot be written.
+    Raises UsageError: the name is empty, there are too many, or the file cannot be written.
     """
     if not wanted.strip():
         raise UsageError("The preset has no name.", "Type one.")
@@ -76,10 +73,8 @@ def save_preset(scene: bpy.types.Scene, wanted: str) -> str:
 def apply_preset(scene: bpy.types.Scene, name: str) -> tuple[str, ...]:
     """Give a scene's panels the settings of a preset; return notes on what was left out.
 
-    Raises
-    ------
-    UsageError, ParseError
-        There is no such preset, or its file cannot be used. Nothing was changed.
+    Raises UsageError, ParseError: there is no such preset, or its file cannot be used. Nothing was
+    changed.
     """
     path = _existing(name)
     try:
@@ -109,10 +104,7 @@ def apply_preset(scene: bpy.types.Scene, name: str) -> tuple[str, ...]:
 def delete_preset(name: str) -> None:
     """Delete the file of a preset.
 
-    Raises
-    ------
-    UsageError
-        There is no such preset, or it cannot be deleted.
+    Raises UsageError: there is no such preset, or it cannot be deleted.
     """
     path = _existing(name)
     try:

@@ -56,10 +56,8 @@ def edge_length_in_blender(scene: bpy.types.Scene, region: bpy.types.Object) -> 
 def checked_edge_length(scene: bpy.types.Scene, region: bpy.types.Object) -> float:
     """Return :func:`edge_length_in_blender`, checked against the region's size.
 
-    Raises
-    ------
-    UsageError
-        The region encloses no volume, or the length is no positive number, too long or too short.
+    Raises UsageError: the region encloses no volume, or the length is no positive number, too long
+    or too short.
     """
     edge_length = edge_length_in_blender(scene, region)
     diagonal = float(np.linalg.norm(np.ptp(hull_in_blender(region)[0], 0)))
@@ -96,10 +94,7 @@ def own_lengths(
 ) -> list[float | None]:
     """Return each region's own edge length in world units, None if it has none.
 
-    Raises
-    ------
-    UsageError
-        A region or its edge length cannot be used.
+    Raises UsageError: a region or its edge length cannot be used.
     """
     lengths = [checked_edge_length(scene, region) for region in regions]
     scale = world_per_blender(frame)

@@ -93,20 +93,12 @@ class ReportData:
 def figures_of_report(report: Any) -> dict[str, Any]:
     """Select the figures that the panel shows; those missing from the report are omitted.
 
-    Parameters
-    ----------
-    report : any
-        Content of ``report.json``, of any version.
-
-    Returns
-    -------
-    dict
-        ``seconds``, ``gaussians``, ``psnr`` (held-out photos, dB), ``psnr_count``,
-        ``memory_bytes``, ``device``, ``device_reason``, ``stages`` (pairs of name and seconds),
-        ``decisions`` (name, choice and setting), ``warnings`` (texts), and
-        ``regions``: for each name ``faces``, ``vertices``, ``closed``, ``coverage``,
-        ``mesh_psnr`` (dB, where the mesh covers the photos), ``uncovered`` (share of the photos)
-        and ``whole_psnr`` (dB, uncovered pixels black).
+    ``report``: content of ``report.json``, of any version.
+    Returns dict: ``seconds``, ``gaussians``, ``psnr`` (held-out photos, dB), ``psnr_count``,
+    ``memory_bytes``, ``device``, ``device_reason``, ``stages`` (pairs of name and seconds),
+    ``decisions`` (name, choice and setting), ``warnings`` (texts), and ``regions``: for each name
+    ``faces``, ``vertices``, ``closed``, ``coverage``, ``mesh_psnr`` (dB, where the mesh covers the
+    photos), ``uncovered`` (share of the photos) and ``whole_psnr`` (dB, uncovered pixels black).
     """
     if not isinstance(report, dict) or not report:
         return {}
@@ -167,10 +159,7 @@ def _measured(**values: Any) -> dict[str, Any]:
 def report_of(text: str) -> ReportData:
     """Parse the figures stored in a .blend for the panel; any text is accepted.
 
-    Parameters
-    ----------
-    text : str
-        JSON text of :func:`figures_of_report`; parsed once, as panels draw often.
+    ``text``: JSON text of :func:`figures_of_report`; parsed once, as panels draw often.
     """
     try:
         figures = json.loads(text)

@@ -96,12 +96,8 @@ class ResultFiles:
 def read_result(folder: Path) -> ResultFiles:
     """Read and check ``DIR/result`` (docs/architecture.md, "Result folder").
 
-    Raises
-    ------
-    DatasetError
-        The folder is not a result folder, contains no region, or holds links.
-    ParseError
-        A file is invalid; names file and position.
+    Raises DatasetError: the folder is not a result folder, contains no region, or holds links;
+    ParseError: a file is invalid; names file and position.
     """
     folder = real_path(folder)
     scene_path = folder / "scene.json"
@@ -221,20 +217,9 @@ def read_mesh_arrays(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
     """Read and check ``mesh.npz``.
 
-    Parameters
-    ----------
-    path : Path
-    repair : bool
-        Whether broken faces are left out.
-
-    Returns
-    -------
-    vertices, faces, corner_uvs, face_atlas
-
-    Raises
-    ------
-    ParseError
-        The file is invalid; names the position.
+    ``repair``: whether broken faces are left out.
+    Returns vertices, faces, corner_uvs, face_atlas.
+    Raises ParseError: the file is invalid; names the position.
     """
     hint = "Mesh the region again."
     try:
@@ -277,10 +262,7 @@ def read_mesh_arrays(
 def sound_faces(faces: np.ndarray) -> np.ndarray:
     """Return (f,) bool: three different corners, and no earlier face of the same three.
 
-    Parameters
-    ----------
-    faces : (f, 3) ndarray of int
-        Indices within range.
+    ``faces``: (f, 3) ndarray of int. Indices within range.
     """
     corners = np.sort(faces.astype(np.int64), axis=1)  # (f, 3)
     a, b, c = corners.T

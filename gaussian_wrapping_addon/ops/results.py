@@ -25,10 +25,8 @@ _PICTURES = ("preview.png", "report/held-out-*.jpg", "*/comparison-*.jpg")
 def _result_folder(context: bpy.types.Context) -> Path:
     """Return the result folder of the scene if its files may be opened.
 
-    Raises
-    ------
-    UsageError
-        There is none, or it is known from the open file alone, which may come from elsewhere.
+    Raises UsageError: there is none, or it is known from the open file alone, which may come from
+    elsewhere.
     """
     frame = addon.current_frame(context.scene, context.view_layer.objects.active)
     if frame is None:

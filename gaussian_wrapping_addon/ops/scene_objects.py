@@ -96,10 +96,8 @@ def create_materials(
 ) -> list[bpy.types.Material]:
     """Create a material for each atlas: ``name``, then ``name 2`` and on.
 
-    Parameters
-    ----------
-    albedo, normal_map, occlusion : sequence of Path
-        Images, one for each atlas; the last two may be empty.
+    ``albedo``, ``normal_map``, ``occlusion``: images, one for each atlas; the last two may be
+    empty.
     """
     normals = load_data_maps(normal_map, len(albedo))
     dark = load_data_maps(occlusion, len(albedo))
@@ -278,15 +276,9 @@ def update_levels(
     Levels are replaced when the region's mesh has changed: they are made from it. The region's own
     object is level 0; it moves into the levels' collection, unless the user has put it elsewhere.
 
-    Parameters
-    ----------
-    region : RegionResult
-    mesh : Object
-        The region's mesh object, up to date; its parent is that of the levels.
-    levels : list of Object
-        All levels of the result; those of other regions are left alone.
-    collection : Collection
-        The result's collection, parent of that of the levels.
+    ``mesh``: the region's mesh object, up to date; its parent is that of the levels.
+    ``levels``: all levels of the result; those of other regions are left alone.
+    ``collection``: the result's collection, parent of that of the levels.
     """
     old = [t for t in levels if t.get(addon.REGION) == region.name]
     if old and all(c.get(addon.STAMP) == region.stamp for c in old):
@@ -368,21 +360,11 @@ def import_result(
     what is missing is added, and everything else, such as the transforms, modifiers and materials
     of the user, stays.
 
-    Parameters
-    ----------
-    folder : Path
-        ``DIR/result`` (docs/architecture.md).
-    scene : Scene
-        Where new objects are linked.
-    files : ResultFiles, optional
-        The content of the folder if it has been read already.
-
-    Raises
-    ------
-    DatasetError, ParseError
-        The folder contains no valid result; nothing has been changed.
-    UsageError
-        A mesh that has changed is in Edit Mode in another scene; nothing has been changed.
+    ``folder``: ``DIR/result`` (docs/architecture.md).
+    ``scene``: where new objects are linked.
+    ``files``: the content of the folder if it has been read already.
+    Raises DatasetError, ParseError: the folder contains no valid result; nothing has been changed;
+    UsageError: a mesh that has changed is in Edit Mode in another scene; nothing has been changed.
     """
     files = files or read_result(folder)
     frame = _find_frame(files, scene)
@@ -593,15 +575,9 @@ def _update_cameras(
 def write_blend(result_folder: Path, path: Path) -> None:
     """Write a .blend file of a result; images stay beside it, with relative paths.
 
-    The file that is open in this Blender is closed without saving, so this is for
-    background Blender only.
-
-    Raises
-    ------
-    UsageError
-        Blender has a window, or the file cannot be written.
-    DatasetError, ParseError
-        The folder contains no valid result.
+    The file that is open in this Blender is closed without saving, so this is for background
+    Blender only. Raises UsageError: Blender has a window, or the file cannot be written;
+    DatasetError, ParseError: the folder contains no valid result.
     """
     path = path.resolve()
     start_empty("Writing a .blend file of a result")
@@ -636,10 +612,6 @@ def export_usd(result_folder: Path) -> list[Path]:
 
     Closes the open file, as :func:`write_blend` does.
 
-    Returns
-    -------
-    paths : list of Path
-        The files written.
     """
     start_empty("Writing USD")
     imported = import_result(result_folder, bpy.context.scene)

@@ -76,10 +76,7 @@ def forget() -> None:
 def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
     """Start an estimate for a scene's photos and settings.
 
-    Raises
-    ------
-    WrapError
-        The source, a choice or the interpreter cannot be used.
+    Raises WrapError: the source, a choice or the interpreter cannot be used.
     """
     job = make_job("wrap", source_of(scene), job_settings(scene, choice.threads, choice.device))
     command = child_command(
@@ -103,18 +100,11 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
 def estimate_of(messages: list[dict[str, Any]], last_words: str = "") -> Estimate:
     """Convert the child's output into lines for the panel.
 
-    Parameters
-    ----------
-    messages : list of dict
-        ``{"line": text}`` for each line and ``{"warning": text}`` for each warning, or
-        ``{"error": text, "hint": text}``.
-    last_words : str
-        The last line of the child's standard error, reported if there is no other output.
-
-    Raises
-    ------
-    WorkerError
-        There is no output.
+    ``messages``: ``{"line": text}`` for each line and ``{"warning": text}`` for each warning, or
+    ``{"error": text, "hint": text}``.
+    ``last_words``: the last line of the child's standard error, reported if there is no other
+    output.
+    Raises WorkerError: there is no output.
     """
     for values in messages:
         if values.get("error"):

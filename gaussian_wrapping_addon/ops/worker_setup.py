@@ -245,10 +245,7 @@ def request_for(
 ) -> SetupRequest:
     """Return the request of a set-up with these choices, or of adding extras to the present one.
 
-    Raises
-    ------
-    UsageError
-        The add-on's list of packages is missing.
+    Raises UsageError: the add-on's list of packages is missing.
     """
     folder = bpy.path.abspath(wheel_folder) if wheel_folder else ""
     root, requirements = str(environment().root), str(requirements_file())
@@ -259,10 +256,7 @@ def request_for(
 def lines_that_add(extra: str, wheel_folder: str) -> list[str]:
     """Return the commands that add an extra to the present environment; starts no process.
 
-    Raises
-    ------
-    UsageError
-        There is no environment to add to.
+    Raises UsageError: there is no environment to add to.
     """
     path = str(environment().marker().get("python", ""))
     unknown = FoundPython(path, (*OLDEST, 0))
@@ -272,13 +266,7 @@ def lines_that_add(extra: str, wheel_folder: str) -> list[str]:
 
 
 def start_setup(request: SetupRequest, *, removes: bool = False) -> None:
-    """Start a set-up or a removal.
-
-    Raises
-    ------
-    UsageError
-        One is running.
-    """
+    """Start a set-up or a removal. Raises UsageError: one is running."""
     if state.task is not None and state.task.status.active:
         raise UsageError("A set-up is running.", "Cancel it or wait for it.")
     state.task, state.is_busy = SetupTask(request, removes=removes), True
@@ -368,10 +356,7 @@ def command_lines(
 ) -> list[str]:
     """Return the commands that a set-up with these choices runs.
 
-    Raises
-    ------
-    UsageError
-        The Python or the choice cannot be used.
+    Raises UsageError: the Python or the choice cannot be used.
     """
     request = request_for(path, torch, wheel_folder(context), extras)
     found = [p for p in state.pythons or () if p.path == path]

@@ -54,12 +54,9 @@ Row = tuple[str, str]
 def live_rows(status: JobStatus) -> tuple[Row, ...]:
     """Return the rows that the panel shows of a running training; none in other stages.
 
-    Parameters
-    ----------
-    status : JobStatus
-        With ``figures``: ``iteration``, ``iterations`` (of the whole plan), ``gaussians``,
-        ``held_out_psnr`` (dB), ``psnr`` (dB, of the photos being trained),
-        ``iterations_per_s``. What is missing has no row.
+    ``status``: with ``figures``: ``iteration``, ``iterations`` (of the whole plan), ``gaussians``,
+    ``held_out_psnr`` (dB), ``psnr`` (dB, of the photos being trained), ``iterations_per_s``. What
+    is missing has no row.
     """
     figures = part({"live": status.figures}, "live")
     if not status.active or measured(figures.get("iteration")) is None:

@@ -180,10 +180,7 @@ _Group = TypeVar("_Group", bound=type)
 def property_of(declared: Declaration, **changes: Any) -> Any:
     """Return the property of a setting, for a class's annotations.
 
-    Parameters
-    ----------
-    changes : dict
-        Keywords of Blender's property that differ from the declaration.
+    ``changes``: keywords of Blender's property that differ from the declaration.
     """
     panel = declared.panel
     assert panel is not None
@@ -247,10 +244,7 @@ def settings_in(panel_name: PanelName) -> list[Declaration]:
 def draw_settings(layout: Any, properties: Any, settings: Iterable[Declaration]) -> None:
     """Draw a row for each setting that applies to the current choices.
 
-    Parameters
-    ----------
-    properties : bpy.types.PropertyGroup
-        ``Scene.gwrap``.
+    ``properties``: ``Scene.gwrap``.
     """
     for declared in settings:
         panel = declared.panel
@@ -273,14 +267,9 @@ _logger = logging.getLogger(__name__)
 class ViewDrawing:
     """What draws into each 3D view with shown overlays.
 
-    Parameters
-    ----------
-    what : str
-        What is drawn, for the log.
-    draw : callable
-        Draws into the view of a context.
-    forget : callable
-        Gives up shaders and batches; they are made again next time.
+    ``what``: what is drawn, for the log.
+    ``draw``: draws into the view of a context.
+    ``forget``: gives up shaders and batches; they are made again next time.
     """
 
     def __init__(
