@@ -154,15 +154,18 @@ def frame_of(thing: bpy.types.Object | None) -> bpy.types.Object | None:
     return None
 
 
-def current_frame(
-    scene: bpy.types.Scene, active: bpy.types.Object | None
-) -> bpy.types.Object | None:
+def current_frame(context: bpy.types.Context) -> bpy.types.Object | None:
     """Return the frame of the active object, or else the scene's newest one, or None."""
-    frame = frame_of(active)
-    if frame is not None:
-        return frame
-    frames = list(objects_of_kind(scene, "frame"))
-    return frames[-1] if frames else None
+    frames = list(objects_of_kind(context.scene, "frame"))
+    return frame_of(context.view_layer.objects.active) or (frames[-1] if frames else None)
+
+
+def needed_frame(context: bpy.types.Context) -> bpy.types.Object:
+    """Return :func:`current_frame`. Raises UsageError: there is none."""
+    frame = current_frame(context)
+    if frame is None:
+        raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
+    return frame
 
 
 def result_folder(frame: bpy.types.Object) -> Path:
@@ -207,7 +210,19 @@ _logger = logging.getLogger(__name__)
 
 
 class ReportsErrors(_Operator):
-    """Mixin: ``execute`` calls ``work`` and reports what it raises."""
+    """Mixin: ``poll`` asks ``why_not``; ``execute`` calls ``work`` and reports what it raises."""
+
+    @classmethod
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        """Return why the operator cannot run now, and the next step; ``""`` if it can."""
+        return ""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run; Blender calls this."""
+        reason = cls.why_not(context)
+        cls.poll_message_set(reason)
+        return not reason
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
         """Perform the operation."""
@@ -230,24 +245,18 @@ class NeedsObjectMode(ReportsErrors):
     """Mixin: the operator is available in Object Mode only."""
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run; Blender calls this."""
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Change to Object Mode first")
-            return False
-        return True
+    def why_not(cls, context: bpy.types.Context) -> str:
+        return "" if context.mode == "OBJECT" else "Change to Object Mode first"
 
 
-class NeedsResult(_Operator):
+class NeedsResult(ReportsErrors):
     """Mixin: the operator acts on the scene's current result."""
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run; Blender calls this."""
-        if current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("The scene has no result; wrap it, or import one")
-            return False
-        return True
+    def why_not(cls, context: bpy.types.Context) -> str:
+        if current_frame(context) is None:
+            return "The scene has no result; wrap it, or import one"
+        return super().why_not(context)
 
 
 # -- Job folders used on this machine, so that a .blend from elsewhere opens none -----------------

@@ -10,7 +10,6 @@ from typing import Final
 import bpy
 
 from ..core.errors import UsageError, unwritable_error
-from ..core.jobs.client import JobClient, worker_python
 from ..core.jobs.store.job_file import BakeRequest, make_bake_job
 from ..core.jobs.store.job_folder import JobFolder
 from ..core.jobs.store.rollback import finished_job, no_finished_training
@@ -18,12 +17,12 @@ from ..core.jobs.store.stage_folder import read_done
 from ..core.mesh.exchange import FileMesh, write_handed_over
 from ..core.names import file_stem
 from ..core.settings import TextureSettings
-from . import addon, job_timer, worker_setup
+from . import addon
 from .addon import OperatorResult, properties_of, waiting
 from .bake_objects import SUFFIXES, Triangulation, quads_of, triangulation_of, world_mesh
-from .jobs import ConfirmsFolder, has_worker, no_job_runs
+from .jobs import ConfirmsFolder, launch, refuse_running, why_no_start
 from .panel_settings import job_folder_of, texture_choices
-from .worker_setup import WorkerChoice
+from .worker_setup import WorkerChoice, worker_choice
 
 # -- Start a bake: hand a mesh of the scene over to the worker ------------------------------------
 
@@ -54,8 +53,7 @@ def start_bake(
     training.
     """
     folder = JobFolder(job_folder_of(frame))
-    if job_timer.is_running(str(folder.root)):
-        raise UsageError(f"A job is running in {folder.root}.", "Cancel it or wait for it.")
+    refuse_running(folder.root)
     earlier = finished_job(folder)
     if not any(read_done(path) for path in folder.stages.glob("train-*")):
         raise no_finished_training(folder.root)
@@ -86,13 +84,9 @@ def start_bake(
     )
     job = make_bake_job(earlier, request)
     job = replace(job, settings=replace(job.settings, threads=choice.threads))
-    client = JobClient.start(
-        folder.root, job, python=worker_python(choice.python), keep_running=choice.keep_running
-    )
+    launch(scene, folder.root, job, choice, "BAKE", thing.session_uid)
     if keeps:
         thing[addon.BAKE] = name
-    properties_of(scene).job_command = "BAKE"
-    job_timer.watch(scene, folder.root, client, target_uid=thing.session_uid)
     return folder.root
 
 
@@ -169,29 +163,22 @@ class GWRAP_OT_bake_photos(ConfirmsFolder, bpy.types.Operator):
     )
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("Needs a finished job: press Wrap Scene or Import Result first")
-            return False
+    def why_not(cls, context: bpy.types.Context) -> str:
+        if addon.current_frame(context) is None:
+            return "Needs a finished job: press Wrap Scene or Import Result first"
         if context.mode != "OBJECT":
-            cls.poll_message_set("Change to Object Mode first")
-            return False
+            return "Change to Object Mode first"
         if bake_target(context) is None:
-            cls.poll_message_set("Select a mesh to bake the photos onto")
-            return False
-        return has_worker(cls) and no_job_runs(cls, context)
-
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-        return addon.result_folder(frame).parent if frame and frame.get(addon.RESULT) else None
+            return "Select a mesh to bake the photos onto"
+        return why_no_start(context)
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         thing = bake_target(context)
         if frame is None or thing is None:
             raise UsageError("No mesh is selected.", "Select a mesh, and wrap the scene before.")
         with waiting(context):
-            start_bake(context.scene, frame, thing, worker_setup.worker_choice(context))
+            start_bake(context.scene, frame, thing, worker_choice(context))
         self.report({"INFO"}, f"Baking photos onto {thing.name}")
         return {"FINISHED"}
 

@@ -14,7 +14,7 @@ from ..core.errors import DatasetError, UsageError
 from ..core.files import real_path, resolve_inside
 from ..core.scene.camera import Camera
 from . import addon
-from .addon import NeedsResult, OperatorResult, ReportsErrors
+from .addon import NeedsResult, OperatorResult
 
 # -- Pinhole cameras as Blender cameras with the same projection ----------------------------------
 
@@ -164,7 +164,7 @@ def show_photo(thing: bpy.types.Object) -> None:
 # -- Look through the photo cameras, one after another, with their photos behind the mesh ---------
 
 
-class GWRAP_OT_view_photo(NeedsResult, ReportsErrors, bpy.types.Operator):
+class GWRAP_OT_view_photo(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.view_photo"
     bl_label = "Look Through Camera"
     bl_description = (
@@ -195,7 +195,7 @@ class GWRAP_OT_view_photo(NeedsResult, ReportsErrors, bpy.types.Operator):
 
     def _camera(self, context: bpy.types.Context) -> tuple[bpy.types.Object, bpy.types.Object]:
         active = context.view_layer.objects.active
-        frame = addon.current_frame(context.scene, active)
+        frame = addon.current_frame(context)
         cameras = cameras_under(frame) if frame is not None else []
         if frame is None or not cameras:
             raise UsageError("The result has no photo cameras.", "Import the result again.")

@@ -345,14 +345,10 @@ class GWRAP_OT_test_computers(ReportsErrors, bpy.types.Operator):
     bl_description = "Ask in the background whether these computers can run jobs"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if properties_of(context.scene).computers.kind == "THIS":
-            cls.poll_message_set("Choose Dask to test an address")
-            return False
-        if is_busy():
-            cls.poll_message_set("A request is running; it takes seconds")
-            return False
-        return True
+            return "Choose Dask to test an address"
+        return "A request is running; it takes seconds" if is_busy() else ""
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
         test_computers(context.scene, worker_choice(context))

@@ -19,7 +19,7 @@ from ..core.worker.helper_process import child_command
 from . import addon, background, job_timer, panel_settings, training, worker_setup
 from .addon import OperatorResult, ReportsErrors, properties_of, redraw, tr
 from .background import Child, Lane
-from .jobs import no_job_runs
+from .jobs import why_busy
 from .panel_settings import source_of
 from .worker_setup import WorkerChoice, worker_choice
 
@@ -237,8 +237,8 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
     )
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return no_job_runs(cls, context)
+    def why_not(cls, context: bpy.types.Context) -> str:
+        return why_busy(context)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         source = properties_of(context.scene).source
@@ -279,14 +279,10 @@ class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
     bl_description = "Check the photos and camera poses and list problems"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if not properties_of(context.scene).source:
-            cls.poll_message_set("Choose the folder of the photos first")
-            return False
-        if is_checking():
-            cls.poll_message_set("The check is running; it takes seconds")
-            return False
-        return True
+            return "Choose the folder of the photos first"
+        return "The check is running; it takes seconds" if is_checking() else ""
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         """Check in a thread: Blender must not wait for a slow disk."""

@@ -26,7 +26,7 @@ from ..core.texture.file_checks import (
     write_mesh_ply,
 )
 from . import addon
-from .addon import NeedsObjectMode, NeedsResult, OperatorResult, ReportsErrors
+from .addon import NeedsObjectMode, NeedsResult, OperatorResult
 from .mesh_data import mesh_of, values_of
 from .placement import placement_of
 from .region_objects import matrix_of
@@ -530,7 +530,7 @@ def export_result(
 # -- Operators that export meshes and pack textures -----------------------------------------------
 
 
-class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
+class GWRAP_OT_export_meshes(NeedsResult, NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.export_meshes"
     bl_label = "Export Meshes"
     bl_description = "Export meshes of a result to other programs, one file and sidecar each"
@@ -564,12 +564,6 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
         name="Pack Textures", description="Put the textures into the file"
     )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run; Blender calls this."""
-        needs_result: Any = NeedsResult.poll
-        return bool(needs_result.__func__(cls, context)) and super().poll(context)
-
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         if not chosen_meshes(context):
             self.scope = "ALL"
@@ -591,7 +585,7 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
     def work(self, context: bpy.types.Context) -> OperatorResult:
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose the folder of the exported files.")
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if self.scope == "SELECTED":
             chosen = chosen_meshes(context)
             if not chosen:
@@ -614,7 +608,7 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_pack_images(NeedsResult, ReportsErrors, bpy.types.Operator):
+class GWRAP_OT_pack_images(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.pack_images"
     bl_label = "Pack Textures"
     bl_description = "Pack the result's textures into the .blend file, or unpack them to files"
@@ -623,7 +617,7 @@ class GWRAP_OT_pack_images(NeedsResult, ReportsErrors, bpy.types.Operator):
     pack: BoolProperty(name="Pack", default=True)  # type: ignore[valid-type]
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         count = 0
         for image in images_of(frame):
             if self.pack and image.packed_file is None:

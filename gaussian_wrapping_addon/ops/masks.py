@@ -15,19 +15,19 @@ from ..core.jobs.store.job_folder import JobFolder
 from ..core.jobs.store.rollback import finished_job
 from ..core.masks.mask_folder import FOLDER, MadeMask, MaskList, read_list, write_list
 from ..core.settings import with_values
-from . import addon, worker_setup
-from .addon import OperatorResult, ReportsErrors, properties_of
+from . import addon
+from .addon import OperatorResult, ReportsErrors
 from .jobs import (
-    ConfirmsFolder,
+    OnRegions,
+    OnSceneJob,
     common_frame,
-    has_worker,
-    no_job_runs,
     refuse_running,
     selected_regions,
     start_on_regions,
+    why_no_start,
 )
 from .panel_settings import job_folder_of, job_settings
-from .worker_setup import WorkerChoice
+from .worker_setup import WorkerChoice, worker_choice
 
 # -- Start a job that masks the photos to what stands in regions, and trains anew -----------------
 
@@ -252,7 +252,7 @@ def _put_into_image(picture: np.ndarray) -> None:
 # -- Operators of masks: make them of a region, review, accept and reject them --------------------
 
 
-class GWRAP_OT_masks_from_region(ConfirmsFolder, bpy.types.Operator):
+class GWRAP_OT_masks_from_region(OnRegions, bpy.types.Operator):
     bl_idname = "gwrap.masks_from_region"
     bl_label = "Masks from Region"
     bl_description = (
@@ -261,45 +261,25 @@ class GWRAP_OT_masks_from_region(ConfirmsFolder, bpy.types.Operator):
     )
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if not selected_regions(context):
-            cls.poll_message_set("Select a region box around the object")
-            return False
-        return has_worker(cls) and no_job_runs(cls, context)
-
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        regions = selected_regions(context)
-        frame = addon.frame_of(regions[0]) if regions else None
-        return addon.result_folder(frame).parent if frame and frame.get(addon.RESULT) else None
+            return "Select a region box around the object"
+        return why_no_start(context)
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        regions = selected_regions(context)
-        choice = worker_setup.worker_choice(context)
-        start_region_masks(context.scene, regions, choice)
+        regions = self.regions(context)
+        start_region_masks(context.scene, regions, worker_choice(context))
         self.report({"INFO"}, f"Masking to {', '.join(r.name for r in regions)}")
         return {"FINISHED"}
 
 
-class GWRAP_OT_review_masks(ConfirmsFolder, bpy.types.Operator):
+class GWRAP_OT_review_masks(OnSceneJob, bpy.types.Operator):
     bl_idname = "gwrap.review_masks"
     bl_label = "Review Masks"
     bl_description = "Show each photo of the job with its mask, here and in an open Image Editor"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not properties_of(context.scene).job_folder:
-            cls.poll_message_set("This scene has no job; press Wrap Scene, or find its folder")
-            return False
-        return True
-
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        return Path(bpy.path.abspath(properties_of(context.scene).job_folder))
-
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        folder = self.folder(context)
-        if folder is None:
-            raise UsageError("This scene has no job.", "Wrap the scene first.")
-        begin(folder)
+        begin(self.folder(context))
         return {"FINISHED"}
 
 
@@ -307,12 +287,8 @@ class _OfReview(ReportsErrors):
     """Mixin: available while masks are reviewed."""
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        """Tell whether masks are reviewed; Blender calls this."""
-        if not is_open():
-            cls.poll_message_set("Press Review Masks first")
-            return False
-        return True
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        return "" if is_open() else "Press Review Masks first"
 
 
 class GWRAP_OT_step_mask(_OfReview, bpy.types.Operator):

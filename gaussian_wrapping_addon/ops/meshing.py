@@ -18,15 +18,16 @@ from ..core.files import write_json
 from ..core.jobs.client import worker_python
 from ..core.settings import MeshingSettings, to_json
 from ..core.worker.helper_process import child_command
-from . import addon, jobs, panel_settings, region_operators, worker_setup
+from . import addon, region_operators
 from .addon import NeedsObjectMode, OperatorResult, redraw
 from .background import Child, Lane, Task
-from .jobs import ConfirmsFolder, chosen_regions
+from .jobs import OnRegions, checked_regions, common_frame, selected_regions
 from .mesh_data import mesh_of
-from .panel_settings import method_choices
+from .panel_settings import job_folder_of, method_choices
 from .region_objects import region_body
 from .region_operators import checked_edge_length, edge_length_in_blender, world_per_blender
 from .training import Estimate, estimate_of, estimate_of_failure
+from .worker_setup import worker_choice
 
 # -- Estimate the meshes of regions (triangles, time, memory) by the worker, in the background ----
 #
@@ -197,7 +198,7 @@ def stop() -> None:
 # -- Operators of the region list: estimate and delete; checked regions instead of selected ones
 
 
-class GWRAP_OT_estimate_regions(ConfirmsFolder, bpy.types.Operator):
+class GWRAP_OT_estimate_regions(OnRegions, bpy.types.Operator):
     bl_idname = "gwrap.estimate_regions"
     bl_label = "Estimate"
     bl_description = (
@@ -207,22 +208,16 @@ class GWRAP_OT_estimate_regions(ConfirmsFolder, bpy.types.Operator):
     checked: BoolProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if is_busy():
-            cls.poll_message_set("An estimate is running")
-            return False
-        return True
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        return "An estimate is running" if is_busy() else ""
 
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        regions = chosen_regions(context, checked=self.checked)
-        frame = addon.frame_of(regions[0]) if regions else None
-        return addon.result_folder(frame).parent if frame and frame.get(addon.RESULT) else None
+    def regions(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+        return checked_regions(context) if self.checked else selected_regions(context)
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        regions = chosen_regions(context, checked=self.checked)
-        folder = panel_settings.job_folder_of(jobs.common_frame(regions))
-        python = worker_setup.worker_choice(context).python
-        start(context.scene, regions, folder, python)
+        regions = self.regions(context)
+        folder = job_folder_of(common_frame(regions))
+        start(context.scene, regions, folder, worker_choice(context).python)
         return {"FINISHED"}
 
 

@@ -318,7 +318,7 @@ def stage_of(context: bpy.types.Context) -> Stage:
     """Return the stage of the scene."""
     scene = context.scene
     properties = properties_of(scene)
-    frame = addon.current_frame(scene, context.view_layer.objects.active)
+    frame = addon.current_frame(context)
     if properties.job_folder:
         status = job_timer.status_of(properties.job_folder)
         if status is None:

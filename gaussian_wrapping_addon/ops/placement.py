@@ -31,7 +31,7 @@ from ..core.scene.placement import (
 )
 from ..core.units.georeference import blender_start
 from . import addon
-from .addon import NeedsResult, OperatorResult, ReportsErrors
+from .addon import NeedsResult, OperatorResult, needed_frame
 from .cameras import cameras_under, scale_display
 from .mesh_data import mesh_of, values_of
 from .region_objects import hull_in_blender, matrix_of, scene_from_blender, transformed
@@ -347,23 +347,14 @@ _TARGETS: Final = (
 )
 
 
-class _Tool(NeedsResult, ReportsErrors):
+class _Tool(NeedsResult):
     """Mixin: a tool for Object Mode, and for vertices of a mesh in Edit Mode."""
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Return whether the tool can run; Blender calls this."""
+    def why_not(cls, context: bpy.types.Context) -> str:
         if context.mode not in ("OBJECT", "EDIT_MESH"):
-            cls.poll_message_set("Leave the current mode first")
-            return False
-        return super().poll(context)
-
-    def frame(self, context: bpy.types.Context) -> bpy.types.Object:
-        """Return the parent empty that the tool transforms."""
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-        if frame is None:
-            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
-        return frame
+            return "Leave the current mode first"
+        return super().why_not(context)
 
     def apply(
         self, context: bpy.types.Context, frame: bpy.types.Object, step: Similarity, done: str
@@ -386,14 +377,13 @@ class GWRAP_OT_add_point(_Tool, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if context.mode != "OBJECT":
-            cls.poll_message_set("In Edit Mode, select vertices instead")
-            return False
-        return super().poll(context)
+            return "In Edit Mode, select vertices instead"
+        return super().why_not(context)
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        add_point(context, self.frame(context))
+        add_point(context, needed_frame(context))
         return {"FINISHED"}
 
 
@@ -419,7 +409,7 @@ class GWRAP_OT_set_scale(_Tool, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         try:
-            points = picked_points(context, self.frame(context))
+            points = picked_points(context, needed_frame(context))
             scale_step(points, 1.0)
         except WrapError as error:
             self.report({"ERROR"}, str(error))
@@ -429,7 +419,7 @@ class GWRAP_OT_set_scale(_Tool, bpy.types.Operator):
         return context.window_manager.invoke_props_dialog(self)
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = self.frame(context)
+        frame = needed_frame(context)
         step = scale_step(picked_points(context, frame), self.distance)
         return self.apply(context, frame, step, f"Scaled by {step.scale:.6g}")
 
@@ -448,7 +438,7 @@ class GWRAP_OT_set_ground(_Tool, bpy.types.Operator):
     )
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = self.frame(context)
+        frame = needed_frame(context)
         plane = plane_through(picked_points(context, frame), camera_poses(frame)[1])
         if self.flip:
             plane = Plane(plane.point, -plane.normal)
@@ -465,7 +455,7 @@ class GWRAP_OT_auto_ground(_Tool, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = self.frame(context)
+        frame = needed_frame(context)
         release(context)  # edits of a mesh reach its data when Edit Mode ends
         plane, how = automatic_plane(frame)
         return self.apply(context, frame, ground_step(plane), how)
@@ -480,7 +470,7 @@ class GWRAP_OT_set_origin(_Tool, bpy.types.Operator):
     target: EnumProperty(name="Target", items=_TARGETS, default="POINTS")  # type: ignore[valid-type]
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = self.frame(context)
+        frame = needed_frame(context)
         if self.target == "CURSOR":
             point = np.array(context.scene.cursor.location, np.float64)
         else:
@@ -501,7 +491,7 @@ class GWRAP_OT_keep_placement(_Tool, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        return self.apply(context, self.frame(context), Similarity(), "The placement is saved")
+        return self.apply(context, needed_frame(context), Similarity(), "The placement is saved")
 
 
 class GWRAP_OT_reset_placement(_Tool, bpy.types.Operator):
@@ -514,7 +504,7 @@ class GWRAP_OT_reset_placement(_Tool, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = self.frame(context)
+        frame = needed_frame(context)
         release(context)
         note = place(frame, first_placement(frame))
         if note:

@@ -13,7 +13,7 @@ from ..core.names import file_stem
 from ..core.settings import Declaration
 from ..core.settings.job import read_saved_settings, savable_settings, write_saved_settings
 from .addon import OperatorResult, ReportsErrors, properties_of, redraw
-from .jobs import no_job_runs
+from .jobs import why_busy
 
 # -- Files of the user's presets, in Blender's folder for presets, which outlives the add-on ------
 
@@ -168,8 +168,8 @@ class GWRAP_OT_apply_preset(ReportsErrors, bpy.types.Operator):
     name: StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return no_job_runs(cls, context)
+    def why_not(cls, context: bpy.types.Context) -> str:
+        return why_busy(context)
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
         notes = apply_preset(context.scene, self.name)

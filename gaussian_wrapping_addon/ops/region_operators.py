@@ -202,7 +202,7 @@ def _active(context: bpy.types.Context) -> bpy.types.Object:
 
 def _target(context: bpy.types.Context) -> tuple[bpy.types.Object | None, bpy.types.Collection]:
     """Return the frame and the collection for a new region."""
-    frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+    frame = addon.current_frame(context)
     if frame is None:
         return None, context.scene.collection
     # Linked and overridden collections accept no new objects; objects excluded from the view layer
@@ -306,12 +306,10 @@ class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
     file_format: EnumProperty(name="Format", items=_FORMATS, default="JSON")  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         active = context.view_layer.objects.active
-        if active is None or active.type not in ("EMPTY", "MESH"):
-            cls.poll_message_set("Select a region box or a mesh")
-            return False
-        return True
+        is_shape = active is not None and active.type in ("EMPTY", "MESH")
+        return "" if is_shape else "Select a region box or a mesh"
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         name = file_stem(_active(context).name, 0)
@@ -369,12 +367,11 @@ class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         active = context.view_layer.objects.active
         if active is None or active.type != "MESH" or addon.kind_of(active):
-            cls.poll_message_set("Select a mesh that is neither a region nor a result")
-            return False
-        return super().poll(context)
+            return "Select a mesh that is neither a region nor a result"
+        return super().why_not(context)
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
         active = _active(context)

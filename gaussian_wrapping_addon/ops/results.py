@@ -10,7 +10,7 @@ from bpy.props import EnumProperty, StringProperty
 from ..core.errors import UsageError
 from ..core.files import real_path
 from . import addon, scene_objects
-from .addon import NeedsObjectMode, NeedsResult, OperatorResult, ReportsErrors
+from .addon import NeedsObjectMode, NeedsResult, OperatorResult, needed_frame
 from .mesh_data import mesh_of
 from .report_data import report_of
 from .scene_objects import import_result
@@ -28,10 +28,7 @@ def _result_folder(context: bpy.types.Context) -> Path:
     Raises UsageError: there is none, or it is known from the open file alone, which may come from
     elsewhere.
     """
-    frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-    if frame is None:
-        raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
-    folder = addon.result_folder(frame)
+    folder = addon.result_folder(needed_frame(context))
     if not addon.is_trusted(folder.parent):
         raise UsageError(
             f"{folder} has not been used on this computer.",
@@ -49,16 +46,7 @@ def _inside(folder: Path, path: Path) -> bool:
     return path.is_file() and path.resolve().is_relative_to(folder.resolve())
 
 
-class _NeedsResult(ReportsErrors):
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("The scene has no result; wrap it, or import one")
-            return False
-        return True
-
-
-class GWRAP_OT_read_report(_NeedsResult, bpy.types.Operator):
+class GWRAP_OT_read_report(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.read_report"
     bl_label = "Open Report"
     bl_description = "Open report.md: all figures of the job, its warnings and pictures"
@@ -72,7 +60,7 @@ class GWRAP_OT_read_report(_NeedsResult, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_show_pictures(_NeedsResult, bpy.types.Operator):
+class GWRAP_OT_show_pictures(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.show_pictures"
     bl_label = "Show Pictures"
     bl_description = "Load the report's pictures; they are listed in the Image Editor"
@@ -99,23 +87,19 @@ class GWRAP_OT_show_pictures(_NeedsResult, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_copy_report(_NeedsResult, bpy.types.Operator):
+class GWRAP_OT_copy_report(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.copy_report"
     bl_label = "Copy"
     bl_description = "Copy the figures and warnings shown here, to paste them elsewhere"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not super().poll(context):
-            return False
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-        if not report_of(addon.figures_of(frame)).known:
-            cls.poll_message_set("The result has no report; run the job again")
-            return False
-        return True
+    def why_not(cls, context: bpy.types.Context) -> str:
+        known = report_of(addon.figures_of(addon.current_frame(context))).known
+        unknown = "" if known else "The result has no report; run the job again"
+        return super().why_not(context) or unknown
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         text = report_of(addon.figures_of(frame)).as_text()
         context.window_manager.clipboard = text.replace(str(Path.home()), "~")
         self.report({"INFO"}, "Copied the report to the clipboard")
@@ -153,16 +137,13 @@ class GWRAP_OT_import_result(NeedsObjectMode, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_open_report(NeedsResult, ReportsErrors, bpy.types.Operator):
+class GWRAP_OT_open_report(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.open_report"
     bl_label = "Open Report Folder"
     bl_description = "Show the folder with report.md, the meshes and the textures"
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-        if frame is None:
-            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
-        folder = addon.result_folder(frame)
+        folder = addon.result_folder(needed_frame(context))
         # A folder only: the path comes from the .blend, and opening a file could run it.
         if addon.is_remote(folder) or not (folder.is_dir() and (folder / "scene.json").is_file()):
             raise UsageError(
@@ -185,9 +166,8 @@ class GWRAP_OT_set_shading(NeedsResult, bpy.types.Operator):
         )
     )
 
-    def execute(self, context: bpy.types.Context) -> OperatorResult:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-        for material in materials_of(frame):
+    def work(self, context: bpy.types.Context) -> OperatorResult:
+        for material in materials_of(addon.current_frame(context)):
             scene_objects.set_shading(material, self.shading)
         return {"FINISHED"}
 

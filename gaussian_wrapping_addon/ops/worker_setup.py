@@ -123,30 +123,24 @@ class GWRAP_OT_check_worker(ReportsErrors, bpy.types.Operator):
     bl_description = "Check in the background that the worker's Python has all that jobs need"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if is_busy():
-            cls.poll_message_set("The check is running; it takes seconds")
-            return False
-        return True
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        return "The check is running; it takes seconds" if is_busy() else ""
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
         start(worker_choice(context).python)
         return {"FINISHED"}
 
 
-class GWRAP_OT_copy_findings(bpy.types.Operator):
+class GWRAP_OT_copy_findings(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.copy_findings"
     bl_label = "Copy Findings"
     bl_description = "Copy the findings about the worker, to paste them into a bug report"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not findings():
-            cls.poll_message_set("Press Check Worker first")
-            return False
-        return True
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        return "" if findings() else "Press Check Worker first"
 
-    def execute(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         context.window_manager.clipboard = as_text()
         return {"FINISHED"}
 
@@ -409,15 +403,14 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
     )  # fmt: skip
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         reason = _why_not_now(context)
         if not reason and state.pythons is None:
             search_pythons()
-            reason = "Searching for Python installations"
-        elif not reason and not state.pythons:
-            reason = "No Python 3.11 or newer was found: install one from python.org"
-        cls.poll_message_set(reason)
-        return not reason
+            return "Searching for Python installations"
+        if not reason and not state.pythons:
+            return "No Python 3.11 or newer was found: install one from python.org"
+        return reason
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         known = {extra.name for extra in EXTRAS}
@@ -462,12 +455,9 @@ class GWRAP_OT_add_extra(ReportsErrors, bpy.types.Operator):
     extra: EnumProperty(name="Package", items=_extra_items())  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         reason = _why_not_now(context)
-        if not reason and not environment().is_ready():
-            reason = "Set up the worker first"
-        cls.poll_message_set(reason)
-        return not reason
+        return "Set up the worker first" if not reason and not environment().is_ready() else reason
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_props_dialog(self, width=_DIALOG_PX)
@@ -505,11 +495,10 @@ class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
     bl_description = "Delete the worker's environment that this add-on has made, and nothing else"
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        reason = "" if environment().is_ours() else "No worker has been set up here"
-        reason = "A set-up is running; cancel it or wait for it" if state.is_busy else reason
-        cls.poll_message_set(reason)
-        return not reason
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        if state.is_busy:
+            return "A set-up is running; cancel it or wait for it"
+        return "" if environment().is_ours() else "No worker has been set up here"
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_confirm(self, event)
@@ -519,20 +508,18 @@ class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_cancel_setup(bpy.types.Operator):
+class GWRAP_OT_cancel_setup(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.cancel_setup"
     bl_label = "Cancel"
     bl_description = "Stop the set-up and delete its unfinished environment"
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        reason = "" if state.is_busy else "No set-up is running"
+    def why_not(cls, _context: bpy.types.Context) -> str:
         if state.is_busy and state.task is not None and state.task.is_cancelling:
-            reason = "The set-up is being cancelled"
-        cls.poll_message_set(reason)
-        return not reason
+            return "The set-up is being cancelled"
+        return "" if state.is_busy else "No set-up is running"
 
-    def execute(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> OperatorResult:
         cancel()
         return {"FINISHED"}
 

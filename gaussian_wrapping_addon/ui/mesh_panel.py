@@ -93,7 +93,7 @@ class GWRAP_PT_mesh(TabPanel, bpy.types.Panel):
         job = job_readiness(context, "MESH")
         if job is not None:
             return job
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
+        if addon.current_frame(context) is None:
             return Readiness("Needs a training")
         count = len(selected_regions(context))
         if not count:
@@ -111,7 +111,7 @@ class GWRAP_PT_mesh(TabPanel, bpy.types.Panel):
         if draw_job(layout, context, "MESH"):
             return
         characters = characters_of(context)
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
+        if addon.current_frame(context) is None:
             wrapped_label(layout, "Needs a finished training.", characters, icon="INFO")
         elif selected:
             names = ", ".join(region.name for region in selected)
@@ -177,7 +177,7 @@ class GWRAP_PT_bake(TabPanel, bpy.types.Panel):
         job = job_readiness(context, "BAKE")
         if job is not None:
             return job
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
+        if addon.current_frame(context) is None:
             return Readiness("Needs a result")
         thing = bake_target(context)
         return (
@@ -200,7 +200,7 @@ class GWRAP_PT_bake(TabPanel, bpy.types.Panel):
             return
         characters = characters_of(context)
         thing = bake_target(context)
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
+        if addon.current_frame(context) is None:
             wrapped_label(layout, "Needs a finished job.", characters, icon="INFO")
         elif thing is None:
             text = "Select a mesh: edited, retopologised, or of your own."

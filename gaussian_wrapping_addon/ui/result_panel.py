@@ -34,11 +34,11 @@ class GWRAP_PT_report(bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return addon.current_frame(context.scene, context.view_layer.objects.active) is not None
+        return addon.current_frame(context) is not None
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         report = report_of(addon.figures_of(frame))
         if not report.known:
             layout.label(text=tr("No report yet"), icon="INFO", translate=False)
@@ -84,7 +84,7 @@ class GWRAP_PT_result(TabPanel, bpy.types.Panel):
     bl_label = "Result"
 
     def readiness(self, context: bpy.types.Context) -> Readiness:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if frame is None:
             return Readiness("No result")
         count = sum(addon.kind_of(child) == "mesh" for child in frame.children)
@@ -93,7 +93,7 @@ class GWRAP_PT_result(TabPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if frame is not None:
             found = materials_of(frame)
             if found:
@@ -131,7 +131,7 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if frame is None:
             layout.label(text=tr("No result yet"), icon="INFO", translate=False)
             return

@@ -88,7 +88,7 @@ class GWRAP_PT_train(TabPanel, bpy.types.Panel):
         job = job_readiness(context, "WRAP")
         if job is not None:
             return job
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if frame is None:
             return Readiness("Not trained")
         training = report_of(addon.figures_of(frame)).training
@@ -98,7 +98,7 @@ class GWRAP_PT_train(TabPanel, bpy.types.Panel):
         layout, properties = self.layout, properties_of(context.scene)
         plain(layout)
         characters = characters_of(context)
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if frame is not None:
             training = report_of(addon.figures_of(frame)).training
             words = tr("Trained: {figures}", figures=training) if training else "Trained"
