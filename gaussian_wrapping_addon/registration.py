@@ -123,8 +123,6 @@ def unregister() -> None:
     job_timer.forget_all_jobs()
     job_timer.stop()
     masks.stop()
-    job_timer.stop_points()
-    computers.stop_watching()
     computers.stop()
     background.stop()  # last of these: what they end is ended by its threads
     cli_command.unregister()

@@ -34,7 +34,7 @@ from .mesh_data import build_mesh, build_polygons, evaluated, mesh_of, values_of
 from .placement import placement_of
 from .region_objects import matrix_of, transformed
 from .result_files import read_mesh_arrays
-from .scene_objects import create_material, load_texture, set_occlusion, set_shading, shading_of
+from .scene_objects import create_material, load_texture, set_shading, shading_of
 
 # -- A mesh object as triangles, with its modifiers, in the world of a job's input ----------------
 
@@ -556,8 +556,7 @@ def _set_material(thing: bpy.types.Object, frame: bpy.types.Object, baked: Baked
     mesh = mesh_of(thing)
     if mesh.users > 1:
         thing.data = mesh = mesh.copy()
-    material = create_material(f"{thing.name} photos", image, normal)
-    set_occlusion(material, dark)
+    material = create_material(f"{thing.name} photos", image, normal, dark)
     set_shading(material, _shading(frame))
     mesh.materials.clear()
     mesh.materials.append(material)

@@ -17,6 +17,7 @@ from ..core.masks.mask_folder import FOLDER, MadeMask, MaskList, read_list, writ
 from ..core.settings import with_values
 from . import addon
 from .addon import OperatorResult, ReportsErrors
+from .job_timer import new_icon
 from .jobs import (
     OnRegions,
     OnSceneJob,
@@ -127,8 +128,6 @@ def decide(*, accepted: bool) -> None:
 
 def end() -> None:
     """Forget the review and its picture."""
-    global _review, _icons
-    _review = None
     image: Any = bpy.data.images.get(IMAGE_NAME)
     if image is not None and image.users <= 1:
         bpy.data.images.remove(image)
@@ -191,15 +190,11 @@ def _show() -> None:
     picture = overlaid(photo, np.zeros(photo.shape[:2], bool) if kept is None else kept)
     _put_into_image(picture)
     step_px = max(1, -(-max(picture.shape[:2]) // ICON_PX))
-    small = np.ascontiguousarray(picture[::step_px, ::step_px])
     if _icons is None:
         _icons = bpy.utils.previews.new()
     _icons.clear()
     _count += 1  # a new name each time: Blender caches what it has drawn under a name
-    icon = _icons.new(f"mask {_count}")
-    icon.image_size = small.shape[1::-1]
-    icon.image_pixels_float.foreach_set(small.ravel())
-    review.icon = int(icon.icon_id)
+    review.icon = new_icon(_icons, f"mask {_count}", picture[::step_px, ::step_px])
 
 
 def _pixels(path: Path, longest_px: int, size: tuple[int, int] | None = None) -> np.ndarray:

@@ -89,11 +89,8 @@ def job_folder_of(frame: bpy.types.Object) -> Path:
 
 def settings_of_scene() -> list[Declaration]:
     """Return the settings that a scene has a property for."""
-    return [
-        declared
-        for declared in declarations(JobSettings)
-        if declared.panel is not None and declared.property_owner != "preferences"
-    ]
+    known = (d for d in declarations(JobSettings) if d.panel is not None)
+    return [declared for declared in known if declared.property_owner != "preferences"]
 
 
 def is_shown(declared: Declaration, properties: bpy.types.PropertyGroup) -> bool:
@@ -124,10 +121,13 @@ def chosen_values(
     return values
 
 
-def _stored(declared: Declaration, properties: bpy.types.PropertyGroup) -> Any:
-    owner: Any = properties
-    owner = owner.training if declared.property_owner == "training" else owner
-    return getattr(owner, declared.property_name)
+def owner_of(declared: Declaration, properties: Any) -> Any:
+    """Return which of ``Scene.gwrap`` and ``Scene.gwrap.training`` has a setting's property."""
+    return properties.training if declared.property_owner == "training" else properties
+
+
+def _stored(declared: Declaration, properties: Any) -> Any:
+    return getattr(owner_of(declared, properties), declared.property_name)
 
 
 def job_settings(scene: bpy.types.Scene, threads: int, device: str = "auto") -> JobSettings:
@@ -140,19 +140,18 @@ def job_settings(scene: bpy.types.Scene, threads: int, device: str = "auto") -> 
     values = chosen_values(properties_of(scene), settings)
     values["start_splat"] = _splat(values["start_splat"])
     values["markers"] = checked_markers(values["markers"])
-    values["control_points"] = _control_points(values["control_points"])
-    values["mask_model"] = _mask_model(values["mask_model"])
+    if values["control_points"]:
+        path = _local(values["control_points"], "file")
+        values["control_points"] = _existing(path, "file of control points")
+    model = values["mask_model"]
+    values["mask_model"] = str(_local(model, "mask model")) if model else ""
     values |= computers_choices(scene)
     name = values.pop("preset")
-    decided = {
-        declared.path
-        for declared in settings
-        if declared.model_selection
-        and name in declared.presets
-        and values[declared.path] == declared.default
-    }  # Auto leaves it to the preset
-    given = {path: value for path, value in values.items() if path not in decided}
-    return with_values(preset(name, threads=threads, device=device), given)
+    for declared in settings:
+        auto = declared.model_selection and name in declared.presets
+        if auto and values[declared.path] == declared.default:
+            del values[declared.path]  # Auto leaves it to the preset
+    return with_values(preset(name, threads=threads, device=device), values)
 
 
 def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
@@ -200,11 +199,8 @@ def method_choices(scene: bpy.types.Scene) -> dict[str, Any]:
 
     The edge length is as in Blender.
     """
-    settings = [
-        declared
-        for declared in settings_of_scene()
-        if declared.option is not None and declared.scope == "method"
-    ]
+    known = settings_of_scene()
+    settings = [d for d in known if d.option is not None and d.scope == "method"]
     values = chosen_values(properties_of(scene), settings)
     return {path.rpartition(".")[2]: value for path, value in values.items()}
 
@@ -215,15 +211,6 @@ def texture_choices(scene: bpy.types.Scene) -> dict[str, Any]:
     return chosen_values(properties_of(scene), settings)
 
 
-def _mask_model(stored: str) -> str:
-    if not stored:
-        return ""
-    path = Path(bpy.path.abspath(stored))
-    if addon.is_remote(path):  # as of a splat
-        raise UsageError(f"{path} is on another computer.", "Copy the mask model to this one.")
-    return str(path)
-
-
 def _splat(stored: str) -> str:
     if not stored:
         return ""
@@ -231,10 +218,6 @@ def _splat(stored: str) -> str:
     if path.suffix.lower() != ".ply":
         raise UsageError(f"{path.name} is not a PLY file.", "Choose a splat saved as PLY, or none.")
     return _existing(path, "splat")
-
-
-def _control_points(stored: str) -> str:
-    return _existing(_local(stored, "file"), "file of control points") if stored else ""
 
 
 def _local(stored: str, what: str) -> Path:
@@ -272,13 +255,12 @@ def preset_lines(name: str) -> tuple[str, ...]:
 def choices_key(scene: bpy.types.Scene) -> tuple[object, ...]:
     """Return what an estimate of time and memory depends on; reads no file, for panels."""
     properties = properties_of(scene)
-    own = (properties.source, properties.preset, properties.texture_size)
-    decisive = [
-        d
+    decisive = (
+        _stored(d, properties)
         for d in settings_of_scene()
         if d.property_owner == "training" or d.panel_name == "dataset"
-    ]
-    return (*own, *(_stored(declared, properties) for declared in decisive))
+    )
+    return (properties.source, properties.preset, properties.texture_size, *decisive)
 
 
 # -- Stage of a scene and the button of the next step; reads no file, for panels and polls --------

@@ -2,7 +2,7 @@
 """The user's presets."""
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import bpy
 from bpy.props import StringProperty
@@ -10,10 +10,10 @@ from bpy.props import StringProperty
 from ..core.errors import UsageError
 from ..core.files import is_link
 from ..core.names import file_stem
-from ..core.settings import Declaration
 from ..core.settings.job import read_saved_settings, savable_settings, write_saved_settings
 from .addon import OperatorResult, ReportsErrors, properties_of, redraw
 from .jobs import why_busy
+from .panel_settings import owner_of
 
 # -- Files of the user's presets, in Blender's folder for presets, which outlives the add-on ------
 
@@ -55,10 +55,8 @@ def save_preset(scene: bpy.types.Scene, wanted: str) -> str:
         raise UsageError(f"There are {len(names)} presets already.", "Delete one.")
     properties = properties_of(scene)
     values = {
-        declared.path: declared.from_panel(
-            getattr(_owner(declared, properties), declared.property_name)
-        )
-        for declared in savable_settings()
+        d.path: d.from_panel(getattr(owner_of(d, properties), d.property_name))
+        for d in savable_settings()
     }
     panel = {name: getattr(properties, name) for name in PANEL_CHOICES}
     try:
@@ -83,21 +81,17 @@ def apply_preset(scene: bpy.types.Scene, name: str) -> tuple[str, ...]:
         raise UsageError(f"{path} cannot be read: {error.strerror}.", "Check the file.") from None
     properties = properties_of(scene)
     notes = list(saved.notes)
-    for declared in savable_settings():
-        if declared.path in saved.values:
-            owner = _owner(declared, properties)
+    chosen = [
+        (d.path, owner_of(d, properties), d.property_name, d.to_panel, saved.values)
+        for d in savable_settings()
+    ]
+    chosen += [(name, properties, name, lambda value: value, saved.panel) for name in PANEL_CHOICES]
+    for called, owner, name, to_panel, values in chosen:
+        if called in values:
             try:
-                setattr(
-                    owner, declared.property_name, declared.to_panel(saved.values[declared.path])
-                )
+                setattr(owner, name, to_panel(values[called]))
             except (TypeError, ValueError, OverflowError):
-                notes.append(f"{declared.path} is no choice of the panel, and stays as it is.")
-    for choice in PANEL_CHOICES:
-        if choice in saved.panel:
-            try:
-                setattr(properties, choice, saved.panel[choice])
-            except (TypeError, ValueError, OverflowError):
-                notes.append(f"{choice} is no choice of the panel, and stays as it is.")
+                notes.append(f"{called} is no choice of the panel, and stays as it is.")
     return tuple(notes)
 
 
@@ -126,10 +120,6 @@ def _existing(name: str) -> Path:
     if folder is None or name not in preset_names():
         raise UsageError(f"There is no preset {name[:80]!r}.", "Open the menu again.")
     return folder / f"{name}.json"
-
-
-def _owner(declared: Declaration, properties: Any) -> Any:
-    return properties.training if declared.property_owner == "training" else properties
 
 
 # -- Operators of the menu of presets: save, apply, delete ----------------------------------------

@@ -17,9 +17,9 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 from ..core.evaluation.report.figures import duration
 from ..core.settings import Declaration, JobSettings, declarations
 from ..core.settings.declaration import Owner, PanelName, Range
-from ..ops import panel_settings
+from ..ops import job_timer
 from ..ops.addon import tr
-from ..ops.panel_settings import is_shown
+from ..ops.panel_settings import is_shown, owner_of, primary_of
 
 # -- Text for narrow panels: wrapped lines, spans of time, counts ---------------------------------
 
@@ -57,7 +57,7 @@ def wrapped(text: str, characters: int) -> list[str]:
         return textwrap.wrap(text, characters) or [""]
     lines, width = [""], 0
     for piece in _pieces(text, characters):
-        wide = sum(2 if _is_wide(character) else 1 for character in piece)
+        wide = sum(1 + _is_wide(character) for character in piece)
         if lines[-1] and width + wide > characters and piece not in _NEVER_FIRST:
             lines.append("")
             width = 0
@@ -84,16 +84,11 @@ def _is_wide(character: str) -> bool:
     return unicodedata.east_asian_width(character) in "WF"
 
 
-def time_span(seconds: float) -> str:
-    """Return a time span in words."""
-    return duration(seconds)
-
-
 def progress_text(stage: str, fraction: float, seconds_left: float | None) -> str:
     """Return the line on the progress bar: stage, percent, time left."""
     parts = [tr(stage.capitalize() or "Starting"), f"{100 * fraction:.0f} %"]
     if seconds_left is not None:
-        parts.append(tr("{time} left", time=time_span(seconds_left)))
+        parts.append(tr("{time} left", time=duration(seconds_left)))
     return " · ".join(parts)
 
 
@@ -125,12 +120,16 @@ class Readiness:
     """``"NONE"`` dims the text: nothing is there yet."""
 
 
-class TabPanel(_Panel):
-    """Mixin: a panel of our tab; :meth:`readiness` is drawn in its header."""
+class InTab(_Panel):
+    """Mixin: a panel of our tab."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = CATEGORY
+
+
+class TabPanel(InTab):
+    """Mixin: a panel of our tab; :meth:`readiness` is drawn in its header."""
 
     def readiness(self, context: bpy.types.Context) -> Readiness:
         """Return the progress of the panel's part, from memory alone."""
@@ -145,16 +144,24 @@ class TabPanel(_Panel):
         row.separator(factor=0.25)
 
 
-def plain(layout: Any) -> None:
-    """Set the layout: names at the left, values at the right, no animation dots."""
+def plain(layout: Any) -> Any:
+    """Set the layout: names at the left, values at the right, no animation dots; return it."""
     layout.use_property_split = True
     layout.use_property_decorate = False
+    return layout
+
+
+def column_of_choices(layout: Any, properties: Any) -> Any:
+    """Return a new column of a plain layout, dimmed while the scene's job runs."""
+    column = plain(layout).column()
+    column.enabled = not job_timer.is_running(properties.job_folder)
+    return column
 
 
 def button(layout: Any, context: bpy.types.Context, operator: str, **keywords: Any) -> Any:
     """Draw an operator, large if it is the next step; return its properties."""
     row = layout.row()
-    if panel_settings.primary_of(context) == operator:
+    if primary_of(context) == operator:
         row.scale_y = LARGE
     return row.operator(operator, **keywords)
 
@@ -250,12 +257,11 @@ def draw_settings(layout: Any, properties: Any, settings: Iterable[Declaration])
         panel = declared.panel
         if panel is None or not is_shown(declared, properties):
             continue
-        owner = properties.training if declared.property_owner == "training" else properties
         target = layout.row() if panel.expand else layout
         keywords: dict[str, Any] = {"text": panel.drawn_label} if panel.drawn_label else {}
         if panel.expand:
             keywords["expand"] = True
-        target.prop(owner, declared.property_name, **keywords)
+        target.prop(owner_of(declared, properties), declared.property_name, **keywords)
 
 
 # -- Draw handlers of the 3D views: added once, taken away whole, and no error at every redraw ----
