@@ -16,6 +16,21 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..core.errors import EXIT_CANCELLED, UsageError
+from ..core.farm.addresses import checked_folder, scheduler_address
+from ..core.farm.hosts import (
+    MAX_WORKERS,
+    Host,
+    Wanted,
+    checked_hosts,
+    hosts_named,
+    read_hosts,
+    ssh_command,
+)
+from ..core.files import real_path
+from ..core.names import SHARED_VARIABLE
+from ..core.settings.declaration import MAX_PROCESSES
+from .job_commands import run_in_worker
 from .options import Commands
 
 if TYPE_CHECKING:
@@ -33,11 +48,9 @@ def add_certificates(parser: ArgumentParser) -> None:
 
 def in_worker(module: str, request: dict[str, Any]) -> int:
     """Run a command of a farm in the worker's Python; return the exit code."""
-    from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.run_in_worker import run_in_worker
 
     return run_in_worker(
-        request, python=worker_python(), module=f"jobs.commands.farm_{module}", what="command",
+        request, module=f"jobs.commands.farm_{module}", what="command",
         grace_s=_GRACE_S,
     )  # fmt: skip
 
@@ -67,9 +80,6 @@ def add_ssh(commands: Any) -> None:
 
 
 def _ssh(options: Namespace) -> int:
-    from ..core.errors import UsageError
-    from ..core.farm.hosts import checked_hosts, hosts_named, read_hosts, ssh_command
-
     if not 1.0 <= options.limit <= 3600.0:
         raise UsageError("--limit is out of range.", "Give from 1 to 3600.")
     usual = _usual(options)
@@ -114,10 +124,6 @@ def _add_system(commands: Any, name: str, title: str) -> None:
 
 
 def _batch_jobs(options: Namespace) -> int:
-    from ..core.errors import UsageError
-    from ..core.farm.hosts import MAX_WORKERS, Wanted
-    from ..core.files import real_path
-
     if not 1 <= options.workers <= MAX_WORKERS:
         raise UsageError("--workers is out of range.", f"Give from 1 to {MAX_WORKERS}.")
     wanted = Wanted(
@@ -159,10 +165,6 @@ def _add_there(parser: ArgumentParser, python: str) -> None:
 
 
 def _usual(options: Namespace) -> Host:
-    from ..core.errors import UsageError
-    from ..core.farm.hosts import Host
-    from ..core.settings.declaration import MAX_PROCESSES
-
     if not 1 <= options.slots <= MAX_PROCESSES:
         raise UsageError("--slots is out of range.", f"Give from 1 to {MAX_PROCESSES}.")
     there = options.certificates_there or _request(options)["certificates"]
@@ -171,9 +173,6 @@ def _usual(options: Namespace) -> Host:
 
 def _request(options: Namespace) -> dict[str, Any]:
     """Return address and certificates, checked here: others would be asked in vain."""
-    from ..core.farm.addresses import checked_folder, scheduler_address
-    from ..core.files import real_path
-
     address = scheduler_address(options.address)
     folder = ""
     if address.scheme == "tls":
@@ -193,8 +192,6 @@ def _add_make_certificates(commands: Any) -> None:
 
 
 def _make_certificates(options: Namespace) -> int:
-    from ..core.files import real_path
-
     return in_worker("certificates", {"folder": str(real_path(options.folder))})
 
 
@@ -230,10 +227,6 @@ def _add_worker(commands: Any) -> None:
 
 
 def _worker(options: Namespace) -> int:
-    from ..core.errors import EXIT_CANCELLED, UsageError
-    from ..core.files import real_path
-    from ..core.settings.declaration import MAX_PROCESSES
-
     if not 1 <= options.slots <= MAX_PROCESSES:
         raise UsageError("--slots is out of range.", f"Give from 1 to {MAX_PROCESSES}.")
     request = {
@@ -277,11 +270,6 @@ def _add_doctor(commands: Any) -> None:
 
 
 def _doctor(options: Namespace) -> int:
-    from ..core.errors import UsageError
-    from ..core.farm.addresses import scheduler_address
-    from ..core.files import real_path
-    from ..core.names import SHARED_VARIABLE
-
     folder = options.shared or os.environ.get(SHARED_VARIABLE, "")
     if not folder:
         raise UsageError(

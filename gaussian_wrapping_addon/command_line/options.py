@@ -165,13 +165,13 @@ def _number_reader(entry: Declaration) -> Callable[[str], Any]:
     return read
 
 
-def given_settings(options: Namespace, scope: Scope) -> dict[str, Any]:
-    """Return the settings, by path, whose options were given.
+def given_settings(options: Namespace, entries: Iterable[Declaration]) -> dict[str, Any]:
+    """Return those of the settings, by path, whose options were given.
 
     Raises UsageError: a value cannot be parsed.
     """
     values = {}
-    for entry in declared_options(scope):
+    for entry in entries:
         assert entry.option is not None
         value = getattr(options, entry.path)
         if value is not None:
@@ -206,7 +206,7 @@ def training_settings(options: Namespace) -> JobSettings:
 
     Ranges are checked when the job is made.
     """
-    values = given_settings(options, "training")
+    values = given_settings(options, declared_options("training"))
     saved = _saved_values(options, values.get("preset"))
     if options.needs is not None:
         word = _SELECTION_VALUES[options.needs]
@@ -257,11 +257,8 @@ def _saved_values(options: Namespace, given_preset: str | None) -> dict[str, Any
 # -- Settings of meshing and texture --------------------------------------------------------------
 
 _IGNORED_BY_PIVOTS: dict[str, tuple[Any, ...]] = {
-    "edge_length": (0.0,),
-    "points": (0,),
-    "spacing": (),
-    "tiles": ("auto", "off"),
-}
+    "edge_length": (0.0,), "points": (0,), "spacing": (), "tiles": ("auto", "off"),
+}  # fmt: skip
 """Settings that the method pivots ignores, and their values without effect: an edge length or
 number of 0, and tiles that pivots do not use anyway."""
 
@@ -276,7 +273,7 @@ def method_settings(options: Namespace) -> dict[str, Any]:
     Options that are not given have their defaults, not the values of an earlier mesh. Raises
     UsageError: an option is given that the method ignores.
     """
-    values = given_settings(options, "method")
+    values = given_settings(options, declared_options("method"))
     given = {path.removeprefix("meshing."): value for path, value in values.items()}
     method = given.get("method", MeshingSettings().method)
     pivots = given.get("pivots", MeshingSettings().pivots)
@@ -307,14 +304,14 @@ def region_settings(
     ``texture_stays``, those of the texture have the values of ``settings``. Raises UsageError: an
     option is given that the method ignores, or a value cannot be parsed.
     """
-    given = given_settings(options, "region")
+    entries = declared_options("region")
     values = {
         entry.path: entry.default
-        for entry in declared_options("region")
+        for entry in entries
         if not (texture_stays and entry.group == "texture")
     }
     values |= {f"meshing.{name}": value for name, value in method_settings(options).items()}
-    values |= given
+    values |= given_settings(options, entries)
     if options.threads is not None:
         values["threads"] = options.threads
     if options.device is not None:

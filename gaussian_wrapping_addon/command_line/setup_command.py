@@ -10,6 +10,29 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.errors import EXIT_DONE, EXIT_OTHER, UsageError
+from ..core.jobs.install import (
+    CPU,
+    CUDA_BRINGS,
+    SetupRequest,
+    SetupTask,
+    all_commands,
+    as_line,
+    check_folders,
+    cuda_present,
+    find_pythons,
+    probe,
+    remove,
+)
+from ..core.worker.environment import (
+    EXTRAS,
+    WorkerEnvironment,
+    default_root,
+    known_environments,
+    read_extra_names,
+    read_requirements,
+    requirements_file,
+)
 from .options import Commands
 
 if TYPE_CHECKING:
@@ -61,34 +84,10 @@ def add_set_up_worker(commands: Commands) -> None:
 
 
 def _extras_help() -> str:
-    from ..core.worker.environment import EXTRAS
-
     return "; ".join(f"{extra.name}: {extra.purpose}" for extra in EXTRAS)
 
 
 def _set_up_worker(options: Namespace) -> int:
-    from ..core.errors import EXIT_DONE, UsageError
-    from ..core.jobs.install import (
-        CPU,
-        CUDA_BRINGS,
-        SetupRequest,
-        all_commands,
-        as_line,
-        check_folders,
-        cuda_present,
-        find_pythons,
-        probe,
-        remove,
-    )
-    from ..core.worker.environment import (
-        WorkerEnvironment,
-        default_root,
-        known_environments,
-        read_extra_names,
-        read_requirements,
-        requirements_file,
-    )
-
     known = [e.root for e in known_environments() if e.is_ours()]
     change = options.repair or options.remove or options.add
     root = (options.to or (known[0] if change and known else default_root())).absolute()
@@ -124,9 +123,6 @@ def _set_up_worker(options: Namespace) -> int:
 
 def _follow(request: SetupRequest) -> int:
     """Run the set-up and show its progress; return the exit code."""
-    from ..core.errors import EXIT_OTHER
-    from ..core.jobs.install import SetupTask
-
     task = SetupTask(request)
     task.start()
     shown_s, shown = 0.0, ""

@@ -9,8 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.errors import EXIT_DONE, DatasetError, UsageError, WrapError, known_error
+from ..core.files import real_path
+from ..core.jobs.store.job_folder import JobFolder
 from ..core.settings import declared
-from .job_commands import follow, require_bpy
+from .job_commands import follow, require_bpy, run_in_worker, run_job
 from .mesh_commands import follow_bake
 from .options import (
     Commands,
@@ -52,7 +55,6 @@ def add_wrap(commands: Commands) -> None:
 
 
 def _wrap(options: Namespace) -> int:
-    from ..core.errors import EXIT_DONE
     from ..core.jobs.client import JobClient, prepare_job, worker_python
 
     job = checked_job(options.input, options)
@@ -73,7 +75,6 @@ def checked_job(photos: Path, options: Namespace) -> JobFile:
     Raises DatasetError, UsageError, DeviceError: the photos, an option or the device cannot be
     used.
     """
-    from ..core.errors import DatasetError, UsageError
     from ..core.jobs.client import worker_if_any
     from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import make_job
@@ -99,7 +100,6 @@ def checked_job(photos: Path, options: Namespace) -> JobFile:
 
 def _reject_frames_of_photos(job: JobFile) -> None:
     """Raise for options of videos where the input is none: they would do nothing."""
-    from ..core.errors import UsageError
     from ..core.jobs.stages.cameras import frames_request
 
     for path in ("video_frames", "video_fps"):
@@ -124,19 +124,18 @@ def add_continue_training(commands: Commands) -> None:
 
 
 def _continue_training(options: Namespace) -> int:
-    from ..core.files import real_path
-    from ..core.jobs.client import JobClient, worker_python
-    from ..core.jobs.commands.device_check import require_device
-    from ..core.jobs.store.job_folder import JobFolder
     from ..core.jobs.store.rollback import continue_training_job, finished_job
 
     folder = JobFolder(real_path(options.out))
     job = continue_training_job(folder, finished_job(folder), options.iterations)
-    if options.device is not None:
-        job = replace(job, settings=replace(job.settings, device=options.device).validated())
-    require_bpy(job, options)
-    require_device(job.settings.device)
-    return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+    return run_job(_on_device(job, options), options)
+
+
+def _on_device(job: JobFile, options: Namespace) -> JobFile:
+    """Return a job that runs on the device of ``--device``, or on its own."""
+    if options.device is None:
+        return job
+    return replace(job, settings=replace(job.settings, device=options.device).validated())
 
 
 def add_resume(commands: Commands) -> None:
@@ -151,20 +150,16 @@ def add_resume(commands: Commands) -> None:
 
 
 def _resume(options: Namespace) -> int:
-    from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
     from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import read_job
-    from ..core.jobs.store.job_folder import JobFolder
 
-    job = read_job(JobFolder(real_path(options.out)).job_path)
-    if options.device is not None:
-        job = replace(job, settings=replace(job.settings, device=options.device).validated())
-    if job.bake is not None and options.max_gaussians is None:
-        return follow_bake(JobClient.resume(options.out, python=worker_python()), job)
-    require_bpy(job, options)
-    require_device(job.settings.device)
+    job = _on_device(read_job(JobFolder(real_path(options.out)).job_path), options)
     if options.max_gaussians is None:
+        if job.bake is not None:
+            return follow_bake(JobClient.resume(options.out, python=worker_python()), job)
+        require_bpy(job, options)
+        require_device(job.settings.device)
         client = JobClient.resume(options.out, python=worker_python(), device=options.device)
         return follow(client, job, options)
     # A training with another maximum starts anew: extra iterations do not apply.
@@ -172,8 +167,7 @@ def _resume(options: Namespace) -> int:
         job.settings.training, max_gaussians=options.max_gaussians, extra_iterations=0
     )
     settings = replace(job.settings, training=training).validated()
-    job = replace(job, command="wrap", settings=settings, bake=None)
-    return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+    return run_job(replace(job, command="wrap", settings=settings, bake=None), options)
 
 
 def add_estimate(commands: Commands) -> None:
@@ -186,9 +180,7 @@ def add_estimate(commands: Commands) -> None:
 
 
 def _estimate(options: Namespace) -> int:
-    from ..core.jobs.client import worker_python
     from ..core.jobs.commands.device_check import require_device
-    from ..core.jobs.commands.run_in_worker import run_in_worker
     from ..core.jobs.store.job_file import make_job
 
     # Masks of a region need the region, and hardly change what the training costs.
@@ -198,7 +190,6 @@ def _estimate(options: Namespace) -> int:
     require_device(job.settings.device)
     return run_in_worker(
         job.to_json(),
-        python=worker_python(),
         module="jobs.commands.estimate_command",
         what="estimate",
     )
@@ -212,8 +203,6 @@ def add_settings(commands: Commands) -> None:
 
 
 def _settings(options: Namespace) -> int:
-    from ..core.errors import EXIT_DONE, UsageError
-
     lines = []
     for entry in declared_options("training", "method", "region"):
         option = entry.option
@@ -247,11 +236,7 @@ def add_queue(commands: Commands) -> None:
 
 
 def _queue(options: Namespace) -> int:
-    from ..core.errors import UsageError, WrapError, known_error
-    from ..core.files import real_path
-    from ..core.jobs.client import prepare_job, worker_python
-    from ..core.jobs.commands.run_in_worker import run_in_worker
-    from ..core.jobs.store.job_folder import JobFolder
+    from ..core.jobs.client import prepare_job
 
     root, out = real_path(options.input), real_path(options.out)
     if out == root or out.is_relative_to(root):
@@ -276,10 +261,10 @@ def _queue(options: Namespace) -> int:
         raise UsageError(f"No folder in {options.input} can be wrapped.", "See the errors above.")
     request = {
         "out": str(out), "jobs": names, "computers": options.computers or "",
-        "processes": _default(options.processes, "processes"),
+        "processes": options.processes or declared("processes").default,
         "certificates": str(options.certificates or ""),
     }  # fmt: skip
-    code = run_in_worker(request, python=worker_python(), module="jobs.queue_process", what="queue")
+    code = run_in_worker(request, module="jobs.queue_process", what="queue")
     return code or int(bool(refused))
 
 
@@ -288,8 +273,6 @@ def _folders(root: Path) -> list[Path]:
 
     Raises UsageError: there is no such folder, or it holds none, or too many.
     """
-    from ..core.errors import UsageError
-
     if not root.is_dir():
         raise UsageError(f"{root} is not a folder.", "Give a folder of folders of photos.")
     found = sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
@@ -303,10 +286,8 @@ def _folders(root: Path) -> list[Path]:
 
 def _is_same(folder: Path, job: JobFile) -> bool:
     """Return whether a folder holds this job already, begun or finished, and run the same way."""
-    from ..core.errors import WrapError
     from ..core.jobs.parts.graph import plan_hash
     from ..core.jobs.store.job_file import read_job
-    from ..core.jobs.store.job_folder import JobFolder
 
     try:
         known = read_job(JobFolder(folder).job_path)
@@ -314,9 +295,3 @@ def _is_same(folder: Path, job: JobFile) -> bool:
         return same and plan_hash(known) == plan_hash(job)
     except (WrapError, OSError):
         return False
-
-
-def _default(value: int | None, path: str) -> int:
-    from ..core.settings import declared
-
-    return int(declared(path).default) if value is None else value
