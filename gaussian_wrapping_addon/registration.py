@@ -77,13 +77,13 @@ HANDLERS: Final[tuple[tuple[str, Callable[..., None]], ...]] = (
     ("load_pre", background.before_load),
     ("load_post", jobs.after_load),
     ("load_post", placement.after_load),
-    ("load_post", region_operators.after_load),
+    ("load_post", region_operators.forget),
     ("undo_post", jobs.after_undo),
     ("redo_post", jobs.after_undo),
     ("undo_post", placement.after_undo),
     ("redo_post", placement.after_undo),
-    ("undo_post", region_operators.after_load),
-    ("redo_post", region_operators.after_load),
+    ("undo_post", region_operators.forget),
+    ("redo_post", region_operators.forget),
     ("depsgraph_update_post", region_operators.after_update),
 )
 

@@ -39,22 +39,22 @@ def properties_of(owner: bpy.types.Scene | bpy.types.Object) -> Any:
 # -- Redraw areas of Blender's windows, and show that Blender is busy -----------------------------
 
 
+def _areas(*kinds: str) -> Iterator[bpy.types.Area]:
+    areas = (area for w in bpy.context.window_manager.windows for area in w.screen.areas)
+    return (area for area in areas if area.type in kinds)
+
+
 def redraw(*kinds: str) -> None:
     """Tag all areas of these types for redrawing; by default 3D views."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in (kinds or ("VIEW_3D",)):
-                area.tag_redraw()
+    for area in _areas(*(kinds or ("VIEW_3D",))):
+        area.tag_redraw()
 
 
 def redraw_sidebars() -> None:
     """Let the side panels of 3D views be drawn again, but not the views."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                for region in area.regions:
-                    if region.type == "UI":
-                        region.tag_redraw()
+    for region in (region for area in _areas("VIEW_3D") for region in area.regions):
+        if region.type == "UI":
+            region.tag_redraw()
 
 
 def redraw_status_bars() -> None:
@@ -307,9 +307,8 @@ def is_remote(folder: Path) -> bool:
 
 
 def _list_path() -> Path | None:
-    package = addon_package()
     with contextlib.suppress(ValueError, OSError):  # ValueError: not installed as an extension
-        return Path(bpy.utils.extension_path_user(package, create=True)) / _FILE
+        return Path(bpy.utils.extension_path_user(addon_package(), create=True)) / _FILE
     return None
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import queue
@@ -253,45 +254,6 @@ def stop() -> None:
 _endings = Lane()
 
 
-def run_child(
-    command: list[str],
-    on_start: Callable[[subprocess.Popen[bytes]], bool],
-    deadline_s: float,
-    late: WorkerError | None = None,
-) -> tuple[list[dict[str, Any]], str]:
-    """Run a child to its end; touches nothing of Blender.
-
-    ``on_start``: receives the process; returns false if the estimate is no longer wanted, which
-    ends it.
-    ``late``: raised where it takes too long, in place of the error of an estimate.
-    Returns ``messages``: JSON objects from standard output, one a line; ``last_words``: the last
-    line of standard error.
-    Raises WorkerError: the child does not start, or takes too long.
-    """
-    try:
-        process = spawn(command)
-    except OSError as error:
-        raise not_started(command[0], error) from None
-    if not on_start(process):
-        kill_group(process)
-    try:
-        output, words = process.communicate(timeout=deadline_s)
-    except subprocess.TimeoutExpired:
-        kill_group(process)
-        too_long = WorkerError("The estimate took too long.", "Start the job without it.")
-        raise late or too_long from None
-    found = []
-    for line in output.decode(errors="replace").splitlines():
-        try:
-            values = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(values, dict):
-            found.append(values)
-    last = words.decode(errors="replace").strip().splitlines()
-    return found, last[-1] if last else ""
-
-
 def get_ready() -> None:
     """Start the thread that ends children, ahead of a timer that uses it."""
     _endings.start()
@@ -308,13 +270,34 @@ class Child:
     def run(
         self, command: list[str], deadline_s: float, late: WorkerError | None = None
     ) -> tuple[list[dict[str, Any]], str]:
-        """Run a child to its end, in a thread; see :func:`run_child`."""
-        return run_child(command, self._on_start, deadline_s, late)
+        """Run a child to its end, in a thread; touches nothing of Blender.
 
-    def _on_start(self, process: subprocess.Popen[bytes]) -> bool:
+        ``late``: raised where it takes too long, in place of the error of an estimate.
+        Returns ``messages``: JSON objects from standard output, one a line; ``last_words``: the
+        last line of standard error.
+        Raises WorkerError: the child does not start, or takes too long.
+        """
+        try:
+            process = spawn(command)
+        except OSError as error:
+            raise not_started(command[0], error) from None
         with self._guard:
             self.process = process
-            return self._wanted
+            wanted = self._wanted
+        if not wanted:
+            kill_group(process)
+        try:
+            output, words = process.communicate(timeout=deadline_s)
+        except subprocess.TimeoutExpired:
+            kill_group(process)
+            too_long = WorkerError("The estimate took too long.", "Start the job without it.")
+            raise late or too_long from None
+        found = []
+        for line in output.decode(errors="replace").splitlines():
+            with contextlib.suppress(ValueError):
+                found.append(json.loads(line))
+        last = words.decode(errors="replace").strip().splitlines()
+        return [v for v in found if isinstance(v, dict)], last[-1] if last else ""
 
     def end(self) -> None:
         """Cancel: end the process in the background, or as soon as it has started."""

@@ -31,14 +31,6 @@ PHOTO_ALPHA = 0.7
 _CAM_FROM_BLENDER_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def camera_matrix(camera: Camera) -> np.ndarray:
-    """Return the (4, 4) float64 matrix of the Blender camera in the scene frame."""
-    scene_from_cam = np.eye(4)
-    scene_from_cam[:3, :3] = camera.rotation.T
-    scene_from_cam[:3, 3] = camera.center
-    return scene_from_cam @ _CAM_FROM_BLENDER_CAM
-
-
 def set_projection(data: bpy.types.Camera, camera: Camera) -> None:
     """Set lens, sensor and shift so that a render of the photo's size projects as the photo."""
     aspect = camera.fx / camera.fy  # height of a pixel over its width
@@ -66,7 +58,10 @@ def create_camera(
     data.clip_start, data.clip_end = CLIP_START, CLIP_END
     data.display_size = display_size
     thing = bpy.data.objects.new(camera.name, data)
-    thing.matrix_basis = Matrix(camera_matrix(camera).tolist())
+    scene_from_cam = np.eye(4)
+    scene_from_cam[:3, :3] = camera.rotation.T
+    scene_from_cam[:3, 3] = camera.center
+    thing.matrix_basis = Matrix((scene_from_cam @ _CAM_FROM_BLENDER_CAM).tolist())
     aspect = camera.fx / camera.fy
     thing[addon.KIND] = "camera"
     thing[addon.PHOTO] = photo
@@ -152,10 +147,9 @@ def show_photo(thing: bpy.types.Object) -> None:
     except RuntimeError as error:
         raise DatasetError(f"The photo {path} cannot be read: {error}.", hint) from None
     data = cast(bpy.types.Camera, thing.data)
-    background = data.background_images[0] if data.background_images else None
-    if background is None:
-        background = data.background_images.new()
-        background.alpha = PHOTO_ALPHA
+    if not data.background_images:
+        data.background_images.new().alpha = PHOTO_ALPHA
+    background = data.background_images[0]
     background.frame_method = "STRETCH"  # the frame has the photo's shape
     background.image = image
     data.show_background_images = True

@@ -120,7 +120,8 @@ class MaterialCopies:
         while f"{name}.png" in self.textures or f"{name}.jpg" in self.textures:
             count += 1
             name = f"{self._stem}-{plain}-{count}"
-        path = self._folder / f"{name}{_suffix(image)}"
+        suffix = ".jpg" if _is_file(image) and image.file_format == "JPEG" else ".png"
+        path = self._folder / f"{name}{suffix}"
         _write_image(image, path)
         copy = bpy.data.images.load(str(path), check_existing=False)
         copy.name = name
@@ -140,10 +141,6 @@ def lend_name(original: bpy.types.ID, copy: bpy.types.ID) -> str:
         original.name = f"exported {name}"
     copy.name = name
     return name
-
-
-def _suffix(image: bpy.types.Image) -> str:
-    return ".jpg" if _is_file(image) and image.file_format == "JPEG" else ".png"
 
 
 def _is_file(image: bpy.types.Image) -> bool:
@@ -218,11 +215,9 @@ def pixels_of(image: bpy.types.Image) -> np.ndarray:
 
 
 _OPERATORS = {
-    "glb": "export_scene.gltf",
-    "obj": "wm.obj_export",
-    "usd": "wm.usd_export",
+    "glb": "export_scene.gltf", "obj": "wm.obj_export", "usd": "wm.usd_export",
     "fbx": "export_scene.fbx",
-}
+}  # fmt: skip
 _SAME_PLACE = 1e-6
 """Object matrices are single precision: a mesh this near its parent's place has not been moved."""
 
@@ -355,7 +350,10 @@ def _write(
     count = len(data.loop_triangles)
     faces = values_of(data.loop_triangles, "vertices", 3, np.int32).reshape(-1, 3)
     corners = values_of(data.loop_triangles, "loops", 3, np.int32)
-    uvs = _corner_uvs(data, corners)
+    layer, uvs = data.uv_layers.active, None
+    if layer is not None:
+        of_loops = values_of(layer.uv, "vector", 2, np.float32).reshape(-1, 2)
+        uvs = of_loops[corners].reshape(-1, 3, 2)
     validate_for_export(local, faces, uvs, name=f"mesh {thing.name}")
     vertices: Any = data.vertices
     vertices.foreach_set("co", local.astype(np.float32).ravel())
@@ -374,10 +372,8 @@ def _write(
         images = request.folder
         if inside:
             images = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gwrap-")))
-        copies = MaterialCopies(
-            stem, images,
-            unlit=kind.unlit, fold_specular=request.format == "usd",
-        )  # fmt: skip
+        folded = request.format == "usd"
+        copies = MaterialCopies(stem, images, unlit=kind.unlit, fold_specular=folded)
         stack.callback(copies.remove)
         for index, material in enumerate(data.materials):
             if material is not None:
@@ -388,14 +384,6 @@ def _write(
         contents["shading"] = copies.shading
     contents["textures"] = [] if inside else copies.textures
     return path, contents
-
-
-def _corner_uvs(data: bpy.types.Mesh, corners: np.ndarray) -> np.ndarray | None:
-    layer = data.uv_layers.active
-    if layer is None:
-        return None
-    uvs = values_of(layer.uv, "vector", 2, np.float32)
-    return uvs.reshape(-1, 2)[corners].reshape(-1, 3, 2)
 
 
 def _colors(
@@ -517,14 +505,10 @@ def export_result(
     for material in materials_of(imported.frame):
         set_shading(material, "UNLIT" if shading == "unlit" else "LIT")
     kinds = ("mesh", "lod") if levels else ("mesh",)
-    things = [
-        thing
-        for thing in imported.frame.children
-        if addon.kind_of(thing) in kinds and (not regions or thing[addon.REGION] in regions)
-    ]
-    return [
-        path for request in requests for path in export_objects(imported.frame, things, request)
-    ]
+    meshes = (t for t in imported.frame.children if addon.kind_of(t) in kinds)
+    things = [t for t in meshes if not regions or t[addon.REGION] in regions]
+    paths = (export_objects(imported.frame, things, request) for request in requests)
+    return [path for written in paths for path in written]
 
 
 # -- Operators that export meshes and pack textures -----------------------------------------------
@@ -572,8 +556,7 @@ class GWRAP_OT_export_meshes(NeedsResult, NeedsObjectMode, bpy.types.Operator):
 
     def draw(self, _context: bpy.types.Context) -> None:
         layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout.use_property_split, layout.use_property_decorate = True, False
         layout.prop(self, "format")
         layout.prop(self, "scope", expand=True)
         if self.scope == "ALL":
@@ -594,12 +577,9 @@ class GWRAP_OT_export_meshes(NeedsResult, NeedsObjectMode, bpy.types.Operator):
             kinds = addon.WITH_TEXTURE if self.levels else ("mesh", "baked")
             children = frame.children_recursive if frame is not None else ()
             chosen = [t for t in children if addon.kind_of(t) in kinds]
-        request = ObjectExport(
-            self.format.lower(),
-            real_path(bpy.path.abspath(self.directory)),
-            self.placed,
-            self.pack and self.format.lower() in PACKABLE_FORMATS,
-        )
+        chosen_format, folder = self.format.lower(), real_path(bpy.path.abspath(self.directory))
+        packs = self.pack and chosen_format in PACKABLE_FORMATS
+        request = ObjectExport(chosen_format, folder, self.placed, packs)
         paths = []
         frames = {t: owner for t in chosen if (owner := addon.frame_of(t)) is not None}
         for owner in dict.fromkeys(frames.values()):
@@ -617,34 +597,30 @@ class GWRAP_OT_pack_images(NeedsResult, bpy.types.Operator):
     pack: BoolProperty(name="Pack", default=True)  # type: ignore[valid-type]
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = addon.current_frame(context)
         count = 0
-        for image in images_of(frame):
-            if self.pack and image.packed_file is None:
-                if not Path(bpy.path.abspath(image.filepath)).is_file():
-                    raise UsageError(
-                        f"The texture {image.filepath} does not exist.", "Import the result again."
-                    )
-                image.pack()
-                count += 1
-            elif not self.pack and image.packed_file is not None:
-                there = Path(bpy.path.abspath(image.filepath)).is_file()
+        for image in images_of(addon.current_frame(context)):
+            if self.pack == (image.packed_file is not None):
+                continue
+            there = Path(bpy.path.abspath(image.filepath)).is_file()
+            if not self.pack:
                 # A file that is there is the result's own, never written over.
                 image.unpack(method="USE_ORIGINAL" if there else "WRITE_ORIGINAL")
-                count += 1
+            elif there:
+                image.pack()
+            else:
+                raise UsageError(
+                    f"The texture {image.filepath} does not exist.", "Import the result again."
+                )
+            count += 1
         self.report({"INFO"}, f"{count} textures {'packed' if self.pack else 'unpacked'}")
         return {"FINISHED"}
 
 
 def chosen_meshes(context: bpy.types.Context) -> list[bpy.types.Object]:
     """Return the selected meshes of results, with levels and lighter meshes."""
-    return [
-        t
-        for t in context.selected_objects
-        if addon.kind_of(t) in addon.WITH_TEXTURE
-        and t.type == "MESH"
-        and addon.frame_of(t) is not None
-    ]
+    meshes = (t for t in context.selected_objects if t.type == "MESH")
+    ours = (t for t in meshes if addon.kind_of(t) in addon.WITH_TEXTURE)
+    return [t for t in ours if addon.frame_of(t) is not None]
 
 
 CLASSES: Final = (GWRAP_OT_export_meshes, GWRAP_OT_pack_images)

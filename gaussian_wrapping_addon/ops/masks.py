@@ -182,12 +182,10 @@ def _show() -> None:
     mask = review.masks.masks[review.index]
     photo = _pixels(review.folder / mask.image, LONGEST_PX)
     path = review.folder / FOLDER / mask.file
-    kept = (
-        _pixels(path, 0, (photo.shape[1], photo.shape[0]))[..., 0] >= THRESHOLD
-        if path.is_file()
-        else None
-    )
-    picture = overlaid(photo, np.zeros(photo.shape[:2], bool) if kept is None else kept)
+    kept = np.zeros(photo.shape[:2], bool)
+    if path.is_file():
+        kept = _pixels(path, 0, (photo.shape[1], photo.shape[0]))[..., 0] >= THRESHOLD
+    picture = overlaid(photo, kept)
     _put_into_image(picture)
     step_px = max(1, -(-max(picture.shape[:2]) // ICON_PX))
     if _icons is None:

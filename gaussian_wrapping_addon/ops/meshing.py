@@ -57,25 +57,11 @@ class EstimateInputs:
         return self.rest == other.rest and bool(same)
 
 
-@dataclass(frozen=True)
-class _Request:
-    uid: int
-    body: dict[str, Any]
-    """The region file's content."""
-    request: dict[str, Any]
-    python: str
-
-
-@dataclass(frozen=True)
-class _Running:
-    child: Child
-    task: Task[Estimate]
-
-
 @dataclass
 class _State:
-    running: dict[int, _Running] = field(default_factory=dict)
     """By the region's session id."""
+
+    running: dict[int, Task[Estimate]] = field(default_factory=dict)
     inputs: dict[int, EstimateInputs] = field(default_factory=dict)
     estimates: dict[int, Estimate] = field(default_factory=dict)
 
@@ -92,7 +78,7 @@ def is_busy() -> bool:
 def is_waiting(region: bpy.types.Object) -> bool:
     """Return whether a region's estimate is running."""
     running = _state.running.get(region.session_uid)
-    return running is not None and running.task.pending
+    return running is not None and running.pending
 
 
 def estimate_for(scene: bpy.types.Scene, region: bpy.types.Object) -> tuple[Estimate | None, bool]:
@@ -132,43 +118,41 @@ def start(
     started.
     """
     interpreter = worker_python(python)
-    requests = [_request(scene, region, folder, interpreter) for region in regions]
+    requests = {
+        region.session_uid: (_request(scene, region, folder), region_body(region))
+        for region in regions
+    }
     cancel_estimates()
     for region in regions:
         _state.inputs[region.session_uid] = inputs_of(scene, region)
         _state.estimates.pop(region.session_uid, None)
-    for request in requests:
+    for uid, request in requests.items():
         child = Child()
-        task = _requests.submit(
-            partial(_run, child, request),
-            partial(_keep, request.uid),
-            failed=partial(_keep_failure, request.uid),
+        _state.running[uid] = _requests.submit(
+            partial(_run, child, interpreter, *request),
+            partial(_keep, uid),
+            failed=partial(_keep_failure, uid),
             end=child.end,
         )
-        _state.running[request.uid] = _Running(child, task)
 
 
-def _request(
-    scene: bpy.types.Scene, region: bpy.types.Object, folder: Path, python: str
-) -> _Request:
+def _request(scene: bpy.types.Scene, region: bpy.types.Object, folder: Path) -> dict[str, Any]:
     frame = addon.frame_of(region)
     assert frame is not None  # whoever starts has found the job folder by it
     length = checked_edge_length(scene, region) * world_per_blender(frame)
     values = {**method_choices(scene), "edge_length": length}
     if length:
         values["points"] = 0
-    meshing = MeshingSettings(**values)
-    request = {"out": str(folder), "meshing": to_json(meshing), "threads": 0}
-    return _Request(region.session_uid, region_body(region), request, python)
+    return {"out": str(folder), "meshing": to_json(MeshingSettings(**values)), "threads": 0}
 
 
-def _run(child: Child, request: _Request) -> Estimate:
-    """Run one estimate; in a thread."""
+def _run(child: Child, python: str, request: dict[str, Any], body: dict[str, Any]) -> Estimate:
+    """Run one estimate of a region file's content; in a thread."""
     with tempfile.TemporaryDirectory(prefix="gwrap-") as folder:
         path = os.path.join(folder, "region.json")
-        write_json(Path(path), request.body)
-        text = json.dumps({**request.request, "region": path}, allow_nan=False)
-        command = child_command(MODULE, text, python=request.python)
+        write_json(Path(path), body)
+        text = json.dumps({**request, "region": path}, allow_nan=False)
+        command = child_command(MODULE, text, python=python)
         return estimate_of(*child.run(command, DEADLINE_S))
 
 

@@ -108,11 +108,8 @@ _POINT_SIZE = 0.05
 
 def point_empties(context: bpy.types.Context) -> list[bpy.types.Object]:
     """Return the selected empties that are points: no region, no parent of a result."""
-    return [
-        thing
-        for thing in context.selected_objects
-        if thing.type == "EMPTY" and addon.kind_of(thing) in ("", "point")
-    ]
+    empties = (thing for thing in context.selected_objects if thing.type == "EMPTY")
+    return [thing for thing in empties if addon.kind_of(thing) in ("", "point")]
 
 
 def picked_points(context: bpy.types.Context, frame: bpy.types.Object) -> np.ndarray:
@@ -173,9 +170,8 @@ def add_point(context: bpy.types.Context, frame: bpy.types.Object) -> bpy.types.
     point.parent = frame
     point.location = transformed(scene_from_blender(frame), cursor[None])[0].tolist()
     point[addon.KIND] = "point"
-    (frame.users_collection[0] if frame.users_collection else context.collection).objects.link(
-        point
-    )
+    collection = frame.users_collection[0] if frame.users_collection else context.collection
+    collection.objects.link(point)
     context.view_layer.update()  # a new object cannot be selected before
     point.select_set(True)
     context.view_layer.objects.active = point
@@ -398,14 +394,9 @@ class GWRAP_OT_set_scale(_Tool, bpy.types.Operator):
     distance: FloatProperty(  # type: ignore[valid-type]
         name="True Distance",
         description="Distance of the two points; units may be typed, such as 35 cm",
-        default=1.0,
-        min=0.0,
-        soft_min=1e-3,
-        precision=4,
-        subtype="DISTANCE",
-        unit="LENGTH",
+        default=1.0, min=0.0, soft_min=1e-3, precision=4, subtype="DISTANCE", unit="LENGTH",
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         try:

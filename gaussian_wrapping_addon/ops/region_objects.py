@@ -158,7 +158,7 @@ def scene_from_blender(frame: bpy.types.Object | None) -> np.ndarray:
     return inverse
 
 
-def hull_in_blender(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
+def hull_in_blender(thing: bpy.types.Object) -> tuple[np.ndarray, Triangles]:
     """Return the convex hull of a region object in Blender's world.
 
     ``thing``: an Empty displayed as a cube, or a mesh (with its modifiers).
@@ -171,7 +171,7 @@ def hull_in_blender(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int
     return vertices, triangles
 
 
-def local_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
+def local_hull(thing: bpy.types.Object) -> tuple[np.ndarray, Triangles]:
     """Return the convex hull of a region object in its own coordinates.
 
     As :func:`hull_in_blender`, which also checks that it encloses a volume.
@@ -189,7 +189,7 @@ def local_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int
     )
 
 
-def _mesh_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
+def _mesh_hull(thing: bpy.types.Object) -> tuple[np.ndarray, Triangles]:
     shown = evaluated(thing)
     mesh = shown.to_mesh()
     points = values_of(mesh.vertices, "co", 3, np.float32)
@@ -262,7 +262,16 @@ def create_region(
         thing.matrix_basis = Matrix(matrix.tolist())
     else:
         center = vertices.mean(0)
-        thing = bpy.data.objects.new(name, _hull_mesh(name, vertices - center))
+        mesh = bpy.data.meshes.new(name)
+        work = bmesh.new()
+        try:
+            for vertex in vertices - center:
+                work.verts.new(vertex.tolist())
+            bmesh.ops.convex_hull(work, input=work.verts[:])
+            work.to_mesh(mesh)
+        finally:
+            work.free()
+        thing = bpy.data.objects.new(name, mesh)
         thing.display_type = "WIRE"
         thing.hide_render = True
         thing.location = center.tolist()
@@ -272,19 +281,6 @@ def create_region(
         thing.parent = frame
     collection.objects.link(thing)
     return thing
-
-
-def _hull_mesh(name: str, vertices: np.ndarray) -> bpy.types.Mesh:
-    work = bmesh.new()
-    try:
-        for vertex in vertices:
-            work.verts.new(vertex.tolist())
-        bmesh.ops.convex_hull(work, input=work.verts[:])
-        mesh = bpy.data.meshes.new(name)
-        work.to_mesh(mesh)
-    finally:
-        work.free()
-    return mesh
 
 
 def box_around(things: list[bpy.types.Object], frame: bpy.types.Object | None) -> np.ndarray:
@@ -425,23 +421,3 @@ def steadied(cage: np.ndarray, first: np.ndarray, before: np.ndarray) -> np.ndar
                 low = now
         result[axis, axis], result[axis, 3] = 0.5 * (now - low), center + 0.5 * (now + low)
     return result
-
-
-def is_moved_only(cage: np.ndarray, before: np.ndarray) -> bool:
-    """Return whether a cage has kept its size."""
-    return bool(np.allclose(cage.diagonal(), before.diagonal(), rtol=1e-6))
-
-
-def as_columns(matrix: np.ndarray) -> list[float]:
-    """Return the 16 numbers of a matrix in the order of gizmos."""
-    return [float(value) for value in matrix.T.ravel()]
-
-
-def from_columns(values: object) -> np.ndarray:
-    """Return the (4, 4) matrix of a gizmo's 16 numbers."""
-    return np.array(values, np.float64).reshape(4, 4).T
-
-
-def same_place(a: Matrix, b: Matrix) -> bool:
-    """Return whether two matrices are equal up to rounding."""
-    return bool(np.allclose(np.array(a), np.array(b), rtol=1e-6, atol=1e-9))

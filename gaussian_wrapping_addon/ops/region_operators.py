@@ -46,11 +46,8 @@ def edge_length_in_blender(scene: bpy.types.Scene, region: bpy.types.Object) -> 
     """Return the edge length that applies, in Blender units; 0 if none does."""
     if has_own(scene, region):
         return float(properties_of(region).edge_length)
-    return (
-        float(properties_of(scene).edge_length)
-        if properties_of(scene).resolution == "EDGE_LENGTH"
-        else 0.0
-    )
+    applies = properties_of(scene).resolution == "EDGE_LENGTH"
+    return float(properties_of(scene).edge_length) if applies else 0.0
 
 
 def checked_edge_length(scene: bpy.types.Scene, region: bpy.types.Object) -> float:
@@ -140,13 +137,8 @@ def after_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None 
 
 
 @persistent
-def after_load(*_arguments: object) -> None:
-    """Handler: another file, or an undo; session ids may mean other objects."""
-    forget()
-
-
-def forget() -> None:
-    """Clear the cache."""
+def forget(*_arguments: object) -> None:
+    """Clear the cache. Handler: another file, or an undo; session ids may mean other objects."""
     _known.names.clear()
     _known.versions.clear()
 
@@ -208,12 +200,8 @@ def _target(context: bpy.types.Context) -> tuple[bpy.types.Object | None, bpy.ty
     # Linked and overridden collections accept no new objects; objects excluded from the view layer
     # cannot be selected.
     shown = _shown_collections(context.view_layer.layer_collection)
-    places = [
-        c
-        for c in frame.users_collection
-        if c in shown and c.library is None and c.override_library is None
-    ]
-    return frame, places[0] if places else context.scene.collection
+    own = (c for c in frame.users_collection if c.library is None and c.override_library is None)
+    return frame, next((c for c in own if c in shown), context.scene.collection)
 
 
 def _shown_collections(layer: bpy.types.LayerCollection) -> list[bpy.types.Collection]:
@@ -246,7 +234,7 @@ class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
             things = [t for t in context.selected_objects if addon.kind_of(t) != "region"]
             vertices = box_around(things, frame)
         elif self.around == "RESULT":
-            vertices = self._result_box(context, frame)
+            vertices = self._result_box(context)
         else:
             inverse = scene_from_blender(frame)
             cursor = np.array(context.scene.cursor.location, np.float64)
@@ -256,14 +244,10 @@ class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
         _select_only(context, thing)
         return {"FINISHED"}
 
-    def _result_box(self, context: bpy.types.Context, frame: bpy.types.Object | None) -> np.ndarray:
-        if frame is None:
-            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
-        regions = [
-            t
-            for t in addon.objects_of_kind(context.scene, "region")
-            if addon.frame_of(t) == frame and t.get(addon.REGION)
-        ]
+    def _result_box(self, context: bpy.types.Context) -> np.ndarray:
+        frame = addon.needed_frame(context)
+        own = (t for t in addon.objects_of_kind(context.scene, "region") if t.get(addon.REGION))
+        regions = [t for t in own if addon.frame_of(t) == frame]
         regions.sort(key=lambda t: t[addon.REGION] != "auto")
         if not regions:
             return box_around([t for t in frame.children if addon.kind_of(t) == "mesh"], frame)
@@ -392,8 +376,7 @@ class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
             active.matrix_world = matrix
         active[addon.KIND] = "region"
         active.display_type = "WIRE"
-        active.show_in_front = True
-        active.hide_render = True
+        active.show_in_front = active.hide_render = True
         return {"FINISHED"}
 
 

@@ -28,13 +28,9 @@ MAX_ROWS = 100
 """Stages and regions stored at most."""
 
 _DECISIONS = {
-    "exposure": "Exposure",
-    "multi_view": "Compare Photos",
-    "growth": "Add Gaussians",
-    "full_size": "Photo Size",
-    "dense_start": "Dense Start",
-    "refine_poses": "Refine Cameras",
-}
+    "exposure": "Exposure", "multi_view": "Compare Photos", "growth": "Add Gaussians",
+    "full_size": "Photo Size", "dense_start": "Dense Start", "refine_poses": "Refine Cameras",
+}  # fmt: skip
 """Labels of what was decided, as the panel Training has them."""
 
 _STAGES = {

@@ -86,10 +86,10 @@ def is_busy() -> bool:
 
 def as_text() -> str:
     """Return the findings for a bug report, with the home folder masked."""
-    lines = [
+    lines = (
         f"good {f.subject}: {f.finding}" if f.good else f"BAD  {f.subject}: {f.finding} {f.hint}"
         for f in _findings
-    ]
+    )
     return "\n".join(lines).replace(str(Path.home()), "~")
 
 
@@ -346,7 +346,7 @@ def _reads(extra: Extra) -> str:
 
 
 def command_lines(
-    context: bpy.types.Context, path: str, torch: str, extras: Iterable[str] = ()
+    context: bpy.types.Context, path: str, torch: str, extras: Iterable[str]
 ) -> list[str]:
     """Return the commands that a set-up with these choices runs.
 
@@ -429,18 +429,15 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
         _draw_commands(layout, lines)
         if self.torch == CUDA:
             layout.label(text=tr(CUDA_BRINGS), icon="MEMORY", translate=False)
-        text = (
-            tr("About 2 GiB on the disk; several minutes. Blender stays usable meanwhile")
-            if self.torch == "cpu"
-            else tr("Up to 10 GiB on the disk; many minutes. Blender stays usable meanwhile")
-        )
-        layout.label(text=text, icon="INFO", translate=False)
+        text = "Up to 10 GiB on the disk; many minutes. Blender stays usable meanwhile"
+        if self.torch == "cpu":
+            text = "About 2 GiB on the disk; several minutes. Blender stays usable meanwhile"
+        layout.label(text=tr(text), icon="INFO", translate=False)
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        found = state.pythons or []
-        python = self.python or found[0].path
-        request = request_for(python, self.torch or "cpu", wheel_folder(context), self.extras)
-        start_setup(request)
+        python = self.python or (state.pythons or [])[0].path
+        folder = wheel_folder(context)
+        start_setup(request_for(python, self.torch or "cpu", folder, self.extras))
         return {"FINISHED"}
 
 
@@ -472,8 +469,7 @@ class GWRAP_OT_add_extra(ReportsErrors, bpy.types.Operator):
         _draw_commands(layout, lines)
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        request = request_for("", "cpu", wheel_folder(context), (self.extra,), adds=True)
-        start_setup(request)
+        start_setup(request_for("", "cpu", wheel_folder(context), (self.extra,), adds=True))
         return {"FINISHED"}
 
 

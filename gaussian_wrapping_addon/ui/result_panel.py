@@ -17,7 +17,7 @@ from ..ops.placement import point_empties
 from ..ops.report_data import report_of
 from ..ops.results import materials_of
 from ..ops.scene_objects import cameras_of, images_of, shading_of
-from .panel_base import Readiness, TabPanel, characters_of, table, wrapped_label
+from .panel_base import InTab, Readiness, TabPanel, characters_of, table, wrapped_label
 
 # -- The sub-panel "Report" of the result: times, accuracy, regions, warnings ---------------------
 
@@ -25,10 +25,7 @@ from .panel_base import Readiness, TabPanel, characters_of, table, wrapped_label
 _MAX_WARNINGS: Final = 8
 
 
-class GWRAP_PT_report(bpy.types.Panel):
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "Gaussian Wrapping"
+class GWRAP_PT_report(InTab, bpy.types.Panel):
     bl_parent_id = "GWRAP_PT_result"
     bl_label = "Report"
 
@@ -46,18 +43,15 @@ class GWRAP_PT_report(bpy.types.Panel):
         table(layout, report.rows)
         if report.device_reason:
             wrapped_label(layout, report.device_reason, characters_of(context))
-        if report.stages:
-            box = layout.box()
-            box.label(text=tr("Time of the Stages"), icon="TIME", translate=False)
-            table(box, report.stages)
-        if report.decisions:
-            box = layout.box()
-            box.label(text=tr("Model Selection"), icon="OPTIONS", translate=False)
-            table(box, report.decisions)
-        for region in report.regions:
-            box = layout.box()
-            box.label(text=region.name, icon="MESH_DATA", translate=False)
-            table(box, region.rows)
+        for title, icon, rows in (
+            (tr("Time of the Stages"), "TIME", report.stages),
+            (tr("Model Selection"), "OPTIONS", report.decisions),
+            *((region.name, "MESH_DATA", region.rows) for region in report.regions),
+        ):
+            if rows:
+                box = layout.box()
+                box.label(text=title, icon=icon, translate=False)
+                table(box, rows)
         self._warnings(layout, report.warnings, characters_of(context))
         column = layout.column(align=True)
         row = column.row(align=True)
@@ -123,10 +117,7 @@ class GWRAP_PT_result(TabPanel, bpy.types.Panel):
 # -- The panel "Scene Tools": photo cameras, true scale, ground and origin of a result ------------
 
 
-class GWRAP_PT_scene_tools(bpy.types.Panel):
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "Gaussian Wrapping"
+class GWRAP_PT_scene_tools(InTab, bpy.types.Panel):
     bl_label = "Scene Tools"
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -149,21 +140,15 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
         collection = cameras_of(frame.users_collection[0]) if frame.users_collection else None
         if collection is not None:
             self.layout.prop(
-                collection,
-                "hide_viewport",
-                text=tr("Show Photo Cameras"),
-                translate=False,
-                invert_checkbox=True,
-            )
+                collection, "hide_viewport", text=tr("Show Photo Cameras"),
+                translate=False, invert_checkbox=True,
+            )  # fmt: skip
         if not cameras_under(frame):
             return
-        row = self.layout.row(align=True)
-        selected: Any = row.operator("gwrap.view_photo", icon="CAMERA_DATA")
-        selected.step = 0
-        previous: Any = row.operator("gwrap.view_photo", text="", icon="TRIA_LEFT")
-        previous.step = -1
-        following: Any = row.operator("gwrap.view_photo", text="", icon="TRIA_RIGHT")
-        following.step = 1
+        row: Any = self.layout.row(align=True)
+        row.operator("gwrap.view_photo", icon="CAMERA_DATA").step = 0
+        row.operator("gwrap.view_photo", text="", icon="TRIA_LEFT").step = -1
+        row.operator("gwrap.view_photo", text="", icon="TRIA_RIGHT").step = 1
 
     def _points(self, context: bpy.types.Context) -> None:
         layout, characters = self.layout, characters_of(context)
@@ -177,12 +162,9 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
             wrapped_label(layout, text, characters, icon="INFO")
         elif len(points) == 2:
             first, second = (p.matrix_world.translation for p in points)
-            distance = bpy.utils.units.to_string(
-                context.scene.unit_settings.system,
-                "LENGTH",
-                (second - first).length * context.scene.unit_settings.scale_length,
-                precision=4,
-            )
+            units = context.scene.unit_settings
+            length = (second - first).length * units.scale_length
+            distance = bpy.utils.units.to_string(units.system, "LENGTH", length, precision=4)
             text = tr("2 points selected, {distance} apart", distance=distance)
             layout.label(text=text, translate=False)
         else:
