@@ -45,33 +45,14 @@ from .ui.translations import table
 _logger = logging.getLogger(__name__)
 
 CLASSES: Final[tuple[type, ...]] = (
-    *training_panel.PROPERTIES,
-    *mesh_panel.PROPERTIES,
-    *computers_panel.PROPERTIES,
-    *properties.CLASSES,
-    *region_panel.PROPERTIES,
-    *preferences.CLASSES,
-    *dataset.CLASSES,
-    *worker_setup.CLASSES,
-    *jobs.CLASSES,
-    *region_operators.CLASSES,
-    *meshing.CLASSES,
-    *masks.CLASSES,
-    *baking.CLASSES,
-    *computers.CLASSES,
-    *results.CLASSES,
-    *export.CLASSES,
-    *cameras.CLASSES,
-    *placement.CLASSES,
-    *training.CLASSES,
-    *presets.CLASSES,
-    *dataset_panel.CLASSES,
-    *training_panel.CLASSES,
-    *computers_panel.CLASSES,
-    *region_panel.CLASSES,
-    *mesh_panel.CLASSES,
-    *result_panel.CLASSES,
-)
+    *training_panel.PROPERTIES, *mesh_panel.PROPERTIES, *computers_panel.PROPERTIES,
+    *properties.CLASSES, *region_panel.PROPERTIES, *preferences.CLASSES, *dataset.CLASSES,
+    *worker_setup.CLASSES, *jobs.CLASSES, *region_operators.CLASSES, *meshing.CLASSES,
+    *masks.CLASSES, *baking.CLASSES, *computers.CLASSES, *results.CLASSES, *export.CLASSES,
+    *cameras.CLASSES, *placement.CLASSES, *training.CLASSES, *presets.CLASSES,
+    *dataset_panel.CLASSES, *training_panel.CLASSES, *computers_panel.CLASSES,
+    *region_panel.CLASSES, *mesh_panel.CLASSES, *result_panel.CLASSES,
+)  # fmt: skip
 
 HANDLERS: Final[tuple[tuple[str, Callable[..., None]], ...]] = (
     ("load_pre", background.before_load),

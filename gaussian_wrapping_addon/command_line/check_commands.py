@@ -18,7 +18,6 @@ _logger = logging.getLogger("gaussian_wrapping")
 
 
 def add_check(commands: Commands) -> None:
-    """Add ``check``."""
     parser = commands.add_parser("check", help="findings about an input, without starting anything")
     parser.add_argument("input", type=Path)
     parser.add_argument(
@@ -61,7 +60,6 @@ def _look_at_photos(source: Path, threads: int) -> int:
 
 
 def add_doctor(commands: Commands) -> None:
-    """Add ``doctor``."""
     parser = commands.add_parser("doctor", help="findings about the worker's Python")
     parser.set_defaults(run=_doctor)
 
@@ -82,7 +80,6 @@ MIN_IMAGE_PX = 64
 
 
 def add_evaluate(commands: Commands) -> None:
-    """Add ``evaluate``."""
     parser = commands.add_parser(
         "evaluate", help="score a mesh or a job against a ground truth or photos"
     )

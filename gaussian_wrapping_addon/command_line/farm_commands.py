@@ -13,8 +13,9 @@ import sys
 import threading
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..core.errors import EXIT_CANCELLED, UsageError
 from ..core.farm.addresses import checked_folder, scheduler_address
@@ -33,14 +34,10 @@ from ..core.settings.declaration import MAX_PROCESSES
 from .job_commands import run_in_worker
 from .options import Commands
 
-if TYPE_CHECKING:
-    from ..core.farm.hosts import Host
-
 _BATCH = Path(__file__).resolve().parents[1] / "batch.py"
 
 
 def add_certificates(parser: ArgumentParser) -> None:
-    """Add ``--certificates``."""
     parser.add_argument(
         "--certificates", default="", metavar="DIR", help="folder of the farm's certificates"
     )
@@ -60,7 +57,6 @@ _GRACE_S = 12.0
 
 
 def add_ssh(commands: Any) -> None:
-    """Add ``ssh``."""
     parser = commands.add_parser(
         "ssh", help="run a Dask scheduler here, and a worker on each of several computers by SSH"
     )
@@ -93,17 +89,7 @@ def _ssh(options: Namespace) -> int:
     return in_worker("ssh", request)
 
 
-def add_slurm(commands: Any) -> None:
-    """Add ``slurm``."""
-    _add_system(commands, "slurm", "SLURM")
-
-
-def add_pbs(commands: Any) -> None:
-    """Add ``pbs``."""
-    _add_system(commands, "pbs", "PBS")
-
-
-def _add_system(commands: Any, name: str, title: str) -> None:
+def _add_system(name: str, title: str, commands: Any) -> None:
     parser = commands.add_parser(
         name, help=f"run a Dask scheduler here, and workers as jobs of {title}"
     )
@@ -212,7 +198,7 @@ def _scheduler(options: Namespace) -> int:
 
 def _add_worker(commands: Any) -> None:
     parser = commands.add_parser("worker", help="let this computer work for a Dask scheduler")
-    _add_address(parser)
+    parser.add_argument("address", metavar="tls://HOST:PORT", help="of the scheduler")
     add_certificates(parser)
     parser.add_argument(
         "--shared", default="", metavar="DIR",
@@ -256,7 +242,7 @@ def _add_doctor(commands: Any) -> None:
     parser = commands.add_parser(
         "doctor", help="check each worker of a Dask scheduler: versions, memory, shared folder"
     )
-    _add_address(parser)
+    parser.add_argument("address", metavar="tls://HOST:PORT", help="of the scheduler")
     add_certificates(parser)
     parser.add_argument(
         "--shared", default="", metavar="DIR",
@@ -285,12 +271,9 @@ def _doctor(options: Namespace) -> int:
     return in_worker("doctor", request)
 
 
-def _add_address(parser: ArgumentParser) -> None:
-    parser.add_argument("address", metavar="tls://HOST:PORT", help="of the scheduler")
-
-
 DASK_COMMANDS = (
-    _add_make_certificates, _add_scheduler, _add_worker, add_ssh, add_slurm, add_pbs, _add_doctor,
+    _add_make_certificates, _add_scheduler, _add_worker, add_ssh,
+    partial(_add_system, "slurm", "SLURM"), partial(_add_system, "pbs", "PBS"), _add_doctor,
 )  # fmt: skip
 """In the order shown by ``farm --help``."""
 

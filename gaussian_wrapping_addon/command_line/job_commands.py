@@ -160,14 +160,12 @@ LEFT = "left"
 
 
 def add_status(commands: Commands) -> None:
-    """Add ``status``."""
     parser = commands.add_parser("status", help="what a job is doing, or how it ended")
     _add_folder(parser)
     parser.set_defaults(run=_status)
 
 
 def add_cancel(commands: Commands) -> None:
-    """Add ``cancel``."""
     parser = commands.add_parser("cancel", help="stop a running job, which can be resumed")
     _add_folder(parser)
     parser.set_defaults(run=_cancel)
@@ -235,9 +233,8 @@ def _ends_within(client: JobClient, seconds: float) -> bool:
 
 
 def add_parts(commands: Commands) -> None:
-    """Add ``parts``."""
     parser = commands.add_parser("parts", help="the parts of a job, and how far each is")
-    parser.add_argument("out", type=Path, metavar="DIR", help="job folder of that job")
+    _add_folder(parser)
     parser.set_defaults(run=_parts)
 
 
@@ -267,11 +264,10 @@ def _parts(options: Namespace) -> int:
 
 
 def add_run_part(commands: Commands) -> None:
-    """Add ``run-part``."""
     parser = commands.add_parser(
         "run-part", help="run one part of a planned job here, as a farm does"
     )
-    parser.add_argument("out", type=Path, metavar="DIR", help="job folder of that job")
+    _add_folder(parser)
     parser.add_argument("part", metavar="PART", help="its name, as parts DIR lists it")
     add_threads(parser)
     add_device(parser, kept=True)

@@ -25,6 +25,7 @@ from ..core.names import (
 from ..core.settings import (
     UP_AXES,
     UV_CHOICES,
+    Declaration,
     JobSettings,
     MeshingSettings,
     TextureSettings,
@@ -47,13 +48,11 @@ from .options import (
 if TYPE_CHECKING:
     from ..core.jobs.client import JobClient
     from ..core.jobs.store.job_file import JobFile
-    from ..core.settings import Declaration
 
 _logger = logging.getLogger("gaussian_wrapping")
 
 
 def add_mesh(commands: Commands) -> None:
-    """Add ``mesh``."""
     parser = commands.add_parser(
         "mesh", help="mesh another region or resolution of a finished training"
     )
@@ -86,7 +85,6 @@ def _trained(out: Path) -> JobFile:
 
 
 def add_estimate_mesh(commands: Commands) -> None:
-    """Add ``estimate-mesh``."""
     parser = commands.add_parser(
         "estimate-mesh", help="estimate triangles, time and memory of a region's mesh"
     )
@@ -123,7 +121,6 @@ def _texture_options() -> list[Declaration]:
 
 
 def add_bake(commands: Commands) -> None:
-    """Add ``bake``."""
     parser = commands.add_parser(
         "bake", help="bake the photos onto an edited, retopologised or foreign mesh"
     )
@@ -209,7 +206,6 @@ def _say_figures(folder: Path) -> None:
 
 
 def add_export(commands: Commands) -> None:
-    """Add ``export``."""
     parser = commands.add_parser(
         "export", help="export meshes of a finished job for other programs"
     )
@@ -278,7 +274,6 @@ def _export(options: Namespace) -> int:
 
 
 def add_convert_region(commands: Commands) -> None:
-    """Add ``convert-region``."""
     parser = commands.add_parser(
         "convert-region", help="convert a region file: JSON, or .rsbox of RealityScan"
     )

@@ -335,7 +335,6 @@ def add_out(parser: ArgumentParser) -> None:
 
 
 def add_threads(parser: ArgumentParser) -> None:
-    """Add ``--threads``."""
     threads = declared("threads")
     add_option(parser, threads, default=threads.default)
 

@@ -8,7 +8,6 @@ import sys
 import time
 from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..core.errors import EXIT_DONE, EXIT_OTHER, UsageError
 from ..core.jobs.install import (
@@ -35,9 +34,6 @@ from ..core.worker.environment import (
 )
 from .options import Commands
 
-if TYPE_CHECKING:
-    from ..core.jobs.install import SetupRequest
-
 _logger = logging.getLogger("gaussian_wrapping")
 
 POLL_S = 0.2
@@ -46,7 +42,6 @@ _OMIT = {False: "Omit --repair.", True: "Give --extras instead of --add, which s
 
 
 def add_set_up_worker(commands: Commands) -> None:
-    """Add ``set-up-worker``."""
     parser = commands.add_parser(
         "set-up-worker", help="create the private environment that workers run in"
     )
@@ -69,7 +64,8 @@ def add_set_up_worker(commands: Commands) -> None:
     )
     parser.add_argument(
         "--extras", default="", metavar="NAMES",
-        help="optional packages too, separated by commas: " + _extras_help(),
+        help="optional packages too, separated by commas: "
+        + "; ".join(f"{extra.name}: {extra.purpose}" for extra in EXTRAS),
     )  # fmt: skip
     parser.add_argument("--dry-run", action="store_true", help="only show the commands")
     action = parser.add_mutually_exclusive_group()
@@ -81,10 +77,6 @@ def add_set_up_worker(commands: Commands) -> None:
         "--add", default="", metavar="NAMES", help="add extras to the present environment"
     )
     parser.set_defaults(run=_set_up_worker)
-
-
-def _extras_help() -> str:
-    return "; ".join(f"{extra.name}: {extra.purpose}" for extra in EXTRAS)
 
 
 def _set_up_worker(options: Namespace) -> int:

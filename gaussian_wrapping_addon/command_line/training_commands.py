@@ -39,7 +39,6 @@ MOST_JOBS = 10_000
 
 
 def add_wrap(commands: Commands) -> None:
-    """Add ``wrap``."""
     parser = commands.add_parser(
         "wrap", help="make a textured mesh of photos, with or without cameras, or of a video"
     )
@@ -111,7 +110,6 @@ def _reject_frames_of_photos(job: JobFile) -> None:
 
 
 def add_continue_training(commands: Commands) -> None:
-    """Add ``more``."""
     parser = commands.add_parser(
         "more", help="continue the training of a finished job, then mesh it again"
     )
@@ -139,7 +137,6 @@ def _on_device(job: JobFile, options: Namespace) -> JobFile:
 
 
 def add_resume(commands: Commands) -> None:
-    """Add ``resume``."""
     parser = commands.add_parser("resume", help="resume a job that was stopped")
     parser.add_argument("out", type=Path, metavar="DIR")
     entry = declared("training.max_gaussians")
@@ -171,7 +168,6 @@ def _resume(options: Namespace) -> int:
 
 
 def add_estimate(commands: Commands) -> None:
-    """Add ``estimate``."""
     parser = commands.add_parser("estimate", help="estimate time, memory and disk of a training")
     parser.add_argument("input", type=Path)
     add_training_options(parser)
@@ -196,7 +192,6 @@ def _estimate(options: Namespace) -> int:
 
 
 def add_settings(commands: Commands) -> None:
-    """Add ``settings``."""
     parser = commands.add_parser("settings", help="list what --set NAME=VALUE can set")
     parser.add_argument("words", nargs="*", metavar="WORD", help="list those alone that have it")
     parser.set_defaults(run=_settings)
@@ -224,7 +219,6 @@ def _settings(options: Namespace) -> int:
 
 
 def add_queue(commands: Commands) -> None:
-    """Add ``queue``."""
     parser = commands.add_parser(
         "queue", help="wrap each folder of photos in a folder, and list the results"
     )

@@ -224,14 +224,15 @@ class ReportsErrors(_Operator):
         cls.poll_message_set(reason)
         return not reason
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         """Perform the operation."""
         raise NotImplementedError
 
     def execute(self, context: bpy.types.Context) -> OperatorResult:
         """Run :meth:`work`; Blender calls this."""
         try:
-            return self.work(context)
+            self.work(context)
+            return {"FINISHED"}
         except WrapError as error:
             _logger.info("%s: %s", type(self).__name__, error)
             self.report({"ERROR"}, str(error))

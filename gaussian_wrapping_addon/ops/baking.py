@@ -18,7 +18,7 @@ from ..core.mesh.exchange import FileMesh, write_handed_over
 from ..core.names import file_stem
 from ..core.settings import TextureSettings
 from . import addon
-from .addon import OperatorResult, properties_of, waiting
+from .addon import properties_of, waiting
 from .bake_objects import SUFFIXES, Triangulation, quads_of, triangulation_of, world_mesh
 from .jobs import ConfirmsFolder, launch, refuse_running, why_no_start
 from .panel_settings import job_folder_of, texture_choices
@@ -172,7 +172,7 @@ class GWRAP_OT_bake_photos(ConfirmsFolder, bpy.types.Operator):
             return "Select a mesh to bake the photos onto"
         return why_no_start(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame = addon.current_frame(context)
         thing = bake_target(context)
         if frame is None or thing is None:
@@ -180,7 +180,6 @@ class GWRAP_OT_bake_photos(ConfirmsFolder, bpy.types.Operator):
         with waiting(context):
             start_bake(context.scene, frame, thing, worker_choice(context))
         self.report({"INFO"}, f"Baking photos onto {thing.name}")
-        return {"FINISHED"}
 
 
 CLASSES: Final = (GWRAP_OT_bake_photos,)

@@ -14,7 +14,7 @@ from ..core.errors import DatasetError, UsageError
 from ..core.files import real_path, resolve_inside
 from ..core.scene.camera import Camera
 from . import addon
-from .addon import NeedsResult, OperatorResult
+from .addon import NeedsResult
 
 # -- Pinhole cameras as Blender cameras with the same projection ----------------------------------
 
@@ -173,7 +173,7 @@ class GWRAP_OT_view_photo(NeedsResult, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame, thing = self._camera(context)
         bring_forward(frame, thing)
         look_through(context.scene, thing)
@@ -185,7 +185,6 @@ class GWRAP_OT_view_photo(NeedsResult, bpy.types.Operator):
             show_photo(thing)
         except DatasetError as error:
             self.report({"WARNING"}, str(error))
-        return {"FINISHED"}
 
     def _camera(self, context: bpy.types.Context) -> tuple[bpy.types.Object, bpy.types.Object]:
         active = context.view_layer.objects.active

@@ -23,7 +23,7 @@ from ..core.jobs.parts.states import PartBoard, PartReader
 from ..core.names import SHARED_VARIABLE
 from ..core.worker.helper_process import child_command
 from . import addon, background
-from .addon import OperatorResult, ReportsErrors, properties_of, redraw_sidebars, tr
+from .addon import ReportsErrors, properties_of, redraw_sidebars, tr
 from .background import Child, Lane, Task
 from .panel_settings import certificates_of, output_of, source_of
 from .worker_setup import WorkerChoice, worker_choice
@@ -294,9 +294,8 @@ class GWRAP_OT_test_computers(ReportsErrors, bpy.types.Operator):
             return "Choose Dask to test an address"
         return "A request is running; it takes seconds" if is_busy() else ""
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         start(context.scene, worker_choice(context))
-        return {"FINISHED"}
 
 
 CLASSES: Final = (GWRAP_OT_test_computers,)

@@ -240,7 +240,7 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
         column.label(text=tr("or select a video,"), translate=False)
         column.label(text=tr("then press Choose Photos."), translate=False)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         if not self.filepath:
             raise UsageError("No folder was chosen.", "Open the folder of the photos.")
         path = Path(bpy.path.abspath(self.filepath))
@@ -257,7 +257,6 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
         training.forget()
         choice = worker_choice(context)
         start_check(context.scene, choice, python=choice.python)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
@@ -280,7 +279,7 @@ class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
             return {"CANCELLED"}
         return {"FINISHED"}
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         properties = properties_of(context.scene)
         check_now(context.scene, worker_choice(context).python)
         severities = [row.severity for row in properties.findings]
@@ -289,7 +288,6 @@ class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
             {"WARNING"} if errors or warnings else {"INFO"},
             f"Photos checked: {errors} errors, {warnings} warnings",
         )
-        return {"FINISHED"}
 
 
 CLASSES: Final = (GWRAP_OT_choose_input, GWRAP_OT_check_photos)

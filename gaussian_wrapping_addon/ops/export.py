@@ -565,7 +565,7 @@ class GWRAP_OT_export_meshes(NeedsResult, NeedsObjectMode, bpy.types.Operator):
         if self.format.lower() in PACKABLE_FORMATS:
             layout.prop(self, "pack")
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose the folder of the exported files.")
         frame = addon.current_frame(context)
@@ -585,7 +585,6 @@ class GWRAP_OT_export_meshes(NeedsResult, NeedsObjectMode, bpy.types.Operator):
         for owner in dict.fromkeys(frames.values()):
             paths += export_objects(owner, [t for t in chosen if frames.get(t) == owner], request)
         self.report({"INFO"}, f"{len(paths)} files written to {request.folder}")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_pack_images(NeedsResult, bpy.types.Operator):
@@ -596,7 +595,7 @@ class GWRAP_OT_pack_images(NeedsResult, bpy.types.Operator):
 
     pack: BoolProperty(name="Pack", default=True)  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         count = 0
         for image in images_of(addon.current_frame(context)):
             if self.pack == (image.packed_file is not None):
@@ -613,7 +612,6 @@ class GWRAP_OT_pack_images(NeedsResult, bpy.types.Operator):
                 )
             count += 1
         self.report({"INFO"}, f"{count} textures {'packed' if self.pack else 'unpacked'}")
-        return {"FINISHED"}
 
 
 def chosen_meshes(context: bpy.types.Context) -> list[bpy.types.Object]:

@@ -405,10 +405,9 @@ class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
             )
         return why_no_start(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         folder = start_wrap(context.scene, worker_choice(context))
         self.report({"INFO"}, f"Wrapping in {folder}")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_mesh_region(OnRegions, bpy.types.Operator):
@@ -433,11 +432,10 @@ class GWRAP_OT_mesh_region(OnRegions, bpy.types.Operator):
         # Without a selection, the checked regions are meant.
         return (not self.checked and selected_regions(context)) or checked_regions(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         regions = self.regions(context)
         start_mesh(context.scene, regions, worker_choice(context))
         self.report({"INFO"}, f"Meshing {', '.join(r.name for r in regions)}")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
@@ -449,9 +447,8 @@ class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
     def why_not(cls, context: bpy.types.Context) -> str:
         return "" if why_busy(context) else "No job is running; Wrap Scene starts one"
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         job_timer.cancel(properties_of(context.scene).job_folder)
-        return {"FINISHED"}
 
 
 class OnSceneJob(ConfirmsFolder):
@@ -477,9 +474,8 @@ class GWRAP_OT_resume_job(OnSceneJob, bpy.types.Operator):
             return "The job folder is missing; press Find Job if it was moved"
         return super().why_not(context) or why_busy(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         resume(context.scene, worker_choice(context))
-        return {"FINISHED"}
 
 
 class GWRAP_OT_find_job(ReportsErrors, bpy.types.Operator):
@@ -494,14 +490,13 @@ class GWRAP_OT_find_job(ReportsErrors, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose the folder of a job.")
         folder = real_path(bpy.path.abspath(self.directory))
         status = attach(context.scene, folder)
         addon.remember(folder)
         self.report({"INFO"}, f"Found a job: {status.state.lower()}")
-        return {"FINISHED"}
 
 
 CLASSES: Final = (

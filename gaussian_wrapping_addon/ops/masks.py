@@ -16,7 +16,7 @@ from ..core.jobs.store.rollback import finished_job
 from ..core.masks.mask_folder import FOLDER, MadeMask, MaskList, read_list, write_list
 from ..core.settings import with_values
 from . import addon
-from .addon import OperatorResult, ReportsErrors
+from .addon import ReportsErrors
 from .job_timer import new_icon
 from .jobs import (
     OnRegions,
@@ -259,11 +259,10 @@ class GWRAP_OT_masks_from_region(OnRegions, bpy.types.Operator):
             return "Select a region box around the object"
         return why_no_start(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         regions = self.regions(context)
         start_region_masks(context.scene, regions, worker_choice(context))
         self.report({"INFO"}, f"Masking to {', '.join(r.name for r in regions)}")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_review_masks(OnSceneJob, bpy.types.Operator):
@@ -271,9 +270,8 @@ class GWRAP_OT_review_masks(OnSceneJob, bpy.types.Operator):
     bl_label = "Review Masks"
     bl_description = "Show each photo of the job with its mask, here and in an open Image Editor"
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         begin(self.folder(context))
-        return {"FINISHED"}
 
 
 class _OfReview(ReportsErrors):
@@ -291,9 +289,8 @@ class GWRAP_OT_step_mask(_OfReview, bpy.types.Operator):
 
     by: IntProperty(default=1, options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def work(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         step(self.by)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_decide_mask(_OfReview, bpy.types.Operator):
@@ -305,10 +302,9 @@ class GWRAP_OT_decide_mask(_OfReview, bpy.types.Operator):
 
     accepted: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def work(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         decide(accepted=self.accepted)
         step(1)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_end_mask_review(_OfReview, bpy.types.Operator):
@@ -316,9 +312,8 @@ class GWRAP_OT_end_mask_review(_OfReview, bpy.types.Operator):
     bl_label = "Close"
     bl_description = "End the review; decisions stay"
 
-    def work(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         end()
-        return {"FINISHED"}
 
 
 CLASSES: Final = (

@@ -19,7 +19,7 @@ from ..core.jobs.client import worker_python
 from ..core.settings import MeshingSettings, to_json
 from ..core.worker.helper_process import child_command
 from . import addon, region_operators
-from .addon import NeedsObjectMode, OperatorResult, redraw
+from .addon import NeedsObjectMode, redraw
 from .background import Child, Lane, Task
 from .jobs import OnRegions, checked_regions, common_frame, selected_regions
 from .mesh_data import mesh_of
@@ -198,11 +198,10 @@ class GWRAP_OT_estimate_regions(OnRegions, bpy.types.Operator):
     def regions(self, context: bpy.types.Context) -> list[bpy.types.Object]:
         return checked_regions(context) if self.checked else selected_regions(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         regions = self.regions(context)
         folder = job_folder_of(common_frame(regions))
         start(context.scene, regions, folder, worker_choice(context).python)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_delete_region(NeedsObjectMode, bpy.types.Operator):
@@ -213,7 +212,7 @@ class GWRAP_OT_delete_region(NeedsObjectMode, bpy.types.Operator):
 
     name: StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         thing = context.scene.objects.get(self.name)
         if thing is None or addon.kind_of(thing) != "region":
             raise UsageError(f"The scene has no region {self.name}.", "Choose one of the list.")
@@ -225,7 +224,6 @@ class GWRAP_OT_delete_region(NeedsObjectMode, bpy.types.Operator):
         bpy.data.objects.remove(thing)
         if mesh is not None and mesh.users == 0:
             bpy.data.meshes.remove(mesh)
-        return {"FINISHED"}
 
 
 CLASSES: Final = (GWRAP_OT_estimate_regions, GWRAP_OT_delete_region)

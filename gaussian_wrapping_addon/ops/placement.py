@@ -354,13 +354,12 @@ class _Tool(NeedsResult):
 
     def apply(
         self, context: bpy.types.Context, frame: bpy.types.Object, step: Similarity, done: str
-    ) -> OperatorResult:
+    ) -> None:
         """Apply a step to the placement of the frame."""
         placement = step.after(placement_of(frame))
         release(context)
         note = place(frame, placement)
         self.report({"WARNING"} if note else {"INFO"}, f"{done}. {note}".strip())
-        return {"FINISHED"}
 
 
 class GWRAP_OT_add_point(_Tool, bpy.types.Operator):
@@ -378,9 +377,8 @@ class GWRAP_OT_add_point(_Tool, bpy.types.Operator):
             return "In Edit Mode, select vertices instead"
         return super().why_not(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         add_point(context, needed_frame(context))
-        return {"FINISHED"}
 
 
 class GWRAP_OT_set_scale(_Tool, bpy.types.Operator):
@@ -409,10 +407,10 @@ class GWRAP_OT_set_scale(_Tool, bpy.types.Operator):
             self.distance = float(np.linalg.norm(points[1] - points[0]))
         return context.window_manager.invoke_props_dialog(self)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame = needed_frame(context)
         step = scale_step(picked_points(context, frame), self.distance)
-        return self.apply(context, frame, step, f"Scaled by {step.scale:.6g}")
+        self.apply(context, frame, step, f"Scaled by {step.scale:.6g}")
 
 
 class GWRAP_OT_set_ground(_Tool, bpy.types.Operator):
@@ -428,12 +426,12 @@ class GWRAP_OT_set_ground(_Tool, bpy.types.Operator):
         name="Flip", description="The other side of the plane is up", options={"SKIP_SAVE"}
     )
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame = needed_frame(context)
         plane = plane_through(picked_points(context, frame), camera_poses(frame)[1])
         if self.flip:
             plane = Plane(plane.point, -plane.normal)
-        return self.apply(context, frame, ground_step(plane), "The points lie on the ground")
+        self.apply(context, frame, ground_step(plane), "The points lie on the ground")
 
 
 class GWRAP_OT_auto_ground(_Tool, bpy.types.Operator):
@@ -445,11 +443,11 @@ class GWRAP_OT_auto_ground(_Tool, bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame = needed_frame(context)
         release(context)  # edits of a mesh reach its data when Edit Mode ends
         plane, how = automatic_plane(frame)
-        return self.apply(context, frame, ground_step(plane), how)
+        self.apply(context, frame, ground_step(plane), how)
 
 
 class GWRAP_OT_set_origin(_Tool, bpy.types.Operator):
@@ -460,7 +458,7 @@ class GWRAP_OT_set_origin(_Tool, bpy.types.Operator):
 
     target: EnumProperty(name="Target", items=_TARGETS, default="POINTS")  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame = needed_frame(context)
         if self.target == "CURSOR":
             point = np.array(context.scene.cursor.location, np.float64)
@@ -469,7 +467,7 @@ class GWRAP_OT_set_origin(_Tool, bpy.types.Operator):
             if len(points) == 0:
                 raise UsageError("No point is picked.", "Select a vertex or a point.")
             point = points.mean(0)
-        return self.apply(context, frame, origin_step(point), "The point is the origin")
+        self.apply(context, frame, origin_step(point), "The point is the origin")
 
 
 class GWRAP_OT_keep_placement(_Tool, bpy.types.Operator):
@@ -481,8 +479,8 @@ class GWRAP_OT_keep_placement(_Tool, bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        return self.apply(context, needed_frame(context), Similarity(), "The placement is saved")
+    def work(self, context: bpy.types.Context) -> None:
+        self.apply(context, needed_frame(context), Similarity(), "The placement is saved")
 
 
 class GWRAP_OT_reset_placement(_Tool, bpy.types.Operator):
@@ -494,13 +492,12 @@ class GWRAP_OT_reset_placement(_Tool, bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame = needed_frame(context)
         release(context)
         note = place(frame, first_placement(frame))
         if note:
             self.report({"WARNING"}, note)
-        return {"FINISHED"}
 
 
 CLASSES: Final = (

@@ -143,10 +143,9 @@ class GWRAP_OT_save_preset(ReportsErrors, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_props_dialog(self)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         name = save_preset(context.scene, self.name)
         self.report({"INFO"}, f"Saved preset {shown_name(name)}")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_apply_preset(ReportsErrors, bpy.types.Operator):
@@ -161,12 +160,11 @@ class GWRAP_OT_apply_preset(ReportsErrors, bpy.types.Operator):
     def why_not(cls, context: bpy.types.Context) -> str:
         return why_busy(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         notes = apply_preset(context.scene, self.name)
         if notes:
             self.report({"WARNING"}, " ".join(notes))
         redraw()
-        return {"FINISHED"}
 
 
 class GWRAP_OT_delete_preset(ReportsErrors, bpy.types.Operator):
@@ -179,10 +177,9 @@ class GWRAP_OT_delete_preset(ReportsErrors, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_confirm(self, event)
 
-    def work(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         delete_preset(self.name)
         self.report({"INFO"}, f"Deleted preset {shown_name(self.name)}")
-        return {"FINISHED"}
 
 
 CLASSES: Final = (GWRAP_OT_save_preset, GWRAP_OT_apply_preset, GWRAP_OT_delete_preset)

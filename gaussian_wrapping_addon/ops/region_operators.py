@@ -228,7 +228,7 @@ class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
 
     around: EnumProperty(name="Around", items=_AROUND, default="CURSOR")  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame, collection = _target(context)
         if self.around == "SELECTED":
             things = [t for t in context.selected_objects if addon.kind_of(t) != "region"]
@@ -242,7 +242,6 @@ class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
         thing = create_region(_free_name(frame), vertices, frame, collection)
         thing.show_name = True
         _select_only(context, thing)
-        return {"FINISHED"}
 
     def _result_box(self, context: bpy.types.Context) -> np.ndarray:
         frame = addon.needed_frame(context)
@@ -267,7 +266,7 @@ class GWRAP_OT_select_region(NeedsObjectMode, bpy.types.Operator):
         self.extend = event.shift
         return self.execute(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         thing = context.view_layer.objects.get(self.name)
         if thing is None:
             raise UsageError(f"Region {self.name} is not in this view layer.", "Enable it.")
@@ -276,7 +275,6 @@ class GWRAP_OT_select_region(NeedsObjectMode, bpy.types.Operator):
             context.view_layer.objects.active = thing
         else:
             _select_only(context, thing)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
@@ -312,11 +310,10 @@ class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
         self.filepath = str(path.with_suffix(suffix) if known else path) + ("" if known else suffix)
         return True
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         path = Path(bpy.path.abspath(self.filepath))
         export_region(_active(context), path)
         self.report({"INFO"}, f"Wrote {path}")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
@@ -332,7 +329,7 @@ class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         path = Path(bpy.path.abspath(self.filepath))
         vertices = read_region_file(path).vertices
         frame, collection = _target(context)
@@ -341,7 +338,6 @@ class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
         thing = create_region(path.stem, vertices, frame, collection)
         thing.show_name = True
         _select_only(context, thing)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
@@ -357,7 +353,7 @@ class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
             return "Select a mesh that is neither a region nor a result"
         return super().why_not(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         active = _active(context)
         frame, _ = _target(context)
         if not active.is_editable:
@@ -377,7 +373,6 @@ class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
         active[addon.KIND] = "region"
         active.display_type = "WIRE"
         active.show_in_front = active.hide_render = True
-        return {"FINISHED"}
 
 
 CLASSES: Final = (

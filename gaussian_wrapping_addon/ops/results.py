@@ -51,13 +51,12 @@ class GWRAP_OT_read_report(NeedsResult, bpy.types.Operator):
     bl_label = "Open Report"
     bl_description = "Open report.md: all figures of the job, its warnings and pictures"
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         folder = _result_folder(context)
         path = folder / "report.md"
         if path.is_symlink() or not _inside(folder, path):
             raise UsageError(f"{folder} holds no report.md.", "Run the job again.")
         bpy.ops.wm.path_open(filepath=str(path))
-        return {"FINISHED"}
 
 
 class GWRAP_OT_show_pictures(NeedsResult, bpy.types.Operator):
@@ -66,7 +65,7 @@ class GWRAP_OT_show_pictures(NeedsResult, bpy.types.Operator):
     bl_description = "Load the report's pictures; they are listed in the Image Editor"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         folder = _result_folder(context)
         paths = [path for pattern in _PICTURES for path in sorted(folder.glob(pattern))]
         paths = [path for path in paths if _inside(folder, path)][:MAX_PICTURES]
@@ -84,7 +83,6 @@ class GWRAP_OT_show_pictures(NeedsResult, bpy.types.Operator):
                 editor: Any = area.spaces.active
                 editor.image = images[min(1, len(images) - 1)]
         self.report({"INFO"}, f"{len(images)} pictures are loaded; the Image Editor lists them")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_copy_report(NeedsResult, bpy.types.Operator):
@@ -98,12 +96,11 @@ class GWRAP_OT_copy_report(NeedsResult, bpy.types.Operator):
         unknown = "" if known else "The result has no report; run the job again"
         return super().why_not(context) or unknown
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame = addon.current_frame(context)
         text = report_of(addon.figures_of(frame)).as_text()
         context.window_manager.clipboard = text.replace(str(Path.home()), "~")
         self.report({"INFO"}, "Copied the report to the clipboard")
-        return {"FINISHED"}
 
 
 # -- Operators that import results, open their folder and set their shading -----------------------
@@ -124,7 +121,7 @@ class GWRAP_OT_import_result(NeedsObjectMode, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose a job folder or its result folder.")
         folder = real_path(bpy.path.abspath(self.directory))
@@ -134,7 +131,6 @@ class GWRAP_OT_import_result(NeedsObjectMode, bpy.types.Operator):
         addon.remember(folder.parent)
         faces = sum(len(mesh_of(m).polygons) for m in imported.meshes)
         self.report({"INFO"}, f"{len(imported.meshes)} meshes, {faces} faces")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_open_report(NeedsResult, bpy.types.Operator):
@@ -142,7 +138,7 @@ class GWRAP_OT_open_report(NeedsResult, bpy.types.Operator):
     bl_label = "Open Report Folder"
     bl_description = "Show the folder with report.md, the meshes and the textures"
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         folder = addon.result_folder(needed_frame(context))
         # A folder only: the path comes from the .blend, and opening a file could run it.
         if addon.is_remote(folder) or not (folder.is_dir() and (folder / "scene.json").is_file()):
@@ -150,7 +146,6 @@ class GWRAP_OT_open_report(NeedsResult, bpy.types.Operator):
                 f"{folder} is not a result folder.", "Import the result from where it is now."
             )
         bpy.ops.wm.path_open(filepath=str(folder))
-        return {"FINISHED"}
 
 
 class GWRAP_OT_set_shading(NeedsResult, bpy.types.Operator):
@@ -166,10 +161,9 @@ class GWRAP_OT_set_shading(NeedsResult, bpy.types.Operator):
         )
     )
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         for material in materials_of(addon.current_frame(context)):
             scene_objects.set_shading(material, self.shading)
-        return {"FINISHED"}
 
 
 def materials_of(frame: bpy.types.Object | None) -> list[bpy.types.Material]:

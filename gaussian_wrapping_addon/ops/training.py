@@ -14,7 +14,7 @@ from ..core.jobs.client import worker_python
 from ..core.jobs.store.job_file import make_job
 from ..core.worker.helper_process import child_command
 from . import addon, background, jobs, worker_setup
-from .addon import OperatorResult, ReportsErrors, properties_of, redraw
+from .addon import ReportsErrors, properties_of, redraw
 from .background import Child, Lane
 from .jobs import ConfirmsFolder, why_busy
 from .panel_settings import choices_key, job_settings, source_of
@@ -157,9 +157,8 @@ class GWRAP_OT_estimate(ReportsErrors, bpy.types.Operator):
             return "Choose the folder of the photos first"
         return "The estimate is running; it takes seconds" if is_busy() else ""
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         start(context.scene, worker_setup.worker_choice(context))
-        return {"FINISHED"}
 
 
 class GWRAP_OT_train_more(ConfirmsFolder, bpy.types.Operator):
@@ -175,12 +174,11 @@ class GWRAP_OT_train_more(ConfirmsFolder, bpy.types.Operator):
             return "Needs a finished training: press Wrap Scene first"
         return why_busy(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame = addon.needed_frame(context)
         jobs.start_more(context.scene, frame, worker_setup.worker_choice(context))
         count = properties_of(context.scene).training.more_iterations
         self.report({"INFO"}, f"Training {count:,} iterations more")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_reset_training(ReportsErrors, bpy.types.Operator):
@@ -193,12 +191,11 @@ class GWRAP_OT_reset_training(ReportsErrors, bpy.types.Operator):
     def why_not(cls, context: bpy.types.Context) -> str:
         return why_busy(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         training = properties_of(context.scene).training
         for name in training.bl_rna.properties.keys():  # noqa: SIM118 - no mapping
             if name != "rna_type":
                 training.property_unset(name)
-        return {"FINISHED"}
 
 
 CLASSES: Final = (GWRAP_OT_estimate, GWRAP_OT_train_more, GWRAP_OT_reset_training)

@@ -126,9 +126,8 @@ class GWRAP_OT_check_worker(ReportsErrors, bpy.types.Operator):
     def why_not(cls, _context: bpy.types.Context) -> str:
         return "The check is running; it takes seconds" if is_busy() else ""
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         start(worker_choice(context).python)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_copy_findings(ReportsErrors, bpy.types.Operator):
@@ -140,9 +139,8 @@ class GWRAP_OT_copy_findings(ReportsErrors, bpy.types.Operator):
     def why_not(cls, _context: bpy.types.Context) -> str:
         return "" if findings() else "Press Check Worker first"
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         context.window_manager.clipboard = as_text()
-        return {"FINISHED"}
 
 
 # -- State of the worker's environment: readiness, search for Pythons, set-up and removal ---------
@@ -434,11 +432,10 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
             text = "About 2 GiB on the disk; several minutes. Blender stays usable meanwhile"
         layout.label(text=tr(text), icon="INFO", translate=False)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         python = self.python or (state.pythons or [])[0].path
         folder = wheel_folder(context)
         start_setup(request_for(python, self.torch or "cpu", folder, self.extras))
-        return {"FINISHED"}
 
 
 class GWRAP_OT_add_extra(ReportsErrors, bpy.types.Operator):
@@ -468,9 +465,8 @@ class GWRAP_OT_add_extra(ReportsErrors, bpy.types.Operator):
             lines = [str(error)]
         _draw_commands(layout, lines)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         start_setup(request_for("", "cpu", wheel_folder(context), (self.extra,), adds=True))
-        return {"FINISHED"}
 
 
 class GWRAP_OT_copy_setup_commands(bpy.types.Operator):
@@ -499,9 +495,8 @@ class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_confirm(self, event)
 
-    def work(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         start_setup(request_for("", "cpu", ""), removes=True)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_cancel_setup(ReportsErrors, bpy.types.Operator):
@@ -515,9 +510,8 @@ class GWRAP_OT_cancel_setup(ReportsErrors, bpy.types.Operator):
             return "The set-up is being cancelled"
         return "" if state.is_busy else "No set-up is running"
 
-    def work(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         cancel()
-        return {"FINISHED"}
 
 
 class GWRAP_OT_open_preferences(bpy.types.Operator):
