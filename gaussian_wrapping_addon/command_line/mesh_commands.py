@@ -104,20 +104,13 @@ def _estimate_mesh(options: Namespace) -> int:
         "out": str(real_path(options.out)), "meshing": to_json(meshing), "threads": options.threads,
         "region": region if region in AUTOMATIC_REGIONS else str(real_path(region)),
     }  # fmt: skip
-    return run_in_worker(
-        request,
-        module="jobs.commands.estimate_mesh_command",
-        what="estimate",
-    )
+    return run_in_worker(request, module="jobs.commands.estimate_mesh_command", what="estimate")
 
 
 def _texture_options() -> list[Declaration]:
     """Return the texture settings that baking uses: no levels of detail are made."""
-    return [
-        entry
-        for entry in declared_options("region")
-        if entry.group == "texture" and entry.name != "lods"
-    ]
+    textures = (entry for entry in declared_options("region") if entry.group == "texture")
+    return [entry for entry in textures if entry.name != "lods"]
 
 
 def add_bake(commands: Commands) -> None:

@@ -210,11 +210,8 @@ def training_settings(options: Namespace) -> JobSettings:
     saved = _saved_values(options, values.get("preset"))
     if options.needs is not None:
         word = _SELECTION_VALUES[options.needs]
-        selected = {
-            declared.path: word
-            for declared in declarations(JobSettings)
-            if declared.model_selection and word in declared.choices
-        }
+        known = (d for d in declarations(JobSettings) if d.model_selection)
+        selected = {d.path: word for d in known if word in d.choices}
         values = {**selected, **values}
     values = {**saved, **values}
     chosen = preset(values.pop("preset", JobSettings().preset))
@@ -305,11 +302,8 @@ def region_settings(
     option is given that the method ignores, or a value cannot be parsed.
     """
     entries = declared_options("region")
-    values = {
-        entry.path: entry.default
-        for entry in entries
-        if not (texture_stays and entry.group == "texture")
-    }
+    stays = "texture" if texture_stays else None
+    values = {entry.path: entry.default for entry in entries if entry.group != stays}
     values |= {f"meshing.{name}": value for name, value in method_settings(options).items()}
     values |= given_settings(options, entries)
     if options.threads is not None:

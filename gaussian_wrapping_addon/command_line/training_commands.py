@@ -184,11 +184,7 @@ def _estimate(options: Namespace) -> int:
     job = make_job("wrap", options.input, settings)
     _reject_frames_of_photos(job)
     require_device(job.settings.device)
-    return run_in_worker(
-        job.to_json(),
-        module="jobs.commands.estimate_command",
-        what="estimate",
-    )
+    return run_in_worker(job.to_json(), module="jobs.commands.estimate_command", what="estimate")
 
 
 def add_settings(commands: Commands) -> None:

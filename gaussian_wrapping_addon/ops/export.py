@@ -30,11 +30,11 @@ from .addon import NeedsObjectMode, NeedsResult, OperatorResult
 from .mesh_data import mesh_of, values_of
 from .placement import placement_of
 from .region_objects import matrix_of
-from .results import materials_of
 from .scene_objects import (
     fold_specular,
     images_of,
     import_result,
+    materials_of,
     set_occlusion,
     set_shading,
     shading_of,

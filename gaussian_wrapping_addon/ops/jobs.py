@@ -264,14 +264,8 @@ def start_on_regions(
     folder = job_folder_of(frame)
     own = own_lengths(scene, regions, frame)
     requests = export_requests(regions, frame, folder)
-    settings = with_values(
-        settings,
-        {
-            "regions": tuple(requests),
-            **meshing_choices(scene, world_per_blender(frame)),
-            **texture_choices(scene),
-        },
-    )
+    chosen = meshing_choices(scene, world_per_blender(frame)) | texture_choices(scene)
+    settings = with_values(settings, {"regions": tuple(requests), **chosen})
     lengths = {r: length for r, length in zip(requests, own, strict=True) if length is not None}
     job = make_job(command, Path(source), settings, lengths)
     names = region_names(job.settings.regions, job.region_bodies)
@@ -500,9 +494,6 @@ class GWRAP_OT_find_job(ReportsErrors, bpy.types.Operator):
 
 
 CLASSES: Final = (
-    GWRAP_OT_wrap_scene,
-    GWRAP_OT_mesh_region,
-    GWRAP_OT_cancel_job,
-    GWRAP_OT_resume_job,
+    GWRAP_OT_wrap_scene, GWRAP_OT_mesh_region, GWRAP_OT_cancel_job, GWRAP_OT_resume_job,
     GWRAP_OT_find_job,
-)
+)  # fmt: skip

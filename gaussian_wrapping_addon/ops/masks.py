@@ -317,9 +317,6 @@ class GWRAP_OT_end_mask_review(_OfReview, bpy.types.Operator):
 
 
 CLASSES: Final = (
-    GWRAP_OT_masks_from_region,
-    GWRAP_OT_review_masks,
-    GWRAP_OT_step_mask,
-    GWRAP_OT_decide_mask,
+    GWRAP_OT_masks_from_region, GWRAP_OT_review_masks, GWRAP_OT_step_mask, GWRAP_OT_decide_mask,
     GWRAP_OT_end_mask_review,
-)
+)  # fmt: skip

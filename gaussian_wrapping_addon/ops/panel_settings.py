@@ -255,12 +255,10 @@ def preset_lines(name: str) -> tuple[str, ...]:
 def choices_key(scene: bpy.types.Scene) -> tuple[object, ...]:
     """Return what an estimate of time and memory depends on; reads no file, for panels."""
     properties = properties_of(scene)
-    decisive = (
-        _stored(d, properties)
-        for d in settings_of_scene()
-        if d.property_owner == "training" or d.panel_name == "dataset"
-    )
-    return (properties.source, properties.preset, properties.texture_size, *decisive)
+    known = settings_of_scene()
+    decisive = (d for d in known if d.property_owner == "training" or d.panel_name == "dataset")
+    own = (properties.source, properties.preset, properties.texture_size)
+    return (*own, *(_stored(d, properties) for d in decisive))
 
 
 # -- Stage of a scene and the button of the next step; reads no file, for panels and polls --------

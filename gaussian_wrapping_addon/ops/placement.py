@@ -501,11 +501,6 @@ class GWRAP_OT_reset_placement(_Tool, bpy.types.Operator):
 
 
 CLASSES: Final = (
-    GWRAP_OT_add_point,
-    GWRAP_OT_set_scale,
-    GWRAP_OT_set_ground,
-    GWRAP_OT_auto_ground,
-    GWRAP_OT_set_origin,
-    GWRAP_OT_keep_placement,
-    GWRAP_OT_reset_placement,
-)
+    GWRAP_OT_add_point, GWRAP_OT_set_scale, GWRAP_OT_set_ground, GWRAP_OT_auto_ground,
+    GWRAP_OT_set_origin, GWRAP_OT_keep_placement, GWRAP_OT_reset_placement,
+)  # fmt: skip

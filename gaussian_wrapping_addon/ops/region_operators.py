@@ -93,12 +93,9 @@ def own_lengths(
 
     Raises UsageError: a region or its edge length cannot be used.
     """
-    lengths = [checked_edge_length(scene, region) for region in regions]
+    lengths = {region: checked_edge_length(scene, region) for region in regions}
     scale = world_per_blender(frame)
-    return [
-        length * scale if has_own(scene, region) else None
-        for region, length in zip(regions, lengths, strict=True)
-    ]
+    return [length * scale if has_own(scene, r) else None for r, length in lengths.items()]
 
 
 # -- Cache of a scene's regions and their shapes, updated by handlers -----------------------------
@@ -376,9 +373,6 @@ class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
 
 
 CLASSES: Final = (
-    GWRAP_OT_add_region_box,
-    GWRAP_OT_select_region,
-    GWRAP_OT_export_region,
-    GWRAP_OT_import_region,
+    GWRAP_OT_add_region_box, GWRAP_OT_select_region, GWRAP_OT_export_region, GWRAP_OT_import_region,
     GWRAP_OT_use_as_region,
-)
+)  # fmt: skip

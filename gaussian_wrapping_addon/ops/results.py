@@ -162,29 +162,11 @@ class GWRAP_OT_set_shading(NeedsResult, bpy.types.Operator):
     )
 
     def work(self, context: bpy.types.Context) -> None:
-        for material in materials_of(addon.current_frame(context)):
+        for material in scene_objects.materials_of(addon.current_frame(context)):
             scene_objects.set_shading(material, self.shading)
 
 
-def materials_of(frame: bpy.types.Object | None) -> list[bpy.types.Material]:
-    """Return our materials on the meshes of a result, coarser and lighter ones included."""
-    children = frame.children if frame is not None else ()
-    found = [
-        material
-        for child in children
-        if addon.kind_of(child) in addon.WITH_TEXTURE
-        for slot in child.material_slots
-        if (material := slot.material) is not None
-        and scene_objects.shading_of(material) is not None
-    ]
-    return list(dict.fromkeys(found))
-
-
 CLASSES: Final = (
-    GWRAP_OT_import_result,
-    GWRAP_OT_open_report,
-    GWRAP_OT_set_shading,
-    GWRAP_OT_read_report,
-    GWRAP_OT_show_pictures,
-    GWRAP_OT_copy_report,
-)
+    GWRAP_OT_import_result, GWRAP_OT_open_report, GWRAP_OT_set_shading, GWRAP_OT_read_report,
+    GWRAP_OT_show_pictures, GWRAP_OT_copy_report,
+)  # fmt: skip

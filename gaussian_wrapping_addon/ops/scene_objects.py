@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -240,20 +241,21 @@ def texture_of(material: bpy.types.Material | None) -> bpy.types.Image | None:
 
 def images_of(frame: bpy.types.Object | None) -> list[bpy.types.Image]:
     """Return the images in our materials on the meshes of a result, each once."""
-    slots: list[Any] = [
-        slot
-        for child in (frame.children_recursive if frame is not None else ())
-        if addon.kind_of(child) in addon.WITH_TEXTURE
-        for slot in child.material_slots
-        if shading_of(slot.material) is not None
-    ]
-    found = [
-        node.image
-        for slot in slots
-        for node in slot.material.node_tree.nodes
-        if node.bl_idname == "ShaderNodeTexImage" and node.image is not None
-    ]
-    return list(dict.fromkeys(found))
+    materials = _ours_on(frame.children_recursive if frame is not None else ())
+    nodes = (node for material in materials for node in material.node_tree.nodes)
+    images = (node.image for node in nodes if node.bl_idname == "ShaderNodeTexImage")
+    return list(dict.fromkeys(image for image in images if image is not None))
+
+
+def materials_of(frame: bpy.types.Object | None) -> list[bpy.types.Material]:
+    """Return our materials on the meshes of a result, coarser and lighter ones included."""
+    return list(dict.fromkeys(_ours_on(frame.children if frame is not None else ())))
+
+
+def _ours_on(children: Iterable[bpy.types.Object]) -> list[Any]:
+    meshes = [child for child in children if addon.kind_of(child) in addon.WITH_TEXTURE]
+    materials = (slot.material for child in meshes for slot in child.material_slots)
+    return [material for material in materials if shading_of(material) is not None]
 
 
 # -- Levels of detail of a region, in a collection of their own; only the finest is shown ---------

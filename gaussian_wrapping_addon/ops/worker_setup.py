@@ -529,12 +529,7 @@ class GWRAP_OT_open_preferences(bpy.types.Operator):
 
 
 CLASSES: Final = (
-    GWRAP_OT_set_up_worker,
-    GWRAP_OT_add_extra,
-    GWRAP_OT_copy_setup_commands,
-    GWRAP_OT_remove_worker,
-    GWRAP_OT_cancel_setup,
-    GWRAP_OT_open_preferences,
-    GWRAP_OT_check_worker,
+    GWRAP_OT_set_up_worker, GWRAP_OT_add_extra, GWRAP_OT_copy_setup_commands,
+    GWRAP_OT_remove_worker, GWRAP_OT_cancel_setup, GWRAP_OT_open_preferences, GWRAP_OT_check_worker,
     GWRAP_OT_copy_findings,
-)
+)  # fmt: skip

@@ -218,11 +218,9 @@ def _limits(declared: Declaration) -> dict[str, Any]:
         if low is None:
             low = 0 if panel.preset_if_zero else check.lowest
     numbers = {
-        "min": low,
-        "max": high if math.isfinite(high) else None,
-        "soft_min": panel.soft_low,
-        "soft_max": panel.soft_high,
-    }
+        "min": low, "max": high if math.isfinite(high) else None,
+        "soft_min": panel.soft_low, "soft_max": panel.soft_high,
+    }  # fmt: skip
     limits = {name: declared.kind(value) for name, value in numbers.items() if value is not None}
     shown = {"step": panel.step, "precision": panel.precision}
     return limits | {name: value for name, value in shown.items() if value is not None}

@@ -35,7 +35,6 @@ class GWRAP_preferences(bpy.types.AddonPreferences):
     keep_running: BoolProperty(  # type: ignore[valid-type]
         name="Keep Jobs Running After Blender Closes",
         description="Jobs continue after Blender closes; opening the file again finds them",
-        default=False,
     )
 
     def draw(self, context: bpy.types.Context) -> None:

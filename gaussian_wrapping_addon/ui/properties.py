@@ -65,7 +65,6 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     decimate: BoolProperty(  # type: ignore[valid-type]
         name="Limit Faces",
         description="Decimate the mesh; it stays closed and keeps its parts and holes",
-        default=False,
     )
     show_points: BoolProperty(  # type: ignore[valid-type]
         name="Points in 3D View",

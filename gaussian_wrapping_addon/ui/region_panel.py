@@ -42,12 +42,10 @@ class GWRAP_PG_region(bpy.types.PropertyGroup):
     checked: BoolProperty(  # type: ignore[valid-type]
         name="Mesh Together",
         description="Mesh and estimate this region together with the other checked ones",
-        default=False,
     )
     own_edge_length: BoolProperty(  # type: ignore[valid-type]
         name="Own Edge Length",
         description="Mesh this region with its own edge length, not that of the Mesh panel",
-        default=False,
     )
     edge_length: property_of(  # type: ignore[valid-type]
         declared("meshing.edge_length"),

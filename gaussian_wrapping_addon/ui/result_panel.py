@@ -15,8 +15,7 @@ from ..ops.addon import tr
 from ..ops.cameras import cameras_under
 from ..ops.placement import point_empties
 from ..ops.report_data import report_of
-from ..ops.results import materials_of
-from ..ops.scene_objects import cameras_of, images_of, shading_of
+from ..ops.scene_objects import cameras_of, images_of, materials_of, shading_of
 from .panel_base import InTab, Readiness, TabPanel, characters_of, table, wrapped_label
 
 # -- The sub-panel "Report" of the result: times, accuracy, regions, warnings ---------------------
