@@ -29,7 +29,6 @@ from .worker_setup import WorkerChoice, worker_choice
 
 FOLDER = "handed-over"
 """Folder of a job with the meshes that Blender has handed over."""
-_UNWRAP = "Unwrap it (U), choose New UVs without modifiers, or apply the modifiers."
 
 
 def bake_target(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -42,8 +41,8 @@ def bake_target(context: bpy.types.Context) -> bpy.types.Object | None:
 
 def start_bake(
     scene: bpy.types.Scene, frame: bpy.types.Object, thing: bpy.types.Object, choice: WorkerChoice
-) -> Path:
-    """Bake the photos of a result onto a mesh object; return the job folder.
+) -> None:
+    """Bake the photos of a result onto a mesh object.
 
     ``thing`` is any mesh, which need not belong to the result. Quads are made here, in Blender,
     which waits for them. They become an object when the bake is done: until then, and where it
@@ -75,19 +74,17 @@ def start_bake(
     )  # fmt: skip
     mesh = replace(mesh, is_new=chosen.retopology == "QUADS")
     request = BakeRequest(
-        mesh=str(_hand_over(folder, name, mesh)),
-        name=name,
+        mesh=str(_hand_over(folder, name, mesh)), name=name,
         uvs=chosen.uvs.lower() if keeps else "auto",
         faces=chosen.faces if chosen.retopology == "DECIMATE" else 0,
-        dense=_hand_over_dense(folder, name, frame, dense),
+        dense=str(_hand_over(folder, f"{name}-dense", world_mesh(frame, dense))) if dense else "",
         texture=_texture(scene, has_dense=dense is not None),
-    )
+    )  # fmt: skip
     job = make_bake_job(earlier, request)
     job = replace(job, settings=replace(job.settings, threads=choice.threads))
     launch(scene, folder.root, job, choice, "BAKE", thing.session_uid)
     if keeps:
         thing[addon.BAKE] = name
-    return folder.root
 
 
 def _refuse_unusable(thing: bpy.types.Object, triangles: Triangulation, uvs: str) -> None:
@@ -99,10 +96,10 @@ def _refuse_unusable(thing: bpy.types.Object, triangles: Triangulation, uvs: str
         )
     if uvs == "OWN" and triangles.corner_uvs is None:
         raise UsageError(f"{thing.name} has no UV map.", "Unwrap it (U), or choose New UVs.")
-    makes_uvs = uvs == "NEW" or triangles.corner_uvs is None
-    if makes_uvs and not triangles.is_own:
+    if (uvs == "NEW" or triangles.corner_uvs is None) and not triangles.is_own:
         raise UsageError(
-            f"Modifiers of {thing.name} change its faces, and it needs new UVs.", _UNWRAP
+            f"Modifiers of {thing.name} change its faces, and it needs new UVs.",
+            "Unwrap it (U), choose New UVs without modifiers, or apply the modifiers.",
         )
 
 
@@ -132,14 +129,6 @@ def _hand_over(folder: JobFolder, name: str, mesh: FileMesh) -> Path:
     except OSError as error:
         raise unwritable_error(path, error) from None
     return path
-
-
-def _hand_over_dense(
-    folder: JobFolder, name: str, frame: bpy.types.Object, dense: Triangulation | None
-) -> str:
-    if dense is None:
-        return ""
-    return str(_hand_over(folder, f"{name}-dense", world_mesh(frame, dense)))
 
 
 def _texture(scene: bpy.types.Scene, *, has_dense: bool) -> TextureSettings:

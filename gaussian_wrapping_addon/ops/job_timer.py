@@ -523,19 +523,17 @@ def _bring_in(folder: str, job: WatchedJob) -> None:
 
 
 def _reading(result: Path) -> Task[ResultFiles | BakedFiles]:
-    return _readings.submit(lambda: _read_outcome(result))
+    """Read what a finished job has made, in a thread."""
 
+    def read() -> ResultFiles | BakedFiles:
+        folder = JobFolder(result.parent)
+        try:
+            bake = read_job(folder.job_path).bake
+        except WrapError:
+            bake = None  # of a job that was made elsewhere, only the result counts
+        return read_result(result) if bake is None else read_baked(folder.baked / bake.name)
 
-def _read_outcome(result: Path) -> ResultFiles | BakedFiles:
-    """Read what a finished job has made; runs in a thread."""
-    folder = JobFolder(result.parent)
-    try:
-        bake = read_job(folder.job_path).bake
-    except WrapError:
-        bake = None  # of a job that was made elsewhere, only the result counts
-    if bake is not None:
-        return read_baked(folder.baked / bake.name)
-    return read_result(result)
+    return _readings.submit(read)
 
 
 def _import(

@@ -230,13 +230,12 @@ def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
 
 def start_mesh(
     scene: bpy.types.Scene, regions: list[bpy.types.Object], choice: WorkerChoice
-) -> Path:
-    """Mesh regions of a finished training, each at its resolution; return the job folder.
+) -> None:
+    """Mesh regions of a finished training, each at its resolution.
 
     Raises WrapError: a region cannot be used, or the job folder contains no finished training.
     """
-    frame = common_frame(regions)
-    folder = job_folder_of(frame)
+    folder = job_folder_of(common_frame(regions))
     if not any(read_done(path) for path in (folder / "stages").glob("train-*")):
         raise UsageError(
             f"{folder} holds no finished training.", "Wrap the scene again, or find its folder."
@@ -245,7 +244,7 @@ def start_mesh(
     earlier = finished_job(JobFolder(folder))
     changed = {"threads": choice.threads, "device": choice.device, **computers_choices(scene)}
     settings = with_values(earlier.settings, changed)
-    return start_on_regions(scene, regions, choice, "mesh", earlier.source, settings)
+    start_on_regions(scene, regions, choice, "mesh", earlier.source, settings)
 
 
 def start_on_regions(
@@ -255,8 +254,8 @@ def start_on_regions(
     command: str,
     source: str,
     settings: JobSettings,
-) -> Path:
-    """Start a job in the folder of a result that meshes regions; return the folder.
+) -> None:
+    """Start a job in the folder of a result that meshes regions.
 
     Of ``settings``, those of the regions, of meshing and texture are taken from the scene.
     """
@@ -272,24 +271,20 @@ def start_on_regions(
     launch(scene, folder, job, choice, command.upper())
     for region, name in zip(regions, names, strict=True):
         region[addon.REGION] = name  # the import finds this box and adds no second one
-    return folder
 
 
-def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerChoice) -> Path:
-    """Train a finished job further, then mesh and texture it again; return the job folder.
+def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerChoice) -> None:
+    """Train a finished job further, then mesh and texture it again.
 
     Raises WrapError: the job folder contains no finished training, or too many iterations are
     requested.
     """
     folder = job_folder_of(frame)
     refuse_running(folder)
-    earlier = finished_job(JobFolder(folder))
-    job = continue_training_job(
-        JobFolder(folder), earlier, properties_of(scene).training.more_iterations
-    )
+    known, count = JobFolder(folder), properties_of(scene).training.more_iterations
+    job = continue_training_job(known, finished_job(known), count)
     changed = {"threads": choice.threads, "device": choice.device, **computers_choices(scene)}
     launch(scene, folder, replace(job, settings=with_values(job.settings, changed)), choice)
-    return folder
 
 
 def resume(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:

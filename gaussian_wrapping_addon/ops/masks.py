@@ -42,8 +42,8 @@ CAMERA_SETTINGS: Final = (
 
 def start_region_masks(
     scene: bpy.types.Scene, regions: list[bpy.types.Object], choice: WorkerChoice
-) -> Path:
-    """Train a finished job's photos anew, masked to regions, and mesh these; return its folder.
+) -> None:
+    """Train a finished job's photos anew, masked to regions, and mesh these.
 
     Cameras are re-used; so are masks that were made of the same regions.
 
@@ -56,7 +56,7 @@ def start_region_masks(
     changed = {name: getattr(earlier.settings, name) for name in CAMERA_SETTINGS}
     changed |= {"make_masks": "region", "mask_model": ""}
     settings = with_values(job_settings(scene, choice.threads, choice.device), changed)
-    return start_on_regions(scene, regions, choice, "wrap", earlier.source, settings)
+    start_on_regions(scene, regions, choice, "wrap", earlier.source, settings)
 
 
 # -- Look at made masks over their photos; decisions go into the job's folder at once -------------
