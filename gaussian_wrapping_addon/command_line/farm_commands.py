@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 from argparse import ArgumentParser, Namespace
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -271,7 +272,7 @@ def _doctor(options: Namespace) -> int:
     return in_worker("doctor", request)
 
 
-DASK_COMMANDS = (
+DASK_COMMANDS: tuple[Callable[[Any], None], ...] = (
     _add_make_certificates, _add_scheduler, _add_worker, add_ssh,
     partial(_add_system, "slurm", "SLURM"), partial(_add_system, "pbs", "PBS"), _add_doctor,
 )  # fmt: skip

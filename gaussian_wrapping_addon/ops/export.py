@@ -350,7 +350,8 @@ def _write(
     count = len(data.loop_triangles)
     faces = values_of(data.loop_triangles, "vertices", 3, np.int32).reshape(-1, 3)
     corners = values_of(data.loop_triangles, "loops", 3, np.int32)
-    layer, uvs = data.uv_layers.active, None
+    layer = data.uv_layers.active
+    uvs: np.ndarray | None = None
     if layer is not None:
         of_loops = values_of(layer.uv, "vector", 2, np.float32).reshape(-1, 2)
         uvs = of_loops[corners].reshape(-1, 3, 2)

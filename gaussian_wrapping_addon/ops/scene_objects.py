@@ -109,11 +109,11 @@ def _textured_mesh(name: str, made: MeshResult) -> bpy.types.Mesh:
 def _images_of(made: MeshResult) -> list[tuple[bpy.types.Image, Any, Any]]:
     """Load photo texture, normal map and occlusion of each atlas; the last two may be None."""
     none = [None] * len(made.albedo)
-    data = [
+    normal_maps, dark = (
         [load_texture(path, "Non-Color") for path in paths] or none
         for paths in (made.normal_map, made.occlusion)
-    ]
-    return list(zip(map(load_texture, made.albedo), *data, strict=True))
+    )
+    return list(zip(map(load_texture, made.albedo), normal_maps, dark, strict=True))
 
 
 def set_normal_map(material: bpy.types.Material, image: bpy.types.Image | None) -> bool:
