@@ -45,45 +45,26 @@ from .ui.translations import table
 _logger = logging.getLogger(__name__)
 
 CLASSES: Final[tuple[type, ...]] = (
-    *training_panel.PROPERTIES,
-    *mesh_panel.PROPERTIES,
-    *computers_panel.PROPERTIES,
-    *properties.CLASSES,
-    *region_panel.PROPERTIES,
-    *preferences.CLASSES,
-    *dataset.CLASSES,
-    *worker_setup.CLASSES,
-    *jobs.CLASSES,
-    *region_operators.CLASSES,
-    *meshing.CLASSES,
-    *masks.CLASSES,
-    *baking.CLASSES,
-    *computers.CLASSES,
-    *results.CLASSES,
-    *export.CLASSES,
-    *cameras.CLASSES,
-    *placement.CLASSES,
-    *training.CLASSES,
-    *presets.CLASSES,
-    *dataset_panel.CLASSES,
-    *training_panel.CLASSES,
-    *computers_panel.CLASSES,
-    *region_panel.CLASSES,
-    *mesh_panel.CLASSES,
-    *result_panel.CLASSES,
-)
+    *training_panel.PROPERTIES, *mesh_panel.PROPERTIES, *computers_panel.PROPERTIES,
+    *properties.CLASSES, *region_panel.PROPERTIES, *preferences.CLASSES, *dataset.CLASSES,
+    *worker_setup.CLASSES, *jobs.CLASSES, *region_operators.CLASSES, *meshing.CLASSES,
+    *masks.CLASSES, *baking.CLASSES, *computers.CLASSES, *results.CLASSES, *export.CLASSES,
+    *cameras.CLASSES, *placement.CLASSES, *training.CLASSES, *presets.CLASSES,
+    *dataset_panel.CLASSES, *training_panel.CLASSES, *computers_panel.CLASSES,
+    *region_panel.CLASSES, *mesh_panel.CLASSES, *result_panel.CLASSES,
+)  # fmt: skip
 
 HANDLERS: Final[tuple[tuple[str, Callable[..., None]], ...]] = (
     ("load_pre", background.before_load),
     ("load_post", jobs.after_load),
     ("load_post", placement.after_load),
-    ("load_post", region_operators.after_load),
+    ("load_post", region_operators.forget),
     ("undo_post", jobs.after_undo),
     ("redo_post", jobs.after_undo),
     ("undo_post", placement.after_undo),
     ("redo_post", placement.after_undo),
-    ("undo_post", region_operators.after_load),
-    ("redo_post", region_operators.after_load),
+    ("undo_post", region_operators.forget),
+    ("redo_post", region_operators.forget),
     ("depsgraph_update_post", region_operators.after_update),
 )
 
@@ -123,8 +104,6 @@ def unregister() -> None:
     job_timer.forget_all_jobs()
     job_timer.stop()
     masks.stop()
-    job_timer.stop_points()
-    computers.stop_watching()
     computers.stop()
     background.stop()  # last of these: what they end is ended by its threads
     cli_command.unregister()

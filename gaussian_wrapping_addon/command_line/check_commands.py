@@ -8,15 +8,16 @@ import math
 from argparse import ArgumentTypeError, Namespace
 from pathlib import Path
 
-from ..core.errors import UsageError
-from .job_commands import has_bpy
+from ..core.errors import EXIT_BAD_DATA, EXIT_DONE, UsageError
+from ..core.jobs.commands.doctor import find_and_diagnose
+from ..core.settings import JobSettings
+from .job_commands import has_bpy, run_in_worker
 from .options import Commands, add_threads
 
 _logger = logging.getLogger("gaussian_wrapping")
 
 
 def add_check(commands: Commands) -> None:
-    """Add ``check``."""
     parser = commands.add_parser("check", help="findings about an input, without starting anything")
     parser.add_argument("input", type=Path)
     parser.add_argument(
@@ -29,7 +30,6 @@ def add_check(commands: Commands) -> None:
 
 
 def _check(options: Namespace) -> int:
-    from ..core.errors import EXIT_BAD_DATA, EXIT_DONE
     from ..core.jobs.client import worker_if_any
     from ..core.loading.check import check_input
     from ..core.loading.source_kind import WITHOUT_PHOTOS
@@ -46,33 +46,25 @@ def _check(options: Namespace) -> int:
 
 def _look_at_photos(source: Path, threads: int) -> int:
     """Let the worker decode the photos; return the exit code."""
-    from ..core.errors import EXIT_DONE, UsageError
     from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.run_in_worker import run_in_worker
 
     try:
-        python = worker_python()
+        worker_python()
     except UsageError as error:
         _logger.info("fact: Blur, exposure and duplicates were not looked for. %s", error)
         return EXIT_DONE
+    request = {"source": str(source.absolute()), "threads": threads}
     return run_in_worker(
-        {"source": str(source.absolute()), "threads": threads},
-        python=python,
-        module="jobs.commands.photo_check_command",
-        what="check of the photos",
+        request, module="jobs.commands.photo_check_command", what="check of the photos"
     )
 
 
 def add_doctor(commands: Commands) -> None:
-    """Add ``doctor``."""
     parser = commands.add_parser("doctor", help="findings about the worker's Python")
     parser.set_defaults(run=_doctor)
 
 
 def _doctor(_options: Namespace) -> int:
-    from ..core.errors import EXIT_BAD_DATA, EXIT_DONE
-    from ..core.jobs.commands.doctor import find_and_diagnose
-
     findings = find_and_diagnose()
     for finding in findings:
         mark = "good" if finding.good else "BAD "
@@ -88,7 +80,6 @@ MIN_IMAGE_PX = 64
 
 
 def add_evaluate(commands: Commands) -> None:
-    """Add ``evaluate``."""
     parser = commands.add_parser(
         "evaluate", help="score a mesh or a job against a ground truth or photos"
     )
@@ -96,31 +87,25 @@ def add_evaluate(commands: Commands) -> None:
         "mesh", type=Path, metavar="MESH_OR_JOB", help="PLY, OBJ, GLB, STL or OFF; or a job folder"
     )
     parser.add_argument(
-        "--metric",
-        choices=("surface", "mbr"),
-        default="surface",
+        "--metric", choices=("surface", "mbr"), default="surface",
         help="surface: distances to a true surface; mbr: mesh-based rendering, a colour field "
         "trained on the mesh and compared with photos that were held out",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--truth", type=Path, metavar="PATH", help="mesh, cloud, scene or data set (surface)"
     )
     parser.add_argument(
-        "--test",
-        type=Path,
-        metavar="PATH",
+        "--test", type=Path, metavar="PATH",
         help="test photos with cameras: COLMAP, transforms, or a folder with cameras.json and "
         "images (mbr; default: the photos that the job held out)",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--max-image-px", type=int, metavar="N", help="long side of the photos compared (mbr)"
     )
     parser.add_argument(
-        "--layout",
-        choices=("auto", "scene", "mesh", "tanks", "dtu"),
-        default="auto",
+        "--layout", choices=("auto", "scene", "mesh", "tanks", "dtu"), default="auto",
         help="layout of the truth; auto detects it from its files",
-    )
+    )  # fmt: skip
     parser.add_argument("--scan", type=int, help="number of the DTU scan")
     parser.add_argument("--region", help="region of the job, if it has several")
     parser.add_argument(
@@ -133,11 +118,10 @@ def add_evaluate(commands: Commands) -> None:
         "--distances", type=_floats, help="thresholds as lengths instead, comma separated"
     )
     parser.add_argument(
-        "--align",
-        choices=("none", "cameras", "icp"),
+        "--align", choices=("none", "cameras", "icp"),
         help="alignment of the mesh to the truth: none, by cameras of equal names, by nearest "
         "points (default: none; tanks icp, dtu cameras)",
-    )
+    )  # fmt: skip
     parser.add_argument("--protocols", help="comma separated, of uniform,scan,legacy")
     parser.add_argument("--samples", type=int, help="points drawn on the mesh (uniform protocol)")
     parser.add_argument("--seed", type=int, default=0, help="seed of these points")
@@ -159,38 +143,20 @@ def _floats(text: str) -> list[float]:
 
 
 def _evaluate(options: Namespace) -> int:
-    from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.run_in_worker import run_in_worker
-    from ..core.settings import JobSettings
 
     JobSettings(seed=options.seed, threads=options.threads).validated()
     if options.max_image_px is not None and options.max_image_px < MIN_IMAGE_PX:
         raise UsageError(
             f"--max-image-px {options.max_image_px} is too small.", f"Give at least {MIN_IMAGE_PX}."
         )
+    given = vars(options)
+    same = (
+        "metric", "max_image_px", "layout", "scan", "region", "distances", "align", "samples",
+        "seed", "threads",
+    )  # fmt: skip
+    request = {name: given[name] for name in same} | {"shares": options.thresholds}
+    for name in ("mesh", "truth", "test", "cameras", "out"):
+        request[name] = None if given[name] is None else str(given[name])
     protocols = options.protocols
-    request = {
-        "mesh": str(options.mesh),
-        "metric": options.metric,
-        "truth": None if options.truth is None else str(options.truth),
-        "test": None if options.test is None else str(options.test),
-        "max_image_px": options.max_image_px,
-        "layout": options.layout,
-        "scan": options.scan,
-        "region": options.region,
-        "cameras": None if options.cameras is None else str(options.cameras),
-        "shares": options.thresholds,
-        "distances": options.distances,
-        "align": options.align,
-        "protocols": None if protocols is None else [p for p in protocols.split(",") if p],
-        "samples": options.samples,
-        "seed": options.seed,
-        "threads": options.threads,
-        "out": None if options.out is None else str(options.out),
-    }
-    return run_in_worker(
-        request,
-        python=worker_python(),
-        module="jobs.commands.evaluate_command",
-        what="evaluation",
-    )
+    request["protocols"] = None if protocols is None else [p for p in protocols.split(",") if p]
+    return run_in_worker(request, module="jobs.commands.evaluate_command", what="evaluation")

@@ -12,20 +12,33 @@ import signal
 import sys
 import threading
 from argparse import ArgumentParser, Namespace
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ..core.errors import EXIT_CANCELLED, UsageError
+from ..core.farm.addresses import checked_folder, scheduler_address
+from ..core.farm.hosts import (
+    MAX_WORKERS,
+    Host,
+    Wanted,
+    checked_hosts,
+    hosts_named,
+    read_hosts,
+    ssh_command,
+)
+from ..core.files import real_path
+from ..core.names import SHARED_VARIABLE
+from ..core.settings.declaration import MAX_PROCESSES
+from .job_commands import run_in_worker
 from .options import Commands
-
-if TYPE_CHECKING:
-    from ..core.farm.hosts import Host
 
 _BATCH = Path(__file__).resolve().parents[1] / "batch.py"
 
 
 def add_certificates(parser: ArgumentParser) -> None:
-    """Add ``--certificates``."""
     parser.add_argument(
         "--certificates", default="", metavar="DIR", help="folder of the farm's certificates"
     )
@@ -33,11 +46,9 @@ def add_certificates(parser: ArgumentParser) -> None:
 
 def in_worker(module: str, request: dict[str, Any]) -> int:
     """Run a command of a farm in the worker's Python; return the exit code."""
-    from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.run_in_worker import run_in_worker
 
     return run_in_worker(
-        request, python=worker_python(), module=f"jobs.commands.farm_{module}", what="command",
+        request, module=f"jobs.commands.farm_{module}", what="command",
         grace_s=_GRACE_S,
     )  # fmt: skip
 
@@ -47,7 +58,6 @@ _GRACE_S = 12.0
 
 
 def add_ssh(commands: Any) -> None:
-    """Add ``ssh``."""
     parser = commands.add_parser(
         "ssh", help="run a Dask scheduler here, and a worker on each of several computers by SSH"
     )
@@ -67,9 +77,6 @@ def add_ssh(commands: Any) -> None:
 
 
 def _ssh(options: Namespace) -> int:
-    from ..core.errors import UsageError
-    from ..core.farm.hosts import checked_hosts, hosts_named, read_hosts, ssh_command
-
     if not 1.0 <= options.limit <= 3600.0:
         raise UsageError("--limit is out of range.", "Give from 1 to 3600.")
     usual = _usual(options)
@@ -83,17 +90,7 @@ def _ssh(options: Namespace) -> int:
     return in_worker("ssh", request)
 
 
-def add_slurm(commands: Any) -> None:
-    """Add ``slurm``."""
-    _add_system(commands, "slurm", "SLURM")
-
-
-def add_pbs(commands: Any) -> None:
-    """Add ``pbs``."""
-    _add_system(commands, "pbs", "PBS")
-
-
-def _add_system(commands: Any, name: str, title: str) -> None:
+def _add_system(name: str, title: str, commands: Any) -> None:
     parser = commands.add_parser(
         name, help=f"run a Dask scheduler here, and workers as jobs of {title}"
     )
@@ -114,10 +111,6 @@ def _add_system(commands: Any, name: str, title: str) -> None:
 
 
 def _batch_jobs(options: Namespace) -> int:
-    from ..core.errors import UsageError
-    from ..core.farm.hosts import MAX_WORKERS, Wanted
-    from ..core.files import real_path
-
     if not 1 <= options.workers <= MAX_WORKERS:
         raise UsageError("--workers is out of range.", f"Give from 1 to {MAX_WORKERS}.")
     wanted = Wanted(
@@ -159,10 +152,6 @@ def _add_there(parser: ArgumentParser, python: str) -> None:
 
 
 def _usual(options: Namespace) -> Host:
-    from ..core.errors import UsageError
-    from ..core.farm.hosts import Host
-    from ..core.settings.declaration import MAX_PROCESSES
-
     if not 1 <= options.slots <= MAX_PROCESSES:
         raise UsageError("--slots is out of range.", f"Give from 1 to {MAX_PROCESSES}.")
     there = options.certificates_there or _request(options)["certificates"]
@@ -171,9 +160,6 @@ def _usual(options: Namespace) -> Host:
 
 def _request(options: Namespace) -> dict[str, Any]:
     """Return address and certificates, checked here: others would be asked in vain."""
-    from ..core.farm.addresses import checked_folder, scheduler_address
-    from ..core.files import real_path
-
     address = scheduler_address(options.address)
     folder = ""
     if address.scheme == "tls":
@@ -193,8 +179,6 @@ def _add_make_certificates(commands: Any) -> None:
 
 
 def _make_certificates(options: Namespace) -> int:
-    from ..core.files import real_path
-
     return in_worker("certificates", {"folder": str(real_path(options.folder))})
 
 
@@ -215,7 +199,7 @@ def _scheduler(options: Namespace) -> int:
 
 def _add_worker(commands: Any) -> None:
     parser = commands.add_parser("worker", help="let this computer work for a Dask scheduler")
-    _add_address(parser)
+    parser.add_argument("address", metavar="tls://HOST:PORT", help="of the scheduler")
     add_certificates(parser)
     parser.add_argument(
         "--shared", default="", metavar="DIR",
@@ -230,10 +214,6 @@ def _add_worker(commands: Any) -> None:
 
 
 def _worker(options: Namespace) -> int:
-    from ..core.errors import EXIT_CANCELLED, UsageError
-    from ..core.files import real_path
-    from ..core.settings.declaration import MAX_PROCESSES
-
     if not 1 <= options.slots <= MAX_PROCESSES:
         raise UsageError("--slots is out of range.", f"Give from 1 to {MAX_PROCESSES}.")
     request = {
@@ -263,7 +243,7 @@ def _add_doctor(commands: Any) -> None:
     parser = commands.add_parser(
         "doctor", help="check each worker of a Dask scheduler: versions, memory, shared folder"
     )
-    _add_address(parser)
+    parser.add_argument("address", metavar="tls://HOST:PORT", help="of the scheduler")
     add_certificates(parser)
     parser.add_argument(
         "--shared", default="", metavar="DIR",
@@ -277,11 +257,6 @@ def _add_doctor(commands: Any) -> None:
 
 
 def _doctor(options: Namespace) -> int:
-    from ..core.errors import UsageError
-    from ..core.farm.addresses import scheduler_address
-    from ..core.files import real_path
-    from ..core.names import SHARED_VARIABLE
-
     folder = options.shared or os.environ.get(SHARED_VARIABLE, "")
     if not folder:
         raise UsageError(
@@ -297,12 +272,9 @@ def _doctor(options: Namespace) -> int:
     return in_worker("doctor", request)
 
 
-def _add_address(parser: ArgumentParser) -> None:
-    parser.add_argument("address", metavar="tls://HOST:PORT", help="of the scheduler")
-
-
-DASK_COMMANDS = (
-    _add_make_certificates, _add_scheduler, _add_worker, add_ssh, add_slurm, add_pbs, _add_doctor,
+DASK_COMMANDS: tuple[Callable[[Any], None], ...] = (
+    _add_make_certificates, _add_scheduler, _add_worker, add_ssh,
+    partial(_add_system, "slurm", "SLURM"), partial(_add_system, "pbs", "PBS"), _add_doctor,
 )  # fmt: skip
 """In the order shown by ``farm --help``."""
 

@@ -8,8 +8,14 @@ import logging
 import time
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from ..core import limits
+from ..core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER, ParseError, UsageError, WorkerError
+from ..core.files import read_json, real_path
+from ..core.jobs.store.job_folder import NAME, JobFolder, back_up_stale_blend, result_state
+from ..core.names import BLENDER_FORMATS
+from ..core.settings import JobSettings
 from .options import Commands, add_device, add_threads
 
 if TYPE_CHECKING:
@@ -31,9 +37,6 @@ def has_bpy() -> bool:
 
 def require_bpy(job: JobFile, options: Namespace) -> None:
     """Raise before the job starts if its Blender files could not be written without bpy."""
-    from ..core.errors import UsageError
-    from ..core.names import BLENDER_FORMATS
-
     wants = not options.no_blend or bool(set(job.settings.export) & set(BLENDER_FORMATS))
     if wants and not has_bpy():
         raise UsageError(
@@ -42,11 +45,30 @@ def require_bpy(job: JobFile, options: Namespace) -> None:
         )
 
 
+def run_in_worker(request: dict[str, Any], *, module: str, what: str, grace_s: float = 2.0) -> int:
+    """Run a module of ``core`` in the worker's Python, log what it says; return the exit code.
+
+    ``what``: its name in errors. ``grace_s``: time to end by itself when this is interrupted.
+    """
+    from ..core.jobs.client import worker_python
+    from ..core.jobs.commands import run_in_worker as commands
+
+    python = worker_python()
+    return commands.run_in_worker(request, python=python, module=module, what=what, grace_s=grace_s)
+
+
+def run_job(job: JobFile, options: Namespace) -> int:
+    """Start a job in the folder of ``--out`` and follow it to its end; return the exit code."""
+    from ..core.jobs.client import JobClient, worker_python
+    from ..core.jobs.commands.device_check import require_device
+
+    require_bpy(job, options)
+    require_device(job.settings.device)
+    return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+
+
 def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
     """Show progress until the worker ends; then write the Blender files. Return the exit code."""
-    from ..core.errors import EXIT_DONE
-    from ..core.jobs.store.job_folder import result_state
-
     before = result_state(client.folder.result)  # the worker replaces it at its end
     code = watch(client)
     if code != EXIT_DONE:
@@ -56,9 +78,6 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
 
 def watch(client: JobClient) -> int:
     """Show progress until the worker ends; return the exit code."""
-    from ..core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER
-    from ..core.jobs.store.job_folder import result_state
-
     before = result_state(client.folder.result)
     shown_s, shown, interrupted_s = 0.0, ("", ""), 0.0
     while True:
@@ -100,8 +119,6 @@ def watch(client: JobClient) -> int:
 
 def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Namespace) -> int:
     """Write the Blender files; a ``scene.blend`` of the result ``before`` is renamed."""
-    from ..core.jobs.store.job_folder import NAME, back_up_stale_blend
-
     if options.no_blend:
         back_up_stale_blend(result, before)
     else:
@@ -117,7 +134,6 @@ def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Names
 
         export_usd(result)
     from ..core.evaluation.report.report import headline
-    from ..core.files import read_json
 
     _logger.info("results: %s", result)
     for line in headline(read_json(result / "report.json")):
@@ -144,14 +160,12 @@ LEFT = "left"
 
 
 def add_status(commands: Commands) -> None:
-    """Add ``status``."""
     parser = commands.add_parser("status", help="what a job is doing, or how it ended")
     _add_folder(parser)
     parser.set_defaults(run=_status)
 
 
 def add_cancel(commands: Commands) -> None:
-    """Add ``cancel``."""
     parser = commands.add_parser("cancel", help="stop a running job, which can be resumed")
     _add_folder(parser)
     parser.set_defaults(run=_cancel)
@@ -162,7 +176,6 @@ def _add_folder(parser: ArgumentParser) -> None:
 
 
 def _status(options: Namespace) -> int:
-    from ..core.errors import EXIT_DONE
     from ..core.jobs.client import JobClient
 
     client = JobClient.attach(options.out)
@@ -181,8 +194,6 @@ def _status(options: Namespace) -> int:
 
 
 def _cancel(options: Namespace) -> int:
-    from ..core import limits
-    from ..core.errors import EXIT_DONE, WorkerError
     from ..core.jobs.client import JobClient
 
     client = JobClient.attach(options.out)
@@ -222,17 +233,13 @@ def _ends_within(client: JobClient, seconds: float) -> bool:
 
 
 def add_parts(commands: Commands) -> None:
-    """Add ``parts``."""
     parser = commands.add_parser("parts", help="the parts of a job, and how far each is")
-    parser.add_argument("out", type=Path, metavar="DIR", help="job folder of that job")
+    _add_folder(parser)
     parser.set_defaults(run=_parts)
 
 
 def _parts(options: Namespace) -> int:
-    from ..core.errors import EXIT_DONE, ParseError
-    from ..core.files import real_path
     from ..core.jobs.parts.graph import PARTS_NAME, plan_if_missing, read_state
-    from ..core.jobs.store.job_folder import JobFolder
 
     root = real_path(options.out)
     folder = JobFolder(root)
@@ -257,11 +264,10 @@ def _parts(options: Namespace) -> int:
 
 
 def add_run_part(commands: Commands) -> None:
-    """Add ``run-part``."""
     parser = commands.add_parser(
         "run-part", help="run one part of a planned job here, as a farm does"
     )
-    parser.add_argument("out", type=Path, metavar="DIR", help="job folder of that job")
+    _add_folder(parser)
     parser.add_argument("part", metavar="PART", help="its name, as parts DIR lists it")
     add_threads(parser)
     add_device(parser, kept=True)
@@ -269,11 +275,7 @@ def add_run_part(commands: Commands) -> None:
 
 
 def _run_part(options: Namespace) -> int:
-    from ..core.files import real_path
-    from ..core.jobs.client import worker_python
     from ..core.jobs.commands.device_check import require_device
-    from ..core.jobs.commands.run_in_worker import run_in_worker
-    from ..core.settings import JobSettings
 
     JobSettings(threads=options.threads, device=options.device or "auto").validated()
     if options.device is not None:
@@ -282,4 +284,4 @@ def _run_part(options: Namespace) -> int:
         "out": str(real_path(options.out)), "part": options.part, "threads": options.threads,
         "device": options.device or "", "attempt": 1, "driven": False,
     }  # fmt: skip
-    return run_in_worker(request, python=worker_python(), module="jobs.part_process", what="part")
+    return run_in_worker(request, module="jobs.part_process", what="part")

@@ -8,10 +8,30 @@ from __future__ import annotations
 
 import logging
 from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from .job_commands import follow, has_bpy, require_bpy, watch
+from ..core.errors import EXIT_DONE, UsageError
+from ..core.files import read_json, real_path
+from ..core.jobs.store.job_folder import JobFolder
+from ..core.names import (
+    AUTOMATIC_REGIONS,
+    BLENDER_FORMATS,
+    EXPORT_FORMATS,
+    RESULT_FORMATS,
+    SHADINGS,
+)
+from ..core.settings import (
+    UP_AXES,
+    UV_CHOICES,
+    Declaration,
+    JobSettings,
+    MeshingSettings,
+    TextureSettings,
+    to_json,
+)
+from .job_commands import has_bpy, run_in_worker, run_job, watch
 from .options import (
     Commands,
     add_device,
@@ -20,6 +40,7 @@ from .options import (
     add_out,
     add_threads,
     declared_options,
+    given_settings,
     method_settings,
     region_settings,
 )
@@ -27,13 +48,11 @@ from .options import (
 if TYPE_CHECKING:
     from ..core.jobs.client import JobClient
     from ..core.jobs.store.job_file import JobFile
-    from ..core.settings import Declaration
 
 _logger = logging.getLogger("gaussian_wrapping")
 
 
 def add_mesh(commands: Commands) -> None:
-    """Add ``mesh``."""
     parser = commands.add_parser(
         "mesh", help="mesh another region or resolution of a finished training"
     )
@@ -46,26 +65,26 @@ def add_mesh(commands: Commands) -> None:
 
 
 def _mesh(options: Namespace) -> int:
-    from ..core.files import real_path
-    from ..core.jobs.client import JobClient, worker_python
-    from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import make_job
-    from ..core.jobs.store.job_folder import JobFolder
+
+    earlier = _trained(options.out)
+    job = make_job("mesh", Path(earlier.source), region_settings(earlier.settings, options))
+    return run_job(job, options)
+
+
+def _trained(out: Path) -> JobFile:
+    """Return the job of a folder. Raises WrapError: it holds none, or no finished training."""
     from ..core.jobs.store.rollback import finished_job, no_finished_training
     from ..core.jobs.store.stage_folder import read_done
 
-    folder = JobFolder(real_path(options.out))
+    folder = JobFolder(real_path(out))
     earlier = finished_job(folder)
     if not any(read_done(path) for path in folder.stages.glob("train-*")):
-        raise no_finished_training(options.out)
-    job = make_job("mesh", Path(earlier.source), region_settings(earlier.settings, options))
-    require_bpy(job, options)
-    require_device(job.settings.device)
-    return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+        raise no_finished_training(out)
+    return earlier
 
 
 def add_estimate_mesh(commands: Commands) -> None:
-    """Add ``estimate-mesh``."""
     parser = commands.add_parser(
         "estimate-mesh", help="estimate triangles, time and memory of a region's mesh"
     )
@@ -77,43 +96,24 @@ def add_estimate_mesh(commands: Commands) -> None:
 
 
 def _estimate_mesh(options: Namespace) -> int:
-    from ..core.files import real_path
-    from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.run_in_worker import run_in_worker
-    from ..core.names import AUTOMATIC_REGIONS
-    from ..core.settings import JobSettings, MeshingSettings, to_json
 
     meshing = MeshingSettings(**method_settings(options))
     JobSettings(meshing=meshing, threads=options.threads).validated()
     region = options.region
     request = {
-        "out": str(real_path(options.out)),
+        "out": str(real_path(options.out)), "meshing": to_json(meshing), "threads": options.threads,
         "region": region if region in AUTOMATIC_REGIONS else str(real_path(region)),
-        "meshing": to_json(meshing),
-        "threads": options.threads,
-    }
-    return run_in_worker(
-        request,
-        python=worker_python(),
-        module="jobs.commands.estimate_mesh_command",
-        what="estimate",
-    )
+    }  # fmt: skip
+    return run_in_worker(request, module="jobs.commands.estimate_mesh_command", what="estimate")
 
 
 def _texture_options() -> list[Declaration]:
     """Return the texture settings that baking uses: no levels of detail are made."""
-    return [
-        entry
-        for entry in declared_options("region")
-        if entry.group == "texture" and entry.name != "lods"
-    ]
+    textures = (entry for entry in declared_options("region") if entry.group == "texture")
+    return [entry for entry in textures if entry.name != "lods"]
 
 
 def add_bake(commands: Commands) -> None:
-    """Add ``bake``."""
-    from ..core.names import RESULT_FORMATS
-    from ..core.settings import UP_AXES, UV_CHOICES
-
     parser = commands.add_parser(
         "bake", help="bake the photos onto an edited, retopologised or foreign mesh"
     )
@@ -122,10 +122,7 @@ def add_bake(commands: Commands) -> None:
         "--mesh", type=Path, required=True, metavar="FILE", help="OBJ, PLY, GLB, STL or OFF"
     )
     parser.add_argument(
-        "--name",
-        default="",
-        metavar="NAME",
-        help="folder below DIR/baked (default: as the file)",
+        "--name", default="", metavar="NAME", help="folder below DIR/baked (default: as the file)"
     )
     parser.add_argument(
         "--uvs", choices=UV_CHOICES, default="auto",
@@ -155,55 +152,30 @@ def add_bake(commands: Commands) -> None:
     parser.set_defaults(run=_bake)
 
 
-def _texture(options: Namespace) -> dict[str, Any]:
-    values = {}
-    for entry in _texture_options():
-        assert entry.option is not None
-        value = getattr(options, entry.path)
-        if value is not None:
-            values[entry.name] = entry.option.parse(value) if entry.option.parse else value
-    if options.dense is not None and "normal_map" not in values:
-        values["normal_map"] = "on"
-    return values
-
-
 def _bake(options: Namespace) -> int:
-    from dataclasses import replace
-
-    from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
     from ..core.jobs.store.job_file import BakeRequest, make_bake_job
-    from ..core.jobs.store.job_folder import JobFolder
-    from ..core.jobs.store.rollback import finished_job, no_finished_training
-    from ..core.jobs.store.stage_folder import read_done
-    from ..core.settings import JobSettings, TextureSettings
 
-    texture = TextureSettings(**_texture(options))
+    given = given_settings(options, _texture_options())
+    values = {path.removeprefix("texture."): value for path, value in given.items()}
+    if options.dense is not None:
+        values = {"normal_map": "on"} | values
+    texture = TextureSettings(**values)
     JobSettings(texture=texture, threads=options.threads).validated()
     request = BakeRequest(
-        mesh=str(real_path(options.mesh)),
-        name=options.name or options.mesh.stem,
+        mesh=str(real_path(options.mesh)), name=options.name or options.mesh.stem,
         sidecar=str(real_path(options.sidecar)) if options.sidecar else "",
-        up=options.up,
-        uvs=options.uvs,
-        faces=options.faces,
-        dense=str(real_path(options.dense)) if options.dense else "",
-        texture=texture,
+        up=options.up, uvs=options.uvs, faces=options.faces,
+        dense=str(real_path(options.dense)) if options.dense else "", texture=texture,
         export=tuple(dict.fromkeys(f for f in options.export.split(",") if f)),
-    )
-    folder = JobFolder(real_path(options.out))
-    earlier = finished_job(folder)
-    if not any(read_done(path) for path in folder.stages.glob("train-*")):
-        raise no_finished_training(options.out)
-    job = make_bake_job(earlier, request)
+    )  # fmt: skip
+    job = make_bake_job(_trained(options.out), request)
     job = replace(job, settings=replace(job.settings, threads=options.threads))
     return follow_bake(JobClient.start(options.out, job, python=worker_python()), job)
 
 
 def follow_bake(client: JobClient, job: JobFile) -> int:
     """Show the progress of a bake, then its figures; return the exit code."""
-    from ..core.errors import EXIT_DONE
-
     code = watch(client)
     if code == EXIT_DONE and job.bake is not None:
         _say_figures(client.folder.baked / job.bake.name)
@@ -212,8 +184,6 @@ def follow_bake(client: JobClient, job: JobFile) -> int:
 
 def _say_figures(folder: Path) -> None:
     """Log where the files are, and what was measured."""
-    from ..core.files import read_json
-
     figures = read_json(folder / "bake.json")
     texture = figures["texture"]
     psnr = figures["mesh_rendering"].get("psnr")
@@ -229,45 +199,33 @@ def _say_figures(folder: Path) -> None:
 
 
 def add_export(commands: Commands) -> None:
-    """Add ``export``."""
-    from ..core.names import BLENDER_FORMATS, EXPORT_FORMATS, SHADINGS
-
     parser = commands.add_parser(
         "export", help="export meshes of a finished job for other programs"
     )
     parser.add_argument("job", type=Path, metavar="JOB", help="job folder, or its result folder")
     parser.add_argument(
-        "--format",
-        default="glb",
+        "--format", default="glb",
         help=f"comma separated, of {','.join(EXPORT_FORMATS)}; "
         f"{' and '.join(BLENDER_FORMATS)} need bpy or Blender",
-    )
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
     parser.add_argument(
-        "--placed",
-        action="store_true",
+        "--placed", action="store_true",
         help="coordinates as placed in Blender, instead of the input's world",
-    )
+    )  # fmt: skip
     parser.add_argument("--region", nargs="+", action="extend", metavar="NAME", default=[])
     parser.add_argument("--lods", action="store_true", help="levels of detail too")
     parser.add_argument(
-        "--shading",
-        choices=SHADINGS,
-        default="auto",
+        "--shading", choices=SHADINGS, default="auto",
         help="shading of the material; auto: lit, but unlit for GLB without a normal or occlusion "
         "map",
-    )
+    )  # fmt: skip
     parser.add_argument("--pack", action="store_true", help="pack textures into USD and FBX files")
     parser.set_defaults(run=_export)
 
 
 def _export(options: Namespace) -> int:
-    from ..core.errors import UsageError
-    from ..core.files import real_path
-    from ..core.jobs.client import worker_python
     from ..core.jobs.commands.export_files import result_of
-    from ..core.jobs.commands.run_in_worker import run_in_worker
-    from ..core.names import BLENDER_FORMATS, EXPORT_FORMATS
 
     formats = list(dict.fromkeys(f for f in options.format.split(",") if f))
     wrong = [f for f in formats if f not in EXPORT_FORMATS]
@@ -292,9 +250,7 @@ def _export(options: Namespace) -> int:
             "result": str(result), "out": str(out), "formats": own, "placed": options.placed,
             "regions": options.region, "levels": options.lods, "shading": options.shading,
         }  # fmt: skip
-        code = run_in_worker(
-            request, python=worker_python(), module="jobs.commands.export_files", what="export"
-        )
+        code = run_in_worker(request, module="jobs.commands.export_files", what="export")
         if code:
             return code
     if by_blender:
@@ -311,7 +267,6 @@ def _export(options: Namespace) -> int:
 
 
 def add_convert_region(commands: Commands) -> None:
-    """Add ``convert-region``."""
     parser = commands.add_parser(
         "convert-region", help="convert a region file: JSON, or .rsbox of RealityScan"
     )
@@ -321,7 +276,6 @@ def add_convert_region(commands: Commands) -> None:
 
 
 def _convert_region(options: Namespace) -> int:
-    from ..core.errors import EXIT_DONE, UsageError
     from ..core.regions.files import SUFFIXES, read_region_file, write_region_file
 
     output: Path = options.output

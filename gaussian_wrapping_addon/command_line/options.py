@@ -129,10 +129,7 @@ class SetAction(Action):
 def add_option(parser: Any, entry: Declaration, **changes: Any) -> None:
     """Add the option of one setting to a parser or argument group.
 
-    Parameters
-    ----------
-    changes : dict
-        Keywords of ``add_argument`` that replace the declared ones.
+    ``changes``: keywords of ``add_argument`` that replace the declared ones.
     """
     option = entry.option
     assert option is not None
@@ -168,16 +165,13 @@ def _number_reader(entry: Declaration) -> Callable[[str], Any]:
     return read
 
 
-def given_settings(options: Namespace, scope: Scope) -> dict[str, Any]:
-    """Return the settings, by path, whose options were given.
+def given_settings(options: Namespace, entries: Iterable[Declaration]) -> dict[str, Any]:
+    """Return those of the settings, by path, whose options were given.
 
-    Raises
-    ------
-    UsageError
-        A value cannot be parsed.
+    Raises UsageError: a value cannot be parsed.
     """
     values = {}
-    for entry in declared_options(scope):
+    for entry in entries:
         assert entry.option is not None
         value = getattr(options, entry.path)
         if value is not None:
@@ -212,15 +206,12 @@ def training_settings(options: Namespace) -> JobSettings:
 
     Ranges are checked when the job is made.
     """
-    values = given_settings(options, "training")
+    values = given_settings(options, declared_options("training"))
     saved = _saved_values(options, values.get("preset"))
     if options.needs is not None:
         word = _SELECTION_VALUES[options.needs]
-        selected = {
-            declared.path: word
-            for declared in declarations(JobSettings)
-            if declared.model_selection and word in declared.choices
-        }
+        known = (d for d in declarations(JobSettings) if d.model_selection)
+        selected = {d.path: word for d in known if word in d.choices}
         values = {**selected, **values}
     values = {**saved, **values}
     chosen = preset(values.pop("preset", JobSettings().preset))
@@ -232,15 +223,8 @@ def _saved_values(options: Namespace, given_preset: str | None) -> dict[str, Any
 
     Settings of meshes are left out, and what the file leaves to the preset.
 
-    Parameters
-    ----------
-    given_preset : str, optional
-        Overrides that of the file.
-
-    Raises
-    ------
-    UsageError, ParseError
-        The file cannot be used.
+    ``given_preset``: overrides that of the file.
+    Raises UsageError, ParseError: the file cannot be used.
     """
     if options.user_preset is None:
         return {}
@@ -270,11 +254,8 @@ def _saved_values(options: Namespace, given_preset: str | None) -> dict[str, Any
 # -- Settings of meshing and texture --------------------------------------------------------------
 
 _IGNORED_BY_PIVOTS: dict[str, tuple[Any, ...]] = {
-    "edge_length": (0.0,),
-    "points": (0,),
-    "spacing": (),
-    "tiles": ("auto", "off"),
-}
+    "edge_length": (0.0,), "points": (0,), "spacing": (), "tiles": ("auto", "off"),
+}  # fmt: skip
 """Settings that the method pivots ignores, and their values without effect: an edge length or
 number of 0, and tiles that pivots do not use anyway."""
 
@@ -286,14 +267,10 @@ _ONLY_BY_PIVOTS = ("pivots", "pivot_box", "pivot_samples")
 def method_settings(options: Namespace) -> dict[str, Any]:
     """Return the meshing settings, by name, of the scope ``method``.
 
-    Options that are not given have their defaults, not the values of an earlier mesh.
-
-    Raises
-    ------
-    UsageError
-        An option is given that the method ignores.
+    Options that are not given have their defaults, not the values of an earlier mesh. Raises
+    UsageError: an option is given that the method ignores.
     """
-    values = given_settings(options, "method")
+    values = given_settings(options, declared_options("method"))
     given = {path.removeprefix("meshing."): value for path, value in values.items()}
     method = given.get("method", MeshingSettings().method)
     pivots = given.get("pivots", MeshingSettings().pivots)
@@ -321,21 +298,14 @@ def region_settings(
     """Return settings with the options of the scopes ``method`` and ``region``.
 
     Options that are not given have their defaults, not the values of an earlier mesh; with
-    ``texture_stays``, those of the texture have the values of ``settings``.
-
-    Raises
-    ------
-    UsageError
-        An option is given that the method ignores, or a value cannot be parsed.
+    ``texture_stays``, those of the texture have the values of ``settings``. Raises UsageError: an
+    option is given that the method ignores, or a value cannot be parsed.
     """
-    given = given_settings(options, "region")
-    values = {
-        entry.path: entry.default
-        for entry in declared_options("region")
-        if not (texture_stays and entry.group == "texture")
-    }
+    entries = declared_options("region")
+    stays = "texture" if texture_stays else None
+    values = {entry.path: entry.default for entry in entries if entry.group != stays}
     values |= {f"meshing.{name}": value for name, value in method_settings(options).items()}
-    values |= given
+    values |= given_settings(options, entries)
     if options.threads is not None:
         values["threads"] = options.threads
     if options.device is not None:
@@ -359,7 +329,6 @@ def add_out(parser: ArgumentParser) -> None:
 
 
 def add_threads(parser: ArgumentParser) -> None:
-    """Add ``--threads``."""
     threads = declared("threads")
     add_option(parser, threads, default=threads.default)
 

@@ -26,27 +26,11 @@ from .training_commands import (
 _logger = logging.getLogger("gaussian_wrapping")
 
 _COMMANDS = (
-    add_wrap,
-    add_queue,
-    add_mesh,
-    add_bake,
-    add_continue_training,
-    add_resume,
-    add_status,
-    add_cancel,
-    add_estimate_mesh,
-    add_parts,
-    add_run_part,
-    add_farm,
-    add_export,
-    add_convert_region,
-    add_evaluate,
-    add_estimate,
-    add_settings,
-    add_check,
-    add_doctor,
+    add_wrap, add_queue, add_mesh, add_bake, add_continue_training, add_resume, add_status,
+    add_cancel, add_estimate_mesh, add_parts, add_run_part, add_farm, add_export,
+    add_convert_region, add_evaluate, add_estimate, add_settings, add_check, add_doctor,
     add_set_up_worker,
-)
+)  # fmt: skip
 """In the order shown by ``--help``."""
 
 

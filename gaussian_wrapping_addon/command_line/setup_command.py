@@ -8,12 +8,31 @@ import sys
 import time
 from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from ..core.errors import EXIT_DONE, EXIT_OTHER, UsageError
+from ..core.jobs.install import (
+    CPU,
+    CUDA_BRINGS,
+    SetupRequest,
+    SetupTask,
+    all_commands,
+    as_line,
+    check_folders,
+    cuda_present,
+    find_pythons,
+    probe,
+    remove,
+)
+from ..core.worker.environment import (
+    EXTRAS,
+    WorkerEnvironment,
+    default_root,
+    known_environments,
+    read_extra_names,
+    read_requirements,
+    requirements_file,
+)
 from .options import Commands
-
-if TYPE_CHECKING:
-    from ..core.jobs.install import SetupRequest
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -23,7 +42,6 @@ _OMIT = {False: "Omit --repair.", True: "Give --extras instead of --add, which s
 
 
 def add_set_up_worker(commands: Commands) -> None:
-    """Add ``set-up-worker``."""
     parser = commands.add_parser(
         "set-up-worker", help="create the private environment that workers run in"
     )
@@ -46,7 +64,8 @@ def add_set_up_worker(commands: Commands) -> None:
     )
     parser.add_argument(
         "--extras", default="", metavar="NAMES",
-        help="optional packages too, separated by commas: " + _extras_help(),
+        help="optional packages too, separated by commas: "
+        + "; ".join(f"{extra.name}: {extra.purpose}" for extra in EXTRAS),
     )  # fmt: skip
     parser.add_argument("--dry-run", action="store_true", help="only show the commands")
     action = parser.add_mutually_exclusive_group()
@@ -60,35 +79,7 @@ def add_set_up_worker(commands: Commands) -> None:
     parser.set_defaults(run=_set_up_worker)
 
 
-def _extras_help() -> str:
-    from ..core.worker.environment import EXTRAS
-
-    return "; ".join(f"{extra.name}: {extra.purpose}" for extra in EXTRAS)
-
-
 def _set_up_worker(options: Namespace) -> int:
-    from ..core.errors import EXIT_DONE, UsageError
-    from ..core.jobs.install import (
-        CPU,
-        CUDA_BRINGS,
-        SetupRequest,
-        all_commands,
-        as_line,
-        check_folders,
-        cuda_present,
-        find_pythons,
-        probe,
-        remove,
-    )
-    from ..core.worker.environment import (
-        WorkerEnvironment,
-        default_root,
-        known_environments,
-        read_extra_names,
-        read_requirements,
-        requirements_file,
-    )
-
     known = [e.root for e in known_environments() if e.is_ours()]
     change = options.repair or options.remove or options.add
     root = (options.to or (known[0] if change and known else default_root())).absolute()
@@ -124,9 +115,6 @@ def _set_up_worker(options: Namespace) -> int:
 
 def _follow(request: SetupRequest) -> int:
     """Run the set-up and show its progress; return the exit code."""
-    from ..core.errors import EXIT_OTHER
-    from ..core.jobs.install import SetupTask
-
     task = SetupTask(request)
     task.start()
     shown_s, shown = 0.0, ""

@@ -9,8 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.errors import EXIT_DONE, DatasetError, UsageError, WrapError, known_error
+from ..core.files import real_path
+from ..core.jobs.store.job_folder import JobFolder
 from ..core.settings import declared
-from .job_commands import follow, require_bpy
+from .job_commands import follow, require_bpy, run_in_worker, run_job
 from .mesh_commands import follow_bake
 from .options import (
     Commands,
@@ -36,7 +39,6 @@ MOST_JOBS = 10_000
 
 
 def add_wrap(commands: Commands) -> None:
-    """Add ``wrap``."""
     parser = commands.add_parser(
         "wrap", help="make a textured mesh of photos, with or without cameras, or of a video"
     )
@@ -52,7 +54,6 @@ def add_wrap(commands: Commands) -> None:
 
 
 def _wrap(options: Namespace) -> int:
-    from ..core.errors import EXIT_DONE
     from ..core.jobs.client import JobClient, prepare_job, worker_python
 
     job = checked_job(options.input, options)
@@ -70,12 +71,9 @@ def _wrap(options: Namespace) -> int:
 def checked_job(photos: Path, options: Namespace) -> JobFile:
     """Return the job that wraps photos with the options given; warn of what they show.
 
-    Raises
-    ------
-    DatasetError, UsageError, DeviceError
-        The photos, an option or the device cannot be used.
+    Raises DatasetError, UsageError, DeviceError: the photos, an option or the device cannot be
+    used.
     """
-    from ..core.errors import DatasetError, UsageError
     from ..core.jobs.client import worker_if_any
     from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import make_job
@@ -101,7 +99,6 @@ def checked_job(photos: Path, options: Namespace) -> JobFile:
 
 def _reject_frames_of_photos(job: JobFile) -> None:
     """Raise for options of videos where the input is none: they would do nothing."""
-    from ..core.errors import UsageError
     from ..core.jobs.stages.cameras import frames_request
 
     for path in ("video_frames", "video_fps"):
@@ -113,7 +110,6 @@ def _reject_frames_of_photos(job: JobFile) -> None:
 
 
 def add_continue_training(commands: Commands) -> None:
-    """Add ``more``."""
     parser = commands.add_parser(
         "more", help="continue the training of a finished job, then mesh it again"
     )
@@ -126,23 +122,21 @@ def add_continue_training(commands: Commands) -> None:
 
 
 def _continue_training(options: Namespace) -> int:
-    from ..core.files import real_path
-    from ..core.jobs.client import JobClient, worker_python
-    from ..core.jobs.commands.device_check import require_device
-    from ..core.jobs.store.job_folder import JobFolder
     from ..core.jobs.store.rollback import continue_training_job, finished_job
 
     folder = JobFolder(real_path(options.out))
     job = continue_training_job(folder, finished_job(folder), options.iterations)
-    if options.device is not None:
-        job = replace(job, settings=replace(job.settings, device=options.device).validated())
-    require_bpy(job, options)
-    require_device(job.settings.device)
-    return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+    return run_job(_on_device(job, options), options)
+
+
+def _on_device(job: JobFile, options: Namespace) -> JobFile:
+    """Return a job that runs on the device of ``--device``, or on its own."""
+    if options.device is None:
+        return job
+    return replace(job, settings=replace(job.settings, device=options.device).validated())
 
 
 def add_resume(commands: Commands) -> None:
-    """Add ``resume``."""
     parser = commands.add_parser("resume", help="resume a job that was stopped")
     parser.add_argument("out", type=Path, metavar="DIR")
     entry = declared("training.max_gaussians")
@@ -153,20 +147,16 @@ def add_resume(commands: Commands) -> None:
 
 
 def _resume(options: Namespace) -> int:
-    from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
     from ..core.jobs.commands.device_check import require_device
     from ..core.jobs.store.job_file import read_job
-    from ..core.jobs.store.job_folder import JobFolder
 
-    job = read_job(JobFolder(real_path(options.out)).job_path)
-    if options.device is not None:
-        job = replace(job, settings=replace(job.settings, device=options.device).validated())
-    if job.bake is not None and options.max_gaussians is None:
-        return follow_bake(JobClient.resume(options.out, python=worker_python()), job)
-    require_bpy(job, options)
-    require_device(job.settings.device)
+    job = _on_device(read_job(JobFolder(real_path(options.out)).job_path), options)
     if options.max_gaussians is None:
+        if job.bake is not None:
+            return follow_bake(JobClient.resume(options.out, python=worker_python()), job)
+        require_bpy(job, options)
+        require_device(job.settings.device)
         client = JobClient.resume(options.out, python=worker_python(), device=options.device)
         return follow(client, job, options)
     # A training with another maximum starts anew: extra iterations do not apply.
@@ -174,12 +164,10 @@ def _resume(options: Namespace) -> int:
         job.settings.training, max_gaussians=options.max_gaussians, extra_iterations=0
     )
     settings = replace(job.settings, training=training).validated()
-    job = replace(job, command="wrap", settings=settings, bake=None)
-    return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+    return run_job(replace(job, command="wrap", settings=settings, bake=None), options)
 
 
 def add_estimate(commands: Commands) -> None:
-    """Add ``estimate``."""
     parser = commands.add_parser("estimate", help="estimate time, memory and disk of a training")
     parser.add_argument("input", type=Path)
     add_training_options(parser)
@@ -188,9 +176,7 @@ def add_estimate(commands: Commands) -> None:
 
 
 def _estimate(options: Namespace) -> int:
-    from ..core.jobs.client import worker_python
     from ..core.jobs.commands.device_check import require_device
-    from ..core.jobs.commands.run_in_worker import run_in_worker
     from ..core.jobs.store.job_file import make_job
 
     # Masks of a region need the region, and hardly change what the training costs.
@@ -198,24 +184,16 @@ def _estimate(options: Namespace) -> int:
     job = make_job("wrap", options.input, settings)
     _reject_frames_of_photos(job)
     require_device(job.settings.device)
-    return run_in_worker(
-        job.to_json(),
-        python=worker_python(),
-        module="jobs.commands.estimate_command",
-        what="estimate",
-    )
+    return run_in_worker(job.to_json(), module="jobs.commands.estimate_command", what="estimate")
 
 
 def add_settings(commands: Commands) -> None:
-    """Add ``settings``."""
     parser = commands.add_parser("settings", help="list what --set NAME=VALUE can set")
     parser.add_argument("words", nargs="*", metavar="WORD", help="list those alone that have it")
     parser.set_defaults(run=_settings)
 
 
 def _settings(options: Namespace) -> int:
-    from ..core.errors import EXIT_DONE, UsageError
-
     lines = []
     for entry in declared_options("training", "method", "region"):
         option = entry.option
@@ -237,7 +215,6 @@ def _settings(options: Namespace) -> int:
 
 
 def add_queue(commands: Commands) -> None:
-    """Add ``queue``."""
     parser = commands.add_parser(
         "queue", help="wrap each folder of photos in a folder, and list the results"
     )
@@ -249,11 +226,7 @@ def add_queue(commands: Commands) -> None:
 
 
 def _queue(options: Namespace) -> int:
-    from ..core.errors import UsageError, WrapError, known_error
-    from ..core.files import real_path
-    from ..core.jobs.client import prepare_job, worker_python
-    from ..core.jobs.commands.run_in_worker import run_in_worker
-    from ..core.jobs.store.job_folder import JobFolder
+    from ..core.jobs.client import prepare_job
 
     root, out = real_path(options.input), real_path(options.out)
     if out == root or out.is_relative_to(root):
@@ -278,23 +251,18 @@ def _queue(options: Namespace) -> int:
         raise UsageError(f"No folder in {options.input} can be wrapped.", "See the errors above.")
     request = {
         "out": str(out), "jobs": names, "computers": options.computers or "",
-        "processes": _default(options.processes, "processes"),
+        "processes": options.processes or declared("processes").default,
         "certificates": str(options.certificates or ""),
     }  # fmt: skip
-    code = run_in_worker(request, python=worker_python(), module="jobs.queue_process", what="queue")
+    code = run_in_worker(request, module="jobs.queue_process", what="queue")
     return code or int(bool(refused))
 
 
 def _folders(root: Path) -> list[Path]:
     """Return the folders of a folder, by name.
 
-    Raises
-    ------
-    UsageError
-        There is no such folder, or it holds none, or too many.
+    Raises UsageError: there is no such folder, or it holds none, or too many.
     """
-    from ..core.errors import UsageError
-
     if not root.is_dir():
         raise UsageError(f"{root} is not a folder.", "Give a folder of folders of photos.")
     found = sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
@@ -308,10 +276,8 @@ def _folders(root: Path) -> list[Path]:
 
 def _is_same(folder: Path, job: JobFile) -> bool:
     """Return whether a folder holds this job already, begun or finished, and run the same way."""
-    from ..core.errors import WrapError
     from ..core.jobs.parts.graph import plan_hash
     from ..core.jobs.store.job_file import read_job
-    from ..core.jobs.store.job_folder import JobFolder
 
     try:
         known = read_job(JobFolder(folder).job_path)
@@ -319,9 +285,3 @@ def _is_same(folder: Path, job: JobFile) -> bool:
         return same and plan_hash(known) == plan_hash(job)
     except (WrapError, OSError):
         return False
-
-
-def _default(value: int | None, path: str) -> int:
-    from ..core.settings import declared
-
-    return int(declared(path).default) if value is None else value

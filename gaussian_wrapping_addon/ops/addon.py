@@ -39,22 +39,22 @@ def properties_of(owner: bpy.types.Scene | bpy.types.Object) -> Any:
 # -- Redraw areas of Blender's windows, and show that Blender is busy -----------------------------
 
 
+def _areas(*kinds: str) -> Iterator[bpy.types.Area]:
+    areas = (area for w in bpy.context.window_manager.windows for area in w.screen.areas)
+    return (area for area in areas if area.type in kinds)
+
+
 def redraw(*kinds: str) -> None:
     """Tag all areas of these types for redrawing; by default 3D views."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in (kinds or ("VIEW_3D",)):
-                area.tag_redraw()
+    for area in _areas(*(kinds or ("VIEW_3D",))):
+        area.tag_redraw()
 
 
 def redraw_sidebars() -> None:
     """Let the side panels of 3D views be drawn again, but not the views."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                for region in area.regions:
-                    if region.type == "UI":
-                        region.tag_redraw()
+    for region in (region for area in _areas("VIEW_3D") for region in area.regions):
+        if region.type == "UI":
+            region.tag_redraw()
 
 
 def redraw_status_bars() -> None:
@@ -154,25 +154,22 @@ def frame_of(thing: bpy.types.Object | None) -> bpy.types.Object | None:
     return None
 
 
-def current_frame(
-    scene: bpy.types.Scene, active: bpy.types.Object | None
-) -> bpy.types.Object | None:
+def current_frame(context: bpy.types.Context) -> bpy.types.Object | None:
     """Return the frame of the active object, or else the scene's newest one, or None."""
-    frame = frame_of(active)
-    if frame is not None:
-        return frame
-    frames = list(objects_of_kind(scene, "frame"))
-    return frames[-1] if frames else None
+    frames = list(objects_of_kind(context.scene, "frame"))
+    return frame_of(context.view_layer.objects.active) or (frames[-1] if frames else None)
+
+
+def needed_frame(context: bpy.types.Context) -> bpy.types.Object:
+    """Return :func:`current_frame`. Raises UsageError: there is none."""
+    frame = current_frame(context)
+    if frame is None:
+        raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
+    return frame
 
 
 def result_folder(frame: bpy.types.Object) -> Path:
-    """Return the result folder that a frame names.
-
-    Raises
-    ------
-    UsageError
-        The frame has none.
-    """
+    """Return the result folder that a frame names. Raises UsageError: the frame has none."""
     text = frame.get(RESULT, "")
     if not isinstance(text, str) or not text:
         raise UsageError(f"{frame.name} has no result folder.", "Import the result again.")
@@ -182,10 +179,7 @@ def result_folder(frame: bpy.types.Object) -> Path:
 def world_from_scene(frame: bpy.types.Object) -> Similarity:
     """Return the similarity from the scene frame to the world of the input.
 
-    Raises
-    ------
-    UsageError
-        The custom property is missing or was edited.
+    Raises UsageError: the custom property is missing or was edited.
     """
     try:
         return Similarity.from_json(json.loads(frame[WORLD_FROM_SCENE]))
@@ -216,16 +210,29 @@ _logger = logging.getLogger(__name__)
 
 
 class ReportsErrors(_Operator):
-    """Mixin: ``execute`` calls ``work`` and reports what it raises."""
+    """Mixin: ``poll`` asks ``why_not``; ``execute`` calls ``work`` and reports what it raises."""
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    @classmethod
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        """Return why the operator cannot run now, and the next step; ``""`` if it can."""
+        return ""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run; Blender calls this."""
+        reason = cls.why_not(context)
+        cls.poll_message_set(reason)
+        return not reason
+
+    def work(self, context: bpy.types.Context) -> None:
         """Perform the operation."""
         raise NotImplementedError
 
     def execute(self, context: bpy.types.Context) -> OperatorResult:
         """Run :meth:`work`; Blender calls this."""
         try:
-            return self.work(context)
+            self.work(context)
+            return {"FINISHED"}
         except WrapError as error:
             _logger.info("%s: %s", type(self).__name__, error)
             self.report({"ERROR"}, str(error))
@@ -239,24 +246,18 @@ class NeedsObjectMode(ReportsErrors):
     """Mixin: the operator is available in Object Mode only."""
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run; Blender calls this."""
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Change to Object Mode first")
-            return False
-        return True
+    def why_not(cls, context: bpy.types.Context) -> str:
+        return "" if context.mode == "OBJECT" else "Change to Object Mode first"
 
 
-class NeedsResult(_Operator):
+class NeedsResult(ReportsErrors):
     """Mixin: the operator acts on the scene's current result."""
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run; Blender calls this."""
-        if current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("The scene has no result; wrap it, or import one")
-            return False
-        return True
+    def why_not(cls, context: bpy.types.Context) -> str:
+        if current_frame(context) is None:
+            return "The scene has no result; wrap it, or import one"
+        return super().why_not(context)
 
 
 # -- Job folders used on this machine, so that a .blend from elsewhere opens none -----------------
@@ -307,9 +308,8 @@ def is_remote(folder: Path) -> bool:
 
 
 def _list_path() -> Path | None:
-    package = addon_package()
     with contextlib.suppress(ValueError, OSError):  # ValueError: not installed as an extension
-        return Path(bpy.utils.extension_path_user(package, create=True)) / _FILE
+        return Path(bpy.utils.extension_path_user(addon_package(), create=True)) / _FILE
     return None
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import queue
@@ -39,17 +40,11 @@ Result = TypeVar("Result")
 class Task(Generic[Result]):
     """One call of a :class:`Lane` and its outcome.
 
-    Parameters
-    ----------
-    call : callable
-        Runs in the lane's thread.
-    then : callable, optional
-        Receives the result on the main thread. Without it, the caller polls :meth:`finished` and
-        reads :meth:`result`.
-    failed : callable, optional
-        Receives the exception if ``call`` raised one; by default it is logged.
-    end : callable, optional
-        Called by :meth:`cancel` to end what the call waits for; must not block.
+    ``call``: runs in the lane's thread.
+    ``then``: receives the result on the main thread. Without it, the caller polls :meth:`finished`
+    and reads :meth:`result`.
+    ``failed``: receives the exception if ``call`` raised one; by default it is logged.
+    ``end``: called by :meth:`cancel` to end what the call waits for; must not block.
     """
 
     def __init__(
@@ -125,10 +120,7 @@ class Lane:
     Starting a thread blocks until it runs, which takes long while a worker keeps all processors
     busy: :meth:`start` does it ahead of time.
 
-    Parameters
-    ----------
-    of_file : bool
-        Tasks concern the open file and are cancelled before another one is loaded.
+    ``of_file``: tasks concern the open file and are cancelled before another one is loaded.
     """
 
     def __init__(self, *, of_file: bool = False) -> None:
@@ -262,57 +254,6 @@ def stop() -> None:
 _endings = Lane()
 
 
-def run_child(
-    command: list[str],
-    on_start: Callable[[subprocess.Popen[bytes]], bool],
-    deadline_s: float,
-    late: WorkerError | None = None,
-) -> tuple[list[dict[str, Any]], str]:
-    """Run a child to its end; touches nothing of Blender.
-
-    Parameters
-    ----------
-    on_start : callable
-        Receives the process; returns false if the estimate is no longer wanted, which ends it.
-    late : WorkerError, optional
-        Raised where it takes too long, in place of the error of an estimate.
-
-    Returns
-    -------
-    messages : list of dict
-        JSON objects from standard output, one a line.
-    last_words : str
-        The last line of standard error.
-
-    Raises
-    ------
-    WorkerError
-        The child does not start, or takes too long.
-    """
-    try:
-        process = spawn(command)
-    except OSError as error:
-        raise not_started(command[0], error) from None
-    if not on_start(process):
-        kill_group(process)
-    try:
-        output, words = process.communicate(timeout=deadline_s)
-    except subprocess.TimeoutExpired:
-        kill_group(process)
-        too_long = WorkerError("The estimate took too long.", "Start the job without it.")
-        raise late or too_long from None
-    found = []
-    for line in output.decode(errors="replace").splitlines():
-        try:
-            values = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(values, dict):
-            found.append(values)
-    last = words.decode(errors="replace").strip().splitlines()
-    return found, last[-1] if last else ""
-
-
 def get_ready() -> None:
     """Start the thread that ends children, ahead of a timer that uses it."""
     _endings.start()
@@ -329,13 +270,34 @@ class Child:
     def run(
         self, command: list[str], deadline_s: float, late: WorkerError | None = None
     ) -> tuple[list[dict[str, Any]], str]:
-        """Run a child to its end, in a thread; see :func:`run_child`."""
-        return run_child(command, self._on_start, deadline_s, late)
+        """Run a child to its end, in a thread; touches nothing of Blender.
 
-    def _on_start(self, process: subprocess.Popen[bytes]) -> bool:
+        ``late``: raised where it takes too long, in place of the error of an estimate.
+        Returns ``messages``: JSON objects from standard output, one a line; ``last_words``: the
+        last line of standard error.
+        Raises WorkerError: the child does not start, or takes too long.
+        """
+        try:
+            process = spawn(command)
+        except OSError as error:
+            raise not_started(command[0], error) from None
         with self._guard:
             self.process = process
-            return self._wanted
+            wanted = self._wanted
+        if not wanted:
+            kill_group(process)
+        try:
+            output, words = process.communicate(timeout=deadline_s)
+        except subprocess.TimeoutExpired:
+            kill_group(process)
+            too_long = WorkerError("The estimate took too long.", "Start the job without it.")
+            raise late or too_long from None
+        found = []
+        for line in output.decode(errors="replace").splitlines():
+            with contextlib.suppress(ValueError):
+                found.append(json.loads(line))
+        last = words.decode(errors="replace").strip().splitlines()
+        return [v for v in found if isinstance(v, dict)], last[-1] if last else ""
 
     def end(self) -> None:
         """Cancel: end the process in the background, or as soon as it has started."""

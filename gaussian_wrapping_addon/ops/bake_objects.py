@@ -34,7 +34,7 @@ from .mesh_data import build_mesh, build_polygons, evaluated, mesh_of, values_of
 from .placement import placement_of
 from .region_objects import matrix_of, transformed
 from .result_files import read_mesh_arrays
-from .scene_objects import create_material, load_texture, set_occlusion, set_shading, shading_of
+from .scene_objects import create_material, load_texture, set_shading, shading_of
 
 # -- A mesh object as triangles, with its modifiers, in the world of a job's input ----------------
 
@@ -60,10 +60,8 @@ class Triangulation:
 def triangulation_of(thing: bpy.types.Object) -> Triangulation:
     """Triangulate a mesh object as it is shown.
 
-    Raises
-    ------
-    UsageError
-        It is no mesh, is not evaluated, has no faces, or has vertices that are not finite.
+    Raises UsageError: it is no mesh, is not evaluated, has no faces, or has vertices that are not
+    finite.
     """
     if thing.type != "MESH":
         raise UsageError(f"{thing.name} is no mesh.", "Select a mesh object.")
@@ -106,17 +104,6 @@ def _same_faces(evaluated: bpy.types.Mesh, own: bpy.types.Mesh) -> bool:
     return bool(np.array_equal(corners[0], corners[1]) and np.array_equal(starts[0], starts[1]))
 
 
-def scene_points(frame: bpy.types.Object, vertices: np.ndarray) -> np.ndarray:
-    """Bring (n, 3) points of Blender's world into the scene frame of a result.
-
-    Raises
-    ------
-    UsageError
-        The frame is scaled differently along its axes, mirrored or has no size.
-    """
-    return placement_of(frame).inverse().points(vertices)
-
-
 def world_mesh(
     frame: bpy.types.Object,
     triangles: Triangulation,
@@ -126,17 +113,12 @@ def world_mesh(
 ) -> FileMesh:
     """Return a mesh in the world of the input, wherever the result and the object stand.
 
-    Parameters
-    ----------
-    with_uvs, with_polygons : bool
-        Whether it has the UVs of the triangles, and what these are parts of.
-
-    Raises
-    ------
-    UsageError
-        The frame has no valid transform, or has lost its world coordinates.
+    ``with_uvs``, ``with_polygons``: whether it has the UVs of the triangles, and what these are
+    parts of.
+    Raises UsageError: the frame has no valid transform, or has lost its world coordinates.
     """
-    world = addon.world_from_scene(frame).points(scene_points(frame, triangles.vertices))
+    scene = placement_of(frame).inverse().points(triangles.vertices)
+    world = addon.world_from_scene(frame).points(scene)
     polygons = Polygons(triangles.polygons.astype(np.int64), triangles.loops.astype(np.int64))
     return FileMesh(
         world, triangles.faces, triangles.corner_uvs if with_uvs else None,
@@ -172,19 +154,10 @@ _MEND = (
 def quads_of(name: str, triangles: Triangulation, quads: int) -> Triangulation:
     """Return about so many quads along a mesh, as triangles that are parts of them.
 
-    Parameters
-    ----------
-    name : str
-        Of the object, for errors.
-    triangles : Triangulation
-        Finite.
-    quads : int
-        QuadriFlow makes up to a quarter fewer, or a few more.
-
-    Raises
-    ------
-    UsageError
-        QuadriFlow refuses the mesh, fails or is cancelled.
+    ``name``: of the object, for errors.
+    ``triangles``: finite.
+    ``quads``: QuadriFlow makes up to a quarter fewer, or a few more.
+    Raises UsageError: QuadriFlow refuses the mesh, fails or is cancelled.
     """
     vertices, faces = _joined(triangles)
     edges = edge_lengths(vertices, faces)
@@ -238,12 +211,12 @@ def _refuse_unsound(name: str, vertices: np.ndarray, faces: np.ndarray) -> bool:
     repeated = np.unique(directed, return_counts=True)
     twice = np.isin(directed, repeated[0][repeated[1] > 1]) & (per_edge == 2)
     keys = edge_keys(begin, end, len(vertices))
-    counts = [len(np.unique(keys[bad])) for bad in (per_edge > 2, twice)]
-    texts = (
-        "more than two faces meet at {} of its edges",
-        "faces point to opposite sides at {} of its edges",
-    )
-    found = [text.format(count) for text, count in zip(texts, counts, strict=True) if count]
+    problems = (
+        ("more than two faces meet", per_edge > 2), ("faces point to opposite sides", twice),
+    )  # fmt: skip
+    found = [
+        f"{text} at {len(np.unique(keys[bad]))} of its edges" for text, bad in problems if bad.any()
+    ]
     if found:
         raise UsageError(f"QuadriFlow cannot work on {name}: {', '.join(found)}.", _MEND)
     return bool((per_edge == 1).any())
@@ -280,13 +253,9 @@ def _run(name: str, thing: bpy.types.Object, quads: int, *, is_open: bool) -> No
     try:
         with bpy.context.temp_override(active_object=thing, object=thing, selected_objects=[thing]):
             outcome = bpy.ops.object.quadriflow_remesh(
-                mode="FACES",
-                target_faces=quads,
-                use_mesh_symmetry=False,
-                use_preserve_sharp=False,
-                use_preserve_boundary=is_open,
-                seed=SEED,
-            )
+                mode="FACES", target_faces=quads, use_mesh_symmetry=False,
+                use_preserve_sharp=False, use_preserve_boundary=is_open, seed=SEED,
+            )  # fmt: skip
     except RuntimeError as error:  # what Blender reports as an error
         _logger.warning("QuadriFlow on %s: %s", name, error)
     sides = values_of(mesh_of(thing).polygons, "loop_total", 1, np.int32)
@@ -337,10 +306,7 @@ class BakedFiles:
 def read_baked(folder: Path) -> BakedFiles:
     """Read and check a folder of a bake.
 
-    Raises
-    ------
-    DatasetError, ParseError
-        A file is missing or invalid, or the folder holds links.
+    Raises DatasetError, ParseError: a file is missing or invalid, or the folder holds links.
     """
     reject_foreign_entries(folder)
     path = folder / "mesh.npz"
@@ -402,19 +368,11 @@ def apply_bake(
     Polygons that new UVs cut are divided; all others stay. A bake with fewer faces or with quads
     becomes a new object under the frame, and the dense one is hidden.
 
-    Parameters
-    ----------
-    scene : Scene
-    frame : Object
-        Frame of the result whose photos were baked.
-    baked : BakedFiles
-    target_uid : int, optional
-        Session uid of the object that was handed over; otherwise it is found by its tag.
-
-    Raises
-    ------
-    UsageError
-        The object is gone, or its faces have changed since; nothing has been changed.
+    ``frame``: frame of the result whose photos were baked.
+    ``target_uid``: session uid of the object that was handed over; otherwise it is found by its
+    tag.
+    Raises UsageError: the object is gone, or its faces have changed since; nothing has been
+    changed.
     """
     thing = _target(scene, baked.name, target_uid)
     if not baked.has_own_faces or baked.polygons is not None:
@@ -428,7 +386,9 @@ def apply_bake(
         if not baked.has_own_uvs:
             _set_uvs(thing, frame, baked)
         _set_material(thing, frame, baked)
-        _use_active_uvs(mesh_of(thing))
+        layer = mesh_of(thing).uv_layers.active
+        if layer is not None:
+            layer.active_render = True  # render with the UV map that photos were baked for
     thing[addon.BAKE] = baked.name
     note = f"{100 * baked.coverage:.1f} % seen by photos"
     thing[addon.BAKE_NOTE] = " ".join([f"{note}.", *baked.warnings])
@@ -450,7 +410,8 @@ def _new_object(
 ) -> bpy.types.Object:
     known = (t for t in scene.objects if addon.kind_of(t) == "baked")
     thing = next((t for t in known if t.get(addon.BAKE) == baked.name), None)
-    name = f"{dense.name}{SUFFIXES[_retopology(baked)]}" if dense else baked.name
+    retopology = "DECIMATE" if baked.polygons is None else "QUADS"
+    name = f"{dense.name}{SUFFIXES[retopology]}" if dense else baked.name
     if baked.polygons is None:
         mesh = build_mesh(name, baked.vertices, baked.faces, baked.corner_uvs)
     else:
@@ -490,10 +451,6 @@ def _stand_in(thing: bpy.types.Object, dense: bpy.types.Object) -> None:
         layer.objects.active = thing
 
 
-def _retopology(baked: BakedFiles) -> str:
-    return "DECIMATE" if baked.polygons is None else "QUADS"
-
-
 def _set_uvs(thing: bpy.types.Object, frame: bpy.types.Object, baked: BakedFiles) -> None:
     triangles = triangulation_of(thing)
     _refuse_changed(thing, frame, triangles, baked)
@@ -519,14 +476,11 @@ def _set_uvs(thing: bpy.types.Object, frame: bpy.types.Object, baked: BakedFiles
 
 
 def _refuse_changed(
-    thing: bpy.types.Object,
-    frame: bpy.types.Object,
-    triangles: Triangulation,
-    baked: BakedFiles,
+    thing: bpy.types.Object, frame: bpy.types.Object, triangles: Triangulation, baked: BakedFiles
 ) -> None:
     same = triangles.is_own and triangles.faces.shape == baked.faces.shape
     if same:
-        now = scene_points(frame, triangles.vertices)[triangles.faces]
+        now = placement_of(frame).inverse().points(triangles.vertices)[triangles.faces]
         before = baked.vertices[baked.faces]
         extent = float(np.ptp(before.reshape(-1, 3), axis=0).max())
         # Moved, turned or scaled as a whole, it is the same mesh.
@@ -590,8 +544,7 @@ def _set_material(thing: bpy.types.Object, frame: bpy.types.Object, baked: Baked
     mesh = mesh_of(thing)
     if mesh.users > 1:
         thing.data = mesh = mesh.copy()
-    material = create_material(f"{thing.name} photos", image, normal)
-    set_occlusion(material, dark)
+    material = create_material(f"{thing.name} photos", image, normal, dark)
     set_shading(material, _shading(frame))
     mesh.materials.clear()
     mesh.materials.append(material)
@@ -633,10 +586,3 @@ def _load(paths: Sequence[Path], udims: Sequence[int], colorspace: str) -> bpy.t
     settings: Any = image.colorspace_settings
     settings.name = colorspace
     return image
-
-
-def _use_active_uvs(mesh: bpy.types.Mesh) -> None:
-    """Render with the UV map that photos were baked for: the active one."""
-    layer = mesh.uv_layers.active
-    if layer is not None:
-        layer.active_render = True

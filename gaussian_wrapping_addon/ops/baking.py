@@ -10,7 +10,6 @@ from typing import Final
 import bpy
 
 from ..core.errors import UsageError, unwritable_error
-from ..core.jobs.client import JobClient, worker_python
 from ..core.jobs.store.job_file import BakeRequest, make_bake_job
 from ..core.jobs.store.job_folder import JobFolder
 from ..core.jobs.store.rollback import finished_job, no_finished_training
@@ -18,19 +17,18 @@ from ..core.jobs.store.stage_folder import read_done
 from ..core.mesh.exchange import FileMesh, write_handed_over
 from ..core.names import file_stem
 from ..core.settings import TextureSettings
-from . import addon, job_timer, worker_setup
-from .addon import OperatorResult, properties_of, waiting
+from . import addon
+from .addon import properties_of, waiting
 from .bake_objects import SUFFIXES, Triangulation, quads_of, triangulation_of, world_mesh
-from .jobs import ConfirmsFolder, has_worker, no_job_runs
+from .jobs import ConfirmsFolder, launch, refuse_running, why_no_start
 from .panel_settings import job_folder_of, texture_choices
-from .worker_setup import WorkerChoice
+from .worker_setup import WorkerChoice, worker_choice
 
 # -- Start a bake: hand a mesh of the scene over to the worker ------------------------------------
 
 
 FOLDER = "handed-over"
 """Folder of a job with the meshes that Blender has handed over."""
-_UNWRAP = "Unwrap it (U), choose New UVs without modifiers, or apply the modifiers."
 
 
 def bake_target(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -43,29 +41,18 @@ def bake_target(context: bpy.types.Context) -> bpy.types.Object | None:
 
 def start_bake(
     scene: bpy.types.Scene, frame: bpy.types.Object, thing: bpy.types.Object, choice: WorkerChoice
-) -> Path:
-    """Bake the photos of a result onto a mesh object; return the job folder.
+) -> None:
+    """Bake the photos of a result onto a mesh object.
 
-    Parameters
-    ----------
-    frame : Object
-        The frame of the result.
-    thing : Object
-        Any mesh; it need not belong to the result.
+    ``thing`` is any mesh, which need not belong to the result. Quads are made here, in Blender,
+    which waits for them. They become an object when the bake is done: until then, and where it
+    fails, the scene stays as it is.
 
-    Raises
-    ------
-    WrapError
-        The mesh cannot be baked onto or made of quads, or the job has no finished training.
-
-    Notes
-    -----
-    Quads are made here, in Blender, which waits for them. They become an object when the bake is
-    done: until then, and where it fails, the scene stays as it is.
+    Raises WrapError: the mesh cannot be baked onto or made of quads, or the job has no finished
+    training.
     """
     folder = JobFolder(job_folder_of(frame))
-    if job_timer.is_running(str(folder.root)):
-        raise UsageError(f"A job is running in {folder.root}.", "Cancel it or wait for it.")
+    refuse_running(folder.root)
     earlier = finished_job(folder)
     if not any(read_done(path) for path in folder.stages.glob("train-*")):
         raise no_finished_training(folder.root)
@@ -87,23 +74,17 @@ def start_bake(
     )  # fmt: skip
     mesh = replace(mesh, is_new=chosen.retopology == "QUADS")
     request = BakeRequest(
-        mesh=str(_hand_over(folder, name, mesh)),
-        name=name,
+        mesh=str(_hand_over(folder, name, mesh)), name=name,
         uvs=chosen.uvs.lower() if keeps else "auto",
         faces=chosen.faces if chosen.retopology == "DECIMATE" else 0,
-        dense=_hand_over_dense(folder, name, frame, dense),
+        dense=str(_hand_over(folder, f"{name}-dense", world_mesh(frame, dense))) if dense else "",
         texture=_texture(scene, has_dense=dense is not None),
-    )
+    )  # fmt: skip
     job = make_bake_job(earlier, request)
     job = replace(job, settings=replace(job.settings, threads=choice.threads))
-    client = JobClient.start(
-        folder.root, job, python=worker_python(choice.python), keep_running=choice.keep_running
-    )
+    launch(scene, folder.root, job, choice, "BAKE", thing.session_uid)
     if keeps:
         thing[addon.BAKE] = name
-    properties_of(scene).job_command = "BAKE"
-    job_timer.watch(scene, folder.root, client, target_uid=thing.session_uid)
-    return folder.root
 
 
 def _refuse_unusable(thing: bpy.types.Object, triangles: Triangulation, uvs: str) -> None:
@@ -115,10 +96,10 @@ def _refuse_unusable(thing: bpy.types.Object, triangles: Triangulation, uvs: str
         )
     if uvs == "OWN" and triangles.corner_uvs is None:
         raise UsageError(f"{thing.name} has no UV map.", "Unwrap it (U), or choose New UVs.")
-    makes_uvs = uvs == "NEW" or triangles.corner_uvs is None
-    if makes_uvs and not triangles.is_own:
+    if (uvs == "NEW" or triangles.corner_uvs is None) and not triangles.is_own:
         raise UsageError(
-            f"Modifiers of {thing.name} change its faces, and it needs new UVs.", _UNWRAP
+            f"Modifiers of {thing.name} change its faces, and it needs new UVs.",
+            "Unwrap it (U), choose New UVs without modifiers, or apply the modifiers.",
         )
 
 
@@ -150,14 +131,6 @@ def _hand_over(folder: JobFolder, name: str, mesh: FileMesh) -> Path:
     return path
 
 
-def _hand_over_dense(
-    folder: JobFolder, name: str, frame: bpy.types.Object, dense: Triangulation | None
-) -> str:
-    if dense is None:
-        return ""
-    return str(_hand_over(folder, f"{name}-dense", world_mesh(frame, dense)))
-
-
 def _texture(scene: bpy.types.Scene, *, has_dense: bool) -> TextureSettings:
     """Return the settings of the panel Texture, without levels of detail."""
     chosen = {path.rpartition(".")[2]: value for path, value in texture_choices(scene).items()}
@@ -179,31 +152,23 @@ class GWRAP_OT_bake_photos(ConfirmsFolder, bpy.types.Operator):
     )
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("Needs a finished job: press Wrap Scene or Import Result first")
-            return False
+    def why_not(cls, context: bpy.types.Context) -> str:
+        if addon.current_frame(context) is None:
+            return "Needs a finished job: press Wrap Scene or Import Result first"
         if context.mode != "OBJECT":
-            cls.poll_message_set("Change to Object Mode first")
-            return False
+            return "Change to Object Mode first"
         if bake_target(context) is None:
-            cls.poll_message_set("Select a mesh to bake the photos onto")
-            return False
-        return has_worker(cls) and no_job_runs(cls, context)
+            return "Select a mesh to bake the photos onto"
+        return why_no_start(context)
 
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-        return addon.result_folder(frame).parent if frame and frame.get(addon.RESULT) else None
-
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+    def work(self, context: bpy.types.Context) -> None:
+        frame = addon.current_frame(context)
         thing = bake_target(context)
         if frame is None or thing is None:
             raise UsageError("No mesh is selected.", "Select a mesh, and wrap the scene before.")
         with waiting(context):
-            start_bake(context.scene, frame, thing, worker_setup.worker_choice(context))
+            start_bake(context.scene, frame, thing, worker_choice(context))
         self.report({"INFO"}, f"Baking photos onto {thing.name}")
-        return {"FINISHED"}
 
 
 CLASSES: Final = (GWRAP_OT_bake_photos,)

@@ -14,7 +14,7 @@ from ..core.errors import DatasetError, UsageError
 from ..core.files import real_path, resolve_inside
 from ..core.scene.camera import Camera
 from . import addon
-from .addon import NeedsResult, OperatorResult, ReportsErrors
+from .addon import NeedsResult
 
 # -- Pinhole cameras as Blender cameras with the same projection ----------------------------------
 
@@ -29,14 +29,6 @@ PHOTO_ALPHA = 0.7
 
 # Ours looks along +z with y down, Blender's along -z with y up.
 _CAM_FROM_BLENDER_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def camera_matrix(camera: Camera) -> np.ndarray:
-    """Return the (4, 4) float64 matrix of the Blender camera in the scene frame."""
-    scene_from_cam = np.eye(4)
-    scene_from_cam[:3, :3] = camera.rotation.T
-    scene_from_cam[:3, 3] = camera.center
-    return scene_from_cam @ _CAM_FROM_BLENDER_CAM
 
 
 def set_projection(data: bpy.types.Camera, camera: Camera) -> None:
@@ -66,7 +58,10 @@ def create_camera(
     data.clip_start, data.clip_end = CLIP_START, CLIP_END
     data.display_size = display_size
     thing = bpy.data.objects.new(camera.name, data)
-    thing.matrix_basis = Matrix(camera_matrix(camera).tolist())
+    scene_from_cam = np.eye(4)
+    scene_from_cam[:3, :3] = camera.rotation.T
+    scene_from_cam[:3, 3] = camera.center
+    thing.matrix_basis = Matrix((scene_from_cam @ _CAM_FROM_BLENDER_CAM).tolist())
     aspect = camera.fx / camera.fy
     thing[addon.KIND] = "camera"
     thing[addon.PHOTO] = photo
@@ -141,10 +136,7 @@ def photo_of(thing: bpy.types.Object) -> Path:
 def show_photo(thing: bpy.types.Object) -> None:
     """Show a camera's photo behind what it sees; the file is read when it is drawn, not packed.
 
-    Raises
-    ------
-    DatasetError
-        The photo is not there.
+    Raises DatasetError: the photo is not there.
     """
     path = photo_of(thing)
     hint = "Restore it, or look through the camera without it."
@@ -155,10 +147,9 @@ def show_photo(thing: bpy.types.Object) -> None:
     except RuntimeError as error:
         raise DatasetError(f"The photo {path} cannot be read: {error}.", hint) from None
     data = cast(bpy.types.Camera, thing.data)
-    background = data.background_images[0] if data.background_images else None
-    if background is None:
-        background = data.background_images.new()
-        background.alpha = PHOTO_ALPHA
+    if not data.background_images:
+        data.background_images.new().alpha = PHOTO_ALPHA
+    background = data.background_images[0]
     background.frame_method = "STRETCH"  # the frame has the photo's shape
     background.image = image
     data.show_background_images = True
@@ -167,7 +158,7 @@ def show_photo(thing: bpy.types.Object) -> None:
 # -- Look through the photo cameras, one after another, with their photos behind the mesh ---------
 
 
-class GWRAP_OT_view_photo(NeedsResult, ReportsErrors, bpy.types.Operator):
+class GWRAP_OT_view_photo(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.view_photo"
     bl_label = "Look Through Camera"
     bl_description = (
@@ -182,7 +173,7 @@ class GWRAP_OT_view_photo(NeedsResult, ReportsErrors, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame, thing = self._camera(context)
         bring_forward(frame, thing)
         look_through(context.scene, thing)
@@ -194,11 +185,10 @@ class GWRAP_OT_view_photo(NeedsResult, ReportsErrors, bpy.types.Operator):
             show_photo(thing)
         except DatasetError as error:
             self.report({"WARNING"}, str(error))
-        return {"FINISHED"}
 
     def _camera(self, context: bpy.types.Context) -> tuple[bpy.types.Object, bpy.types.Object]:
         active = context.view_layer.objects.active
-        frame = addon.current_frame(context.scene, active)
+        frame = addon.current_frame(context)
         cameras = cameras_under(frame) if frame is not None else []
         if frame is None or not cameras:
             raise UsageError("The result has no photo cameras.", "Import the result again.")

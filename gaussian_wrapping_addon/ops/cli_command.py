@@ -16,10 +16,8 @@ _handle: Any = None
 def register(main: Callable[[list[str], str], int]) -> None:
     """Register the command with Blender, once.
 
-    Parameters
-    ----------
-    main : callable
-        Takes the arguments and the name of the program, runs one command, returns its exit code.
+    ``main``: takes the arguments and the name of the program, runs one command, returns its exit
+    code.
     """
     global _handle
     if _handle is None:

@@ -7,16 +7,15 @@ import json
 import logging
 import os
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import bpy
 
 from ..core.errors import UsageError, WorkerError, WrapError
-from ..core.farm.addresses import Address, scheduler_address
+from ..core.farm.addresses import scheduler_address
 from ..core.files import real_path
 from ..core.jobs.client import worker_python
 from ..core.jobs.parts.graph import PARTS_NAME
@@ -24,9 +23,8 @@ from ..core.jobs.parts.states import PartBoard, PartReader
 from ..core.names import SHARED_VARIABLE
 from ..core.worker.helper_process import child_command
 from . import addon, background
-from .addon import OperatorResult, ReportsErrors, properties_of, redraw_sidebars, tr
+from .addon import ReportsErrors, properties_of, redraw_sidebars, tr
 from .background import Child, Lane, Task
-from .job_timer import key_of
 from .panel_settings import certificates_of, output_of, source_of
 from .worker_setup import WorkerChoice, worker_choice
 
@@ -34,8 +32,6 @@ from .worker_setup import WorkerChoice, worker_choice
 
 
 _logger = logging.getLogger(__name__)
-
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -76,50 +72,24 @@ def outcome(about: str) -> Outcome | None:
     return found if found is not None and _memory.about == about else None
 
 
-def call(
-    about: str,
-    request: Callable[[], Result],
-    then: Callable[[Result], tuple[str, ...] | Outcome],
-    end: Callable[[], None] | None = None,
-) -> None:
-    """Run a request in the thread.
-
-    Parameters
-    ----------
-    about : str
-        The address or folder that it is about.
-    request : callable
-        Runs in the thread; touches nothing of Blender.
-    then : callable
-        Receives the result on the main thread; returns sentences on it, or an outcome.
-    end : callable, optional
-        Ends what the request waits for, where nobody waits for it any more.
-    """
-    _lane.cancel()
-    _memory.outcome, _memory.about = None, about
-
-    def keep(result: Result) -> None:
-        found = then(result)
-        _end(found if isinstance(found, Outcome) else Outcome(True, found))
-
-    def keep_failure(error: Exception) -> None:
-        if not isinstance(error, WrapError | OSError):
-            _logger.error("a request to a farm", exc_info=error)
-        lines = (error.message, error.hint) if isinstance(error, WrapError) else (str(error),)
-        _end(Outcome(False, tuple(filter(None, lines))))
-
-    _lane.submit(request, keep, failed=keep_failure, end=end)
-
-
 def stop() -> None:
     """Forget everything; a request that runs ends by itself within seconds."""
     _lane.stop()
     _memory.outcome = None
+    _watched.clear()
+    _readings.stop()
 
 
-def _end(outcome: Outcome) -> None:
+def _keep(outcome: Outcome) -> None:
     _memory.outcome = outcome
     redraw_sidebars()
+
+
+def _keep_failure(error: Exception) -> None:
+    if not isinstance(error, WrapError | OSError):
+        _logger.error("a request to a farm", exc_info=error)
+    lines = (error.message, error.hint) if isinstance(error, WrapError) else (str(error),)
+    _keep(Outcome(False, tuple(filter(None, lines))))
 
 
 # -- Check each worker of a Dask cluster in the background, by a process of the worker's Python
@@ -133,16 +103,18 @@ MAX_ROWS = 12
 MAX_TEXT = 600
 
 
-def start(scene: bpy.types.Scene, address: Address, choice: WorkerChoice) -> None:
+def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
     """Ask all workers of a scheduler in the background; the panel shows a row for each.
 
-    Raises
-    ------
-    UsageError
-        There is no folder to test, or the certificates are on another computer.
-    WorkerError
-        No worker is set up on this computer.
+    Raises UsageError: the address cannot be used, there is no folder to test, or the certificates
+    are on another computer; WorkerError: no worker is set up on this computer.
     """
+    about = properties_of(scene).computers.dask_address
+    address = scheduler_address(about)
+    if not address.is_this_computer and not bpy.app.online_access:
+        raise UsageError(
+            "Blender may not go online.", "Turn on Allow Online Access in Preferences, System."
+        )
     request = {
         "address": str(address), "certificates": certificates_of(scene),
         "folder": str(folder_of_jobs(scene)), "limit_s": LIMIT_S,
@@ -150,10 +122,12 @@ def start(scene: bpy.types.Scene, address: Address, choice: WorkerChoice) -> Non
     python = worker_python(choice.python)
     command, child = child_command(MODULE, json.dumps(request), python=python), Child()
     late = WorkerError("The test took too long.", "Look at the scheduler, then test again.")
-    call(
-        properties_of(scene).computers.dask_address,
+    _lane.cancel()
+    _memory.outcome, _memory.about = None, about
+    _lane.submit(
         lambda: child.run(command, DEADLINE_S, late),
-        lambda told: outcome_of(*told),
+        lambda told: _keep(outcome_of(*told)),
+        failed=_keep_failure,
         end=child.end,
     )
 
@@ -161,10 +135,7 @@ def start(scene: bpy.types.Scene, address: Address, choice: WorkerChoice) -> Non
 def folder_of_jobs(scene: bpy.types.Scene) -> Path:
     """Return the folder that workers must see: where the scene's job is or will be written.
 
-    Raises
-    ------
-    UsageError
-        Neither photos nor the environment name one.
+    Raises UsageError: neither photos nor the environment name one.
     """
     if properties_of(scene).source:
         folder = output_of(scene, source_of(scene))
@@ -183,12 +154,8 @@ def folder_of_jobs(scene: bpy.types.Scene) -> Path:
 def outcome_of(messages: list[dict[str, Any]], last_words: str) -> Outcome:
     """Return what the panel shows of what the process has written.
 
-    Parameters
-    ----------
-    messages : list of dict
-        ``{"worker": {...}}`` for each worker, ``{"error", "hint"}``.
-    last_words : str
-        The last line of its standard error.
+    ``messages``: ``{"worker": {...}}`` for each worker, ``{"error", "hint"}``.
+    ``last_words``: the last line of its standard error.
     """
     workers = [m["worker"] for m in messages if isinstance(m.get("worker"), dict)]
     errors = [m for m in messages if m.get("error")]
@@ -230,16 +197,9 @@ MAX_FOLDERS: Final = 20
 _NEVER_S: Final = float("-inf")
 
 
-@dataclass(frozen=True)
-class Look:
-    """What a job folder says of its parts."""
-
-    board: PartBoard
-
-    @property
-    def moves(self) -> bool:
-        """Whether something is left to happen."""
-        return bool(self.board.counts) and not self.board.finished
+def _moves(board: PartBoard | None) -> bool:
+    """Return whether something is left to happen."""
+    return board is not None and bool(board.counts) and not board.finished
 
 
 @dataclass
@@ -247,23 +207,20 @@ class _Watched:
     reader: PartReader
     asked_s: float = _NEVER_S
     read_s: float = _NEVER_S
-    look: Look | None = None
-    reading: Task[Look | None] | None = None
+    board: PartBoard | None = None
+    reading: Task[PartBoard | None] | None = None
 
 
 _readings = Lane()
 _watched: dict[str, _Watched] = {}
 
 
-def look_at(folder: str) -> Look | None:
+def look_at(folder: str) -> PartBoard | None:
     """Return the parts of a job folder as last read, for panels; None if there are none.
 
     Reads nothing. Asks for a new reading where this one is old.
 
-    Parameters
-    ----------
-    folder : str
-        Absolute path; ``""`` for none.
+    ``folder``: absolute path; ``""`` for none.
     """
     if not folder:
         return None
@@ -274,14 +231,9 @@ def look_at(folder: str) -> Look | None:
         watched = _watched[folder] = _Watched(PartReader(Path(folder)))
     watched.asked_s = time.monotonic()
     if _is_due(watched):
-        start_watching()
-    return watched.look
-
-
-def start_watching() -> None:
-    """Read in the background what was asked for."""
-    _readings.start()  # the timer starts no thread
-    background.watch(tick)
+        _readings.start()  # the timer starts no thread
+        background.watch(tick)
+    return watched.board
 
 
 def tick() -> bool:
@@ -296,21 +248,15 @@ def tick() -> bool:
                 again = True
             else:
                 watched.read_s = time.monotonic()
-        elif watched.look is not None and watched.look.moves:
+        elif _moves(watched.board):
             # Drawn since it was read, or drawn right now: it will be due.
             wait_s = time.monotonic() - watched.read_s
             again = again or watched.asked_s >= watched.read_s or wait_s < EVERY_S
     return again
 
 
-def stop_watching() -> None:
-    """Forget everything."""
-    _watched.clear()
-    _readings.stop()
-
-
 def _is_due(watched: _Watched) -> bool:
-    every_s = EVERY_S if watched.look is not None and watched.look.moves else IDLE_EVERY_S
+    every_s = EVERY_S if _moves(watched.board) else IDLE_EVERY_S
     return time.monotonic() - watched.read_s >= every_s
 
 
@@ -321,41 +267,17 @@ def _collected(watched: _Watched) -> bool:
         return True
     watched.reading, watched.read_s = None, time.monotonic()
     try:
-        watched.look = reading.result()
+        watched.board = reading.result()
     except Exception:  # whatever the folder contains
         _logger.exception("reading the parts in %s", watched.reader.root)
-        watched.look = None
+        watched.board = None
     redraw_sidebars()  # a panel that is shown asks again
-    return watched.look is not None and watched.look.moves
+    return _moves(watched.board)
 
 
-def _read(reader: PartReader) -> Look | None:
+def _read(reader: PartReader) -> PartBoard | None:
     """Read the parts of a job folder; runs in a thread."""
-    return Look(reader.read()) if (reader.root / PARTS_NAME).exists() else None
-
-
-# -- Actions of the panel "Computers" as plain functions ------------------------------------------
-
-
-def shown_folder(scene: bpy.types.Scene) -> str:
-    """Return the folder of the job whose parts a scene shows; ``""`` for none."""
-    return key_of(properties_of(scene).job_folder)
-
-
-def test_computers(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
-    """Ask in the background whether the chosen computers can be used.
-
-    Raises
-    ------
-    WrapError
-        The address or a folder cannot be used, or no worker is set up on this computer.
-    """
-    address = scheduler_address(properties_of(scene).computers.dask_address)
-    if not address.is_this_computer and not bpy.app.online_access:
-        raise UsageError(
-            "Blender may not go online.", "Turn on Allow Online Access in Preferences, System."
-        )
-    start(scene, address, choice)
+    return reader.read() if (reader.root / PARTS_NAME).exists() else None
 
 
 # -- The operator of the panel "Computers" --------------------------------------------------------
@@ -367,18 +289,13 @@ class GWRAP_OT_test_computers(ReportsErrors, bpy.types.Operator):
     bl_description = "Ask in the background whether these computers can run jobs"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if properties_of(context.scene).computers.kind == "THIS":
-            cls.poll_message_set("Choose Dask to test an address")
-            return False
-        if is_busy():
-            cls.poll_message_set("A request is running; it takes seconds")
-            return False
-        return True
+            return "Choose Dask to test an address"
+        return "A request is running; it takes seconds" if is_busy() else ""
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        test_computers(context.scene, worker_choice(context))
-        return {"FINISHED"}
+    def work(self, context: bpy.types.Context) -> None:
+        start(context.scene, worker_choice(context))
 
 
 CLASSES: Final = (GWRAP_OT_test_computers,)

@@ -16,14 +16,16 @@ from ..core.photos.formats import PHOTO_SUFFIXES
 from ..core.photos.video import VIDEO_SUFFIXES
 from ..core.readers.program_files import CAMERA_FILE_SUFFIXES
 from ..core.worker.helper_process import child_command
-from . import addon, background, job_timer, panel_settings, training, worker_setup
+from . import addon, background, job_timer, panel_settings, training
 from .addon import OperatorResult, ReportsErrors, properties_of, redraw, tr
 from .background import Child, Lane
-from .jobs import no_job_runs
+from .jobs import why_busy
 from .panel_settings import source_of
 from .worker_setup import WorkerChoice, worker_choice
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ..core.loading.check import Finding
 
 
@@ -41,12 +43,6 @@ _looks = Lane(of_file=True)
 def is_busy() -> bool:
     """Return whether the worker is looking at photos."""
     return _looks.busy
-
-
-def get_ready() -> None:
-    """Start the threads of the next look ahead of a timer that starts it."""
-    _looks.start()
-    background.get_ready()
 
 
 def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
@@ -83,12 +79,9 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
 def rows_of(messages: list[dict[str, Any]], last_words: str = "") -> list[dict[str, str]]:
     """Return the rows for the panel of what the worker wrote.
 
-    Parameters
-    ----------
-    messages : list of dict
-        ``{"finding": {"severity", "message", "hint"}}``, or ``{"error", "hint", "extras"}``.
-    last_words : str
-        The last line of the worker's standard error, shown if there is nothing else.
+    ``messages``: ``{"finding": {"severity", "message", "hint"}}``, or ``{"error", "hint",
+    "extras"}``.
+    ``last_words``: the last line of the worker's standard error, shown if there is nothing else.
     """
     rows = []
     for values in messages:
@@ -128,24 +121,23 @@ def is_checking() -> bool:
     return _checks.busy
 
 
-def check_now(scene: bpy.types.Scene, python: str = "") -> None:
+def check_now(scene: bpy.types.Scene, python: str) -> None:
     """Check a scene's input and store the findings; blocks Blender.
 
-    Parameters
-    ----------
-    python : str
-        The worker's Python in the preferences, which opens videos.
-
-    Raises
-    ------
-    UsageError
-        No input is chosen.
+    ``python``: the worker's Python in the preferences, which opens videos.
+    Raises UsageError: no input is chosen.
     """
+    stop_check()
+    _keep(scene, _check(scene, python)())
+
+
+def _check(scene: bpy.types.Scene, python: str) -> "Callable[[], list[Finding]]":
+    """Return what checks the present input, for a thread."""
     from ..core.loading.check import check_input
 
-    stop_check()
-    found = check_input(source_of(scene), worker=worker_if_any(python), panoramas=_panoramas(scene))
-    _keep(scene, found)
+    panoramas = str(properties_of(scene).training.equirectangular).lower()
+    source = source_of(scene)
+    return lambda: check_input(source, worker=worker_if_any(python), panoramas=panoramas)
 
 
 def start_check(
@@ -153,53 +145,41 @@ def start_check(
 ) -> None:
     """Begin to check a scene's input.
 
-    Parameters
-    ----------
-    choice : WorkerChoice, optional
-        If there are no errors, request an estimate of the training from this worker.
-    python : str
-        As for :func:`check_now`.
-
-    Raises
-    ------
-    UsageError
-        No input is chosen.
+    ``choice``: if there are no errors, request an estimate of the training from this worker.
+    ``python``: as for :func:`check_now`.
+    Raises UsageError: no input is chosen.
     """
-    from ..core.loading.check import Finding, check_input
+    from ..core.loading.check import Finding
 
-    source = source_of(scene)
+    check = _check(scene, python)
     stop_check()
-    get_ready()
+    _looks.start()  # now: the timer, which starts the look, starts no thread
+    background.get_ready()
     if choice is not None:
         training.get_ready()
     looks_with = choice or worker_choice(bpy.context)
-    panoramas = _panoramas(scene)
     uid, chosen = scene.session_uid, properties_of(scene).source
 
     def keep(found: "list[Finding]") -> None:
         scene = addon.scene_of_uid(uid)
         if scene is not None and properties_of(scene).source == chosen:
             _keep(scene, found)
-            has_photos = properties_of(scene).checked_kind not in WITHOUT_PHOTOS
-            if has_photos and not panel_settings.has_errors(scene):
-                start(scene, looks_with)
-            if choice is not None:
-                _estimate(scene, choice)
+            if not panel_settings.has_errors(scene):
+                if properties_of(scene).checked_kind not in WITHOUT_PHOTOS:
+                    start(scene, looks_with)
+                if choice is not None:
+                    try:
+                        training.start(scene, choice)
+                    except WrapError as error:
+                        training.answer_with(scene, error)
         redraw()
 
     def keep_failure(error: Exception) -> None:
-        _logger.error("checking %s", source, exc_info=error)
+        _logger.error("checking %s", chosen, exc_info=error)
         text = f"{type(error).__name__}: {error}"
         keep([Finding("error", text, "See the system console.")])
 
-    def check() -> "list[Finding]":
-        return check_input(source, worker=worker_if_any(python), panoramas=panoramas)
-
     _checks.submit(check, keep, failed=keep_failure)
-
-
-def _panoramas(scene: bpy.types.Scene) -> str:
-    return str(properties_of(scene).training.equirectangular).lower()
 
 
 def _keep(scene: bpy.types.Scene, found: "list[Finding]") -> None:
@@ -210,18 +190,7 @@ def _keep(scene: bpy.types.Scene, found: "list[Finding]") -> None:
     properties.checked_kind = next((f.kind for f in found if f.kind), "")
     for finding in found:
         row = properties.findings.add()
-        row.severity = finding.severity
-        row.message = finding.message
-        row.hint = finding.hint
-
-
-def _estimate(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
-    if panel_settings.has_errors(scene):
-        return
-    try:
-        training.start(scene, choice)
-    except WrapError as error:
-        training.answer_with(scene, error)
+        row.severity, row.message, row.hint = finding.severity, finding.message, finding.hint
 
 
 def stop_check() -> None:
@@ -255,8 +224,8 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
     )
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return no_job_runs(cls, context)
+    def why_not(cls, context: bpy.types.Context) -> str:
+        return why_busy(context)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         source = properties_of(context.scene).source
@@ -271,7 +240,7 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
         column.label(text=tr("or select a video,"), translate=False)
         column.label(text=tr("then press Choose Photos."), translate=False)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         if not self.filepath:
             raise UsageError("No folder was chosen.", "Open the folder of the photos.")
         path = Path(bpy.path.abspath(self.filepath))
@@ -286,9 +255,8 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
             job_timer.detach(context.scene)
         properties.source = str(path)
         training.forget()
-        choice = worker_setup.worker_choice(context)
+        choice = worker_choice(context)
         start_check(context.scene, choice, python=choice.python)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
@@ -297,35 +265,29 @@ class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
     bl_description = "Check the photos and camera poses and list problems"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if not properties_of(context.scene).source:
-            cls.poll_message_set("Choose the folder of the photos first")
-            return False
-        if is_checking():
-            cls.poll_message_set("The check is running; it takes seconds")
-            return False
-        return True
+            return "Choose the folder of the photos first"
+        return "The check is running; it takes seconds" if is_checking() else ""
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         """Check in a thread: Blender must not wait for a slow disk."""
         try:
-            python = worker_setup.worker_choice(context).python
-            start_check(context.scene, python=python)
+            start_check(context.scene, python=worker_choice(context).python)
         except WrapError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return {"FINISHED"}
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         properties = properties_of(context.scene)
-        check_now(context.scene, worker_setup.worker_choice(context).python)
-        errors = sum(row.severity == "error" for row in properties.findings)
-        warnings = sum(row.severity == "warning" for row in properties.findings)
+        check_now(context.scene, worker_choice(context).python)
+        severities = [row.severity for row in properties.findings]
+        errors, warnings = severities.count("error"), severities.count("warning")
         self.report(
             {"WARNING"} if errors or warnings else {"INFO"},
             f"Photos checked: {errors} errors, {warnings} warnings",
         )
-        return {"FINISHED"}
 
 
 CLASSES: Final = (GWRAP_OT_choose_input, GWRAP_OT_check_photos)

@@ -26,15 +26,15 @@ from ..core.texture.file_checks import (
     write_mesh_ply,
 )
 from . import addon
-from .addon import NeedsObjectMode, NeedsResult, OperatorResult, ReportsErrors
+from .addon import NeedsObjectMode, NeedsResult, OperatorResult
 from .mesh_data import mesh_of, values_of
 from .placement import placement_of
 from .region_objects import matrix_of
-from .results import materials_of
 from .scene_objects import (
     fold_specular,
     images_of,
     import_result,
+    materials_of,
     set_occlusion,
     set_shading,
     shading_of,
@@ -52,17 +52,11 @@ _UNSAFE = re.compile(r"[^\w.-]+")
 class MaterialCopies:
     """Copies of the materials of one exported mesh; :meth:`remove` takes them out again.
 
-    Parameters
-    ----------
-    stem : str
-        Name of the exported file without its suffix; prefix of the image names.
-    folder : Path
-        Where images are written to.
-    unlit : str
-        What becomes of our unlit materials: ``"keep"`` (glTF has them), ``"emission"`` or
-        ``"lit"``, for formats without unlit materials, which would drop the texture.
-    fold_specular : bool
-        Whether the format describes reflectance by the index of refraction alone.
+    ``stem``: name of the exported file without its suffix; prefix of the image names.
+    ``folder``: where images are written to.
+    ``unlit``: what becomes of our unlit materials: ``"keep"`` (glTF has them), ``"emission"`` or
+    ``"lit"``, for formats without unlit materials, which would drop the texture.
+    ``fold_specular``: whether the format describes reflectance by the index of refraction alone.
     """
 
     def __init__(self, stem: str, folder: Path, *, unlit: str, fold_specular: bool = False) -> None:
@@ -80,10 +74,7 @@ class MaterialCopies:
     def copy_of(self, material: bpy.types.Material) -> bpy.types.Material:
         """Return a copy whose images lie beside the exported file.
 
-        Raises
-        ------
-        UsageError
-            An image is missing, or of a kind that cannot be written as one file.
+        Raises UsageError: an image is missing, or of a kind that cannot be written as one file.
         """
         copy = material.copy()
         self._materials.append((material, copy))
@@ -129,7 +120,8 @@ class MaterialCopies:
         while f"{name}.png" in self.textures or f"{name}.jpg" in self.textures:
             count += 1
             name = f"{self._stem}-{plain}-{count}"
-        path = self._folder / f"{name}{_suffix(image)}"
+        suffix = ".jpg" if _is_file(image) and image.file_format == "JPEG" else ".png"
+        path = self._folder / f"{name}{suffix}"
         _write_image(image, path)
         copy = bpy.data.images.load(str(path), check_existing=False)
         copy.name = name
@@ -149,10 +141,6 @@ def lend_name(original: bpy.types.ID, copy: bpy.types.ID) -> str:
         original.name = f"exported {name}"
     copy.name = name
     return name
-
-
-def _suffix(image: bpy.types.Image) -> str:
-    return ".jpg" if _is_file(image) and image.file_format == "JPEG" else ".png"
 
 
 def _is_file(image: bpy.types.Image) -> bool:
@@ -203,10 +191,7 @@ def _save_as_png(image: bpy.types.Image, path: Path) -> None:
 def pixels_of(image: bpy.types.Image) -> np.ndarray:
     """Return (h, w, 3) uint8 of an sRGB image, the first row on top.
 
-    Raises
-    ------
-    UsageError
-        The image cannot be read.
+    Raises UsageError: the image cannot be read.
     """
     width, height = image.size
     if width * height == 0:
@@ -230,11 +215,9 @@ def pixels_of(image: bpy.types.Image) -> np.ndarray:
 
 
 _OPERATORS = {
-    "glb": "export_scene.gltf",
-    "obj": "wm.obj_export",
-    "usd": "wm.usd_export",
+    "glb": "export_scene.gltf", "obj": "wm.obj_export", "usd": "wm.usd_export",
     "fbx": "export_scene.fbx",
-}
+}  # fmt: skip
 _SAME_PLACE = 1e-6
 """Object matrices are single precision: a mesh this near its parent's place has not been moved."""
 
@@ -258,22 +241,10 @@ def export_objects(
 ) -> list[Path]:
     """Write one file for each mesh, its sidecar beside it.
 
-    Parameters
-    ----------
-    frame : Object
-        The parent empty of the result.
-    things : list of Object
-        Meshes and levels of detail of that result.
-
-    Raises
-    ------
-    UsageError
-        Nothing to write, an unknown format, an exporter that is missing or fails, a missing image,
-        or a frame with non-uniform scale.
-    MeshingError
-        A mesh has no faces or values that are not finite; it is not written.
-    ResourceError
-        The folder cannot be written.
+    ``frame``: the parent empty of the result that ``things``, meshes and levels, belong to.
+    Raises UsageError: nothing to write, an unknown format, an exporter that is missing or fails, a
+    missing image, or a frame with non-uniform scale; MeshingError: a mesh has no faces or values
+    that are not finite; it is not written; ResourceError: the folder cannot be written.
     """
     if request.format not in MESH_FORMATS:
         raise UsageError(
@@ -379,7 +350,11 @@ def _write(
     count = len(data.loop_triangles)
     faces = values_of(data.loop_triangles, "vertices", 3, np.int32).reshape(-1, 3)
     corners = values_of(data.loop_triangles, "loops", 3, np.int32)
-    uvs = _corner_uvs(data, corners)
+    layer = data.uv_layers.active
+    uvs: np.ndarray | None = None
+    if layer is not None:
+        of_loops = values_of(layer.uv, "vector", 2, np.float32).reshape(-1, 2)
+        uvs = of_loops[corners].reshape(-1, 3, 2)
     validate_for_export(local, faces, uvs, name=f"mesh {thing.name}")
     vertices: Any = data.vertices
     vertices.foreach_set("co", local.astype(np.float32).ravel())
@@ -398,10 +373,8 @@ def _write(
         images = request.folder
         if inside:
             images = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gwrap-")))
-        copies = MaterialCopies(
-            stem, images,
-            unlit=kind.unlit, fold_specular=request.format == "usd",
-        )  # fmt: skip
+        folded = request.format == "usd"
+        copies = MaterialCopies(stem, images, unlit=kind.unlit, fold_specular=folded)
         stack.callback(copies.remove)
         for index, material in enumerate(data.materials):
             if material is not None:
@@ -412,14 +385,6 @@ def _write(
         contents["shading"] = copies.shading
     contents["textures"] = [] if inside else copies.textures
     return path, contents
-
-
-def _corner_uvs(data: bpy.types.Mesh, corners: np.ndarray) -> np.ndarray | None:
-    layer = data.uv_layers.active
-    if layer is None:
-        return None
-    uvs = values_of(layer.uv, "vector", 2, np.float32)
-    return uvs.reshape(-1, 2)[corners].reshape(-1, 3, 2)
 
 
 def _colors(
@@ -525,25 +490,10 @@ def export_result(
 ) -> list[Path]:
     """Write meshes of a result; the open file is closed without saving.
 
-    Parameters
-    ----------
-    result : Path
-        The result folder.
-    requests : list of ObjectExport
-        One for each format.
-    regions : tuple of str
-        Names; empty for all.
-    levels : bool
-        Whether levels of detail are written too.
-    shading : str
-        ``"unlit"``, or lit.
-
-    Raises
-    ------
-    UsageError
-        Blender has a window, or there is no such region; what :func:`export_objects` raises.
-    DatasetError, ParseError
-        The folder contains no valid result.
+    ``requests``: one for each format. ``regions``: names; empty for all. ``levels``: whether levels
+    of detail are written too. ``shading``: ``"unlit"``, or lit.
+    Raises UsageError: Blender has a window, or there is no such region; what :func:`export_objects`
+    raises; DatasetError, ParseError: the folder contains no valid result.
     """
     start_empty("Exporting a result")
     imported = import_result(result, bpy.context.scene)
@@ -556,20 +506,16 @@ def export_result(
     for material in materials_of(imported.frame):
         set_shading(material, "UNLIT" if shading == "unlit" else "LIT")
     kinds = ("mesh", "lod") if levels else ("mesh",)
-    things = [
-        thing
-        for thing in imported.frame.children
-        if addon.kind_of(thing) in kinds and (not regions or thing[addon.REGION] in regions)
-    ]
-    return [
-        path for request in requests for path in export_objects(imported.frame, things, request)
-    ]
+    meshes = (t for t in imported.frame.children if addon.kind_of(t) in kinds)
+    things = [t for t in meshes if not regions or t[addon.REGION] in regions]
+    paths = (export_objects(imported.frame, things, request) for request in requests)
+    return [path for written in paths for path in written]
 
 
 # -- Operators that export meshes and pack textures -----------------------------------------------
 
 
-class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
+class GWRAP_OT_export_meshes(NeedsResult, NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.export_meshes"
     bl_label = "Export Meshes"
     bl_description = "Export meshes of a result to other programs, one file and sidecar each"
@@ -603,12 +549,6 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
         name="Pack Textures", description="Put the textures into the file"
     )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run; Blender calls this."""
-        needs_result: Any = NeedsResult.poll
-        return bool(needs_result.__func__(cls, context)) and super().poll(context)
-
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         if not chosen_meshes(context):
             self.scope = "ALL"
@@ -617,8 +557,7 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
 
     def draw(self, _context: bpy.types.Context) -> None:
         layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout.use_property_split, layout.use_property_decorate = True, False
         layout.prop(self, "format")
         layout.prop(self, "scope", expand=True)
         if self.scope == "ALL":
@@ -627,10 +566,10 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
         if self.format.lower() in PACKABLE_FORMATS:
             layout.prop(self, "pack")
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose the folder of the exported files.")
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if self.scope == "SELECTED":
             chosen = chosen_meshes(context)
             if not chosen:
@@ -639,21 +578,17 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
             kinds = addon.WITH_TEXTURE if self.levels else ("mesh", "baked")
             children = frame.children_recursive if frame is not None else ()
             chosen = [t for t in children if addon.kind_of(t) in kinds]
-        request = ObjectExport(
-            self.format.lower(),
-            real_path(bpy.path.abspath(self.directory)),
-            self.placed,
-            self.pack and self.format.lower() in PACKABLE_FORMATS,
-        )
+        chosen_format, folder = self.format.lower(), real_path(bpy.path.abspath(self.directory))
+        packs = self.pack and chosen_format in PACKABLE_FORMATS
+        request = ObjectExport(chosen_format, folder, self.placed, packs)
         paths = []
         frames = {t: owner for t in chosen if (owner := addon.frame_of(t)) is not None}
         for owner in dict.fromkeys(frames.values()):
             paths += export_objects(owner, [t for t in chosen if frames.get(t) == owner], request)
         self.report({"INFO"}, f"{len(paths)} files written to {request.folder}")
-        return {"FINISHED"}
 
 
-class GWRAP_OT_pack_images(NeedsResult, ReportsErrors, bpy.types.Operator):
+class GWRAP_OT_pack_images(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.pack_images"
     bl_label = "Pack Textures"
     bl_description = "Pack the result's textures into the .blend file, or unpack them to files"
@@ -661,35 +596,30 @@ class GWRAP_OT_pack_images(NeedsResult, ReportsErrors, bpy.types.Operator):
 
     pack: BoolProperty(name="Pack", default=True)  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+    def work(self, context: bpy.types.Context) -> None:
         count = 0
-        for image in images_of(frame):
-            if self.pack and image.packed_file is None:
-                if not Path(bpy.path.abspath(image.filepath)).is_file():
-                    raise UsageError(
-                        f"The texture {image.filepath} does not exist.", "Import the result again."
-                    )
-                image.pack()
-                count += 1
-            elif not self.pack and image.packed_file is not None:
-                there = Path(bpy.path.abspath(image.filepath)).is_file()
+        for image in images_of(addon.current_frame(context)):
+            if self.pack == (image.packed_file is not None):
+                continue
+            there = Path(bpy.path.abspath(image.filepath)).is_file()
+            if not self.pack:
                 # A file that is there is the result's own, never written over.
                 image.unpack(method="USE_ORIGINAL" if there else "WRITE_ORIGINAL")
-                count += 1
+            elif there:
+                image.pack()
+            else:
+                raise UsageError(
+                    f"The texture {image.filepath} does not exist.", "Import the result again."
+                )
+            count += 1
         self.report({"INFO"}, f"{count} textures {'packed' if self.pack else 'unpacked'}")
-        return {"FINISHED"}
 
 
 def chosen_meshes(context: bpy.types.Context) -> list[bpy.types.Object]:
     """Return the selected meshes of results, with levels and lighter meshes."""
-    return [
-        t
-        for t in context.selected_objects
-        if addon.kind_of(t) in addon.WITH_TEXTURE
-        and t.type == "MESH"
-        and addon.frame_of(t) is not None
-    ]
+    meshes = (t for t in context.selected_objects if t.type == "MESH")
+    ours = (t for t in meshes if addon.kind_of(t) in addon.WITH_TEXTURE)
+    return [t for t in ours if addon.frame_of(t) is not None]
 
 
 CLASSES: Final = (GWRAP_OT_export_meshes, GWRAP_OT_pack_images)

@@ -100,13 +100,6 @@ def detach(scene: bpy.types.Scene) -> None:
     properties_of(scene).job_folder = ""
 
 
-def forget_all() -> None:
-    """Stop watching all jobs; workers continue."""
-    for job in jobs.values():
-        job.release()
-    jobs.clear()
-
-
 def status_of(folder: str) -> JobStatus | None:
     """Return the last known status of a scene's job folder; None where it is not watched."""
     job = jobs.get(key_of(folder))
@@ -135,20 +128,16 @@ def result_to_import(scene: bpy.types.Scene) -> str:
     status = status_of(properties_of(scene).job_folder)
     if status is None or status.state != "DONE" or not status.result:
         return ""
-    wanted = os.path.normpath(status.result)
-    shown = (
-        os.path.normpath(bpy.path.abspath(str(frame.get(addon.RESULT, ""))))
-        for frame in addon.objects_of_kind(scene, "frame")
-    )
-    return "" if wanted in shown else status.result
+    shown = map(_named, addon.objects_of_kind(scene, "frame"))
+    return "" if os.path.normpath(status.result) in shown else status.result
 
 
-# -- Preview image of a running training, loaded by the job timer, drawn from memory --------------
+# -- What a running training shows: a picture for the panel, points for the 3D view ---------------
 #
-# Panels draw often and must neither read the disk nor create data: they call :func:`icons_of`.
-# The images are in a preview collection, not in ``bpy.data``, so that they are neither saved nor
-# part of undo. Files are searched and read in a thread, as plain pixels: Blender takes longer to
-# decode its first image than its window may wait.
+# Panels and views draw often and must neither read the disk nor create data: they call
+# :func:`icons_of` and :func:`points_of`. Pictures are in a preview collection, not in ``bpy.data``,
+# so that nothing is saved, part of undo, or left behind. Files are searched and read in a thread,
+# pictures as plain pixels: Blender takes longer to decode its first image than its window may wait.
 
 
 _logger = logging.getLogger(__name__)
@@ -162,30 +151,49 @@ EVERY_S = 3.0
 MAX_BYTES = 8 * 2**20
 """Larger files are not a preview; drawing them would be noticeable."""
 
-_NEVER_S = float("-inf")
-
 Stamp = tuple[str, int, int]
 """Path, time in ns and size in bytes of a file."""
 
 
-@dataclass
-class _ShownPreview:
-    searched_s: float = _NEVER_S
-    stamp: Stamp | None = None
-    names: tuple[str, ...] = ()
-    icons: tuple[int, ...] = ()
-    reading: Task[_Read | None] | None = None
+@dataclass(frozen=True)
+class LivePoints:
+    """Points of a running training."""
+
+    stamp: Stamp
+    positions: np.ndarray
+    """(n, 3) float32, scene frame."""
+    colors: np.ndarray
+    """(n, 4) float32, 0 to 1."""
 
 
 @dataclass(frozen=True)
-class _Read:
+class _Picture:
     stamp: Stamp
     parts: tuple[np.ndarray, ...]
     """Each (h, w, 4) float32, as Blender wants them: from the bottom up."""
 
 
-_preview_readings = Lane()
+@dataclass
+class _Shown:
+    searched_s: float = float("-inf")
+    stamp: Stamp | None = None
+    reading: Task[Any] | None = None
+
+
+@dataclass
+class _ShownPreview(_Shown):
+    names: tuple[str, ...] = ()
+    icons: tuple[int, ...] = ()
+
+
+@dataclass
+class _ShownPoints(_Shown):
+    points: LivePoints | None = None
+
+
+_live_readings = Lane()
 _shown_previews: dict[str, _ShownPreview] = {}
+_shown_points: dict[str, _ShownPoints] = {}
 _pictures: Any = None  # ImagePreviewCollection, created with the first image
 _count = 0
 
@@ -197,6 +205,27 @@ def icons_of(folder: str) -> tuple[int, ...]:
     """
     shown = _shown_previews.get(folder)
     return shown.icons if shown else ()
+
+
+def points_of(scene: bpy.types.Scene) -> LivePoints | None:
+    """Return the points to draw in a scene; None if there are none or they are not wanted."""
+    properties = properties_of(scene)
+    status = status_of(properties.job_folder)
+    if not properties.show_points or status is None or not status.active or status.stage != "train":
+        return None
+    shown = _shown_points.get(key_of(properties.job_folder))
+    return shown.points if shown else None
+
+
+def frame_of_job(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """Return the frame of an earlier result of the scene's job; None before the first."""
+    wanted = os.path.join(key_of(properties_of(scene).job_folder), "result")
+    return next((f for f in addon.objects_of_kind(scene, "frame") if _named(f) == wanted), None)
+
+
+def _named(frame: bpy.types.Object) -> str:
+    """Return the result folder that a frame names, without a look at the disk."""
+    return os.path.normpath(bpy.path.abspath(str(frame.get(addon.RESULT, ""))))
 
 
 def newest_picture(
@@ -225,58 +254,75 @@ def refresh(folder: str, now_s: float) -> bool:
     or broken file changes nothing.
     """
     shown = _shown_previews.setdefault(folder, _ShownPreview())
+
+    def keep(picture: _Picture) -> None:
+        loaded = _load(picture.parts)
+        _drop(shown.names)
+        shown.names, shown.icons = loaded
+
+    return _refreshed(shown, folder, now_s, _read_preview, keep)
+
+
+def refresh_points(folder: str, now_s: float) -> bool:
+    """Search for new points, as :func:`refresh`; return whether there are new ones."""
+    shown = _shown_points.setdefault(folder, _ShownPoints())
+
+    def keep(points: LivePoints) -> None:
+        shown.points = points
+
+    return _refreshed(shown, folder, now_s, _read_points, keep)
+
+
+def _refreshed(
+    shown: _Shown,
+    folder: str,
+    now_s: float,
+    read: Callable[[Path, Stamp | None], Any],
+    keep: Callable[[Any], None],
+) -> bool:
     if shown.reading is None:
         if now_s - shown.searched_s >= EVERY_S:
-            shown.searched_s = now_s
-            known = shown.stamp
-            shown.reading = _preview_readings.submit(lambda: _read_preview(Path(folder), known))
+            shown.searched_s, known = now_s, shown.stamp
+            shown.reading = _live_readings.submit(lambda: read(Path(folder), known))
         return False
     if not shown.reading.finished():
         return False
     reading, shown.reading = shown.reading, None
     try:
-        read = reading.result()
-        loaded = _load(read.parts) if read else None
-    except Exception:  # whatever the file contains: the job continues without its image
-        _logger.info("no picture of %s", folder, exc_info=True)
+        found = reading.result()
+        if found is None:
+            return False
+        keep(found)
+    except Exception:  # whatever the file contains: the job continues without it
+        _logger.info("no picture or points of %s", folder, exc_info=True)
         return False
-    if read is None or loaded is None:
-        return False
-    _drop(shown.names)
-    shown.names, shown.icons = loaded
-    shown.stamp = read.stamp
+    shown.stamp = found.stamp
     return True
 
 
 def forget(folder: str) -> None:
-    """Remove the image of a job that has ended."""
+    """Remove the image and the points of a job that has ended."""
+    _shown_points.pop(folder, None)
     shown = _shown_previews.pop(folder, None)
     if shown is not None:
         _drop(shown.names)
 
 
-def start() -> None:
-    """Start the thread that reads images, ahead of the first one."""
-    _preview_readings.start()
-
-
 def stop() -> None:
-    """Remove everything; Blender warns about collections left behind."""
+    """Remove all images and points; Blender warns about collections left behind."""
     global _pictures
     _shown_previews.clear()
-    _preview_readings.stop()
+    _shown_points.clear()
+    _live_readings.stop()
     if _pictures is not None:
         bpy.utils.previews.remove(_pictures)
         _pictures = None
 
 
-def _read_preview(folder: Path, known: Stamp | None) -> _Read | None:
+def _read_preview(folder: Path, known: Stamp | None) -> _Picture | None:
     """Return the newest image, cut in two if it is wide; None if there is no new one.
 
-    Raises
-    ------
-    Exception
-        The file cannot be read or contains no image; NumPy raises many types.
+    Raises Exception: the file cannot be read or contains no image; NumPy raises many types.
     """
     stamp = newest_picture(folder)
     if stamp is None or stamp == known or stamp[2] > MAX_BYTES:
@@ -291,8 +337,16 @@ def _read_preview(folder: Path, known: Stamp | None) -> _Read | None:
     values = np.ones((height, width, 4), np.float32)
     values[..., :3] = pixels[::-1] / np.float32(255.0)
     if width < 2 * height:
-        return _Read(stamp, (values,))
-    return _Read(stamp, (values[:, : width // 2], values[:, -(width // 2) :]))
+        return _Picture(stamp, (values,))
+    return _Picture(stamp, (values[:, : width // 2], values[:, -(width // 2) :]))
+
+
+def _read_points(folder: Path, known: Stamp | None) -> LivePoints | None:
+    """Return the newest points, None if there are no new ones."""
+    stamp = newest_picture(folder, POINTS_FILE, WHOLE_TRAININGS)
+    if stamp is None or stamp == known or stamp[2] > MAX_POINTS_BYTES:
+        return None
+    return LivePoints(stamp, *parse_points(read_bounded(Path(stamp[0]), MAX_POINTS_BYTES)))
 
 
 def _load(parts: tuple[np.ndarray, ...]) -> tuple[tuple[str, ...], tuple[int, ...]]:
@@ -302,12 +356,12 @@ def _load(parts: tuple[np.ndarray, ...]) -> tuple[tuple[str, ...], tuple[int, ..
         _pictures = bpy.utils.previews.new()
     _count += 1  # new names each time: Blender caches what it has drawn under a name
     names = tuple(f"{_count} {part}" for part in ("photo", "rendering")[: len(parts)])
-    return names, tuple(map(_new, names, parts))
+    return names, tuple(new_icon(_pictures, *named) for named in zip(names, parts, strict=True))
 
 
-def _new(name: str, pixels: np.ndarray) -> int:
-    """Create a preview from (h, w, 4) float32 values; return its icon."""
-    picture = _pictures.new(name)
+def new_icon(pictures: Any, name: str, pixels: np.ndarray) -> int:
+    """Add (h, w, 4) float32 pixels to a preview collection; return their icon."""
+    picture = pictures.new(name)
     picture.image_size = pixels.shape[1::-1]
     picture.image_pixels_float.foreach_set(np.ascontiguousarray(pixels).ravel())
     return int(picture.icon_id)
@@ -317,101 +371,6 @@ def _drop(names: tuple[str, ...]) -> None:
     for name in names:
         if _pictures is not None and name in _pictures:
             del _pictures[name]
-
-
-# -- Points of a running training for the 3D view, read by the job timer, drawn from memory -------
-#
-# As with the preview image (``job_timer.py``), a thread searches and reads the file, and
-# nothing is put into ``bpy.data``: nothing is saved, nothing is part of undo, and nothing is left
-# behind.
-
-
-@dataclass(frozen=True)
-class LivePoints:
-    """Points of a running training."""
-
-    stamp: Stamp
-    positions: np.ndarray
-    """(n, 3) float32, scene frame."""
-    colors: np.ndarray
-    """(n, 4) float32, 0 to 1."""
-
-
-@dataclass
-class _ShownPoints:
-    searched_s: float = _NEVER_S
-    points: LivePoints | None = None
-    reading: Task[LivePoints | None] | None = None
-
-
-_point_readings = Lane()
-_shown_points: dict[str, _ShownPoints] = {}
-
-
-def points_of(scene: bpy.types.Scene) -> LivePoints | None:
-    """Return the points to draw in a scene; None if there are none or they are not wanted."""
-    properties = properties_of(scene)
-    status = status_of(properties.job_folder)
-    if not properties.show_points or status is None or not status.active or status.stage != "train":
-        return None
-    shown = _shown_points.get(key_of(properties.job_folder))
-    return shown.points if shown else None
-
-
-def frame_of_job(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Return the frame of an earlier result of the scene's job; None before the first."""
-    wanted = os.path.join(key_of(properties_of(scene).job_folder), "result")
-    for frame in addon.objects_of_kind(scene, "frame"):
-        if os.path.normpath(bpy.path.abspath(str(frame.get(addon.RESULT, "")))) == wanted:
-            return frame
-    return None
-
-
-def refresh_points(folder: str, now_s: float) -> bool:
-    """Search for new points, at most every few seconds; return whether there are new ones."""
-    shown = _shown_points.setdefault(folder, _ShownPoints())
-    if shown.reading is None:
-        if now_s - shown.searched_s >= EVERY_S:
-            shown.searched_s = now_s
-            known = shown.points.stamp if shown.points else None
-            shown.reading = _point_readings.submit(lambda: _read_points(Path(folder), known))
-        return False
-    if not shown.reading.finished():
-        return False
-    reading, shown.reading = shown.reading, None
-    try:
-        read = reading.result()
-    except Exception:  # whatever the file contains: the job continues without its points
-        _logger.info("no points of %s", folder, exc_info=True)
-        return False
-    if read is not None:
-        shown.points = read
-    return read is not None
-
-
-def forget_points(folder: str) -> None:
-    """Remove the points of a job that has ended."""
-    _shown_points.pop(folder, None)
-
-
-def start_points() -> None:
-    """Start the thread that reads points, ahead of the first ones."""
-    _point_readings.start()
-
-
-def stop_points() -> None:
-    """Remove everything."""
-    _shown_points.clear()
-    _point_readings.stop()
-
-
-def _read_points(folder: Path, known: Stamp | None) -> LivePoints | None:
-    """Return the newest points, None if there are no new ones; runs in a thread."""
-    stamp = newest_picture(folder, POINTS_FILE, WHOLE_TRAININGS)
-    if stamp is None or stamp == known or stamp[2] > MAX_POINTS_BYTES:
-        return None
-    positions, colors = parse_points(read_bounded(Path(stamp[0]), MAX_POINTS_BYTES))
-    return LivePoints(stamp, positions, colors)
 
 
 # -- Poll the watched jobs from Blender's timer and import their results --------------------------
@@ -436,12 +395,8 @@ def watch(
 ) -> None:
     """Show a job in a scene and follow it to its end.
 
-    Parameters
-    ----------
-    imports : bool
-        Whether its result is wanted in the scene.
-    target_uid : int, optional
-        Session uid of the object that photos are baked onto.
+    ``imports``: whether its result is wanted in the scene.
+    ``target_uid``: session uid of the object that photos are baked onto.
     """
     addon.remember(folder)
     job = WatchedJob(client, client.poll(), scene.session_uid, imports, target_uid=target_uid)
@@ -452,12 +407,8 @@ def watch(
 def cancel(folder: str) -> None:
     """Request a job to stop; it is killed if it does not.
 
-    A finished job whose result is being read stays finished, and its result is offered.
-
-    Raises
-    ------
-    UsageError
-        No job is watched in this folder.
+    A finished job whose result is being read stays finished, and its result is offered. Raises
+    UsageError: no job is watched in this folder.
     """
     job = jobs.get(key_of(folder))
     if job is None:
@@ -475,23 +426,18 @@ def cancel(folder: str) -> None:
 
 def forget_all_jobs() -> None:
     """Stop watching; workers go on, and are found again by ``attach_open_file``."""
-    forget_all()
+    for job in jobs.values():
+        job.release()
+    jobs.clear()
     _status_reads.stop()
     _readings.stop()
 
 
 def start_timer() -> None:
     """Poll the jobs as long as one is running."""
-    _status_reads.start()
-    _readings.start()
-    start()
-    start_points()
-    background.watch(tick)
-
-
-def tick() -> bool:
-    """Poll all jobs once, from the add-on's timer."""
-    return poll_jobs()
+    for lane in (_status_reads, _readings, _live_readings):
+        lane.start()  # the timer starts no thread
+    background.watch(poll_jobs)
 
 
 def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
@@ -515,7 +461,6 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
         if not job.status.active:
             job.release()
             forget(folder)
-            forget_points(folder)
         elif job.status.stage == "train":
             changed = refresh(folder, now_s) or changed
             changed = refresh_points(folder, now_s) or changed
@@ -578,19 +523,17 @@ def _bring_in(folder: str, job: WatchedJob) -> None:
 
 
 def _reading(result: Path) -> Task[ResultFiles | BakedFiles]:
-    return _readings.submit(lambda: _read_outcome(result))
+    """Read what a finished job has made, in a thread."""
 
+    def read() -> ResultFiles | BakedFiles:
+        folder = JobFolder(result.parent)
+        try:
+            bake = read_job(folder.job_path).bake
+        except WrapError:
+            bake = None  # of a job that was made elsewhere, only the result counts
+        return read_result(result) if bake is None else read_baked(folder.baked / bake.name)
 
-def _read_outcome(result: Path) -> ResultFiles | BakedFiles:
-    """Read what a finished job has made; runs in a thread."""
-    folder = JobFolder(result.parent)
-    try:
-        bake = read_job(folder.job_path).bake
-    except WrapError:
-        bake = None  # of a job that was made elsewhere, only the result counts
-    if bake is not None:
-        return read_baked(folder.baked / bake.name)
-    return read_result(result)
+    return _readings.submit(read)
 
 
 def _import(

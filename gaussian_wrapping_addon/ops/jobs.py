@@ -14,14 +14,14 @@ from bpy.props import BoolProperty, StringProperty
 from ..core.errors import DatasetError, UsageError, WrapError
 from ..core.files import real_path
 from ..core.jobs.client import JobClient, worker_python
-from ..core.jobs.store.job_file import make_job
+from ..core.jobs.store.job_file import JobFile, make_job
 from ..core.jobs.store.job_folder import JobFolder, JobStatus
 from ..core.jobs.store.rollback import continue_training_job, finished_job
 from ..core.jobs.store.stage_folder import read_done
 from ..core.names import AUTOMATIC_REGIONS, region_name, region_names
 from ..core.regions.files import read_region_file
 from ..core.settings import JobSettings, with_values
-from . import addon, job_timer, panel_settings, worker_setup
+from . import addon, job_timer, panel_settings
 from .addon import OperatorResult, ReportsErrors, properties_of
 from .job_timer import WatchedJob, gone, jobs, key_of
 from .panel_settings import (
@@ -35,42 +35,35 @@ from .panel_settings import (
 )
 from .region_objects import export_region
 from .region_operators import own_lengths, world_per_blender
-from .worker_setup import WorkerChoice
+from .worker_setup import WorkerChoice, worker_choice, worker_problem
 
-# -- Poll conditions and the confirmation shared by operators on jobs -----------------------------
-
-
-def no_job_runs(cls: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-    """Return whether no job runs in the scene; else set the poll message."""
-    if job_timer.is_running(properties_of(context.scene).job_folder):
-        cls.poll_message_set("A job is running; cancel it or wait for it")
-        return False
-    return True
+# -- Conditions and the confirmation shared by operators on jobs ----------------------------------
 
 
-def has_worker(cls: type[bpy.types.Operator]) -> bool:
-    """Return whether jobs have a Python to run in; else set the poll message."""
-    problem = worker_setup.worker_problem()
-    if problem:
-        cls.poll_message_set(problem)
-    return not problem
+def why_busy(context: bpy.types.Context) -> str:
+    """Return that a job runs in the scene; ``""`` if none does."""
+    running = job_timer.is_running(properties_of(context.scene).job_folder)
+    return "A job is running; cancel it or wait for it" if running else ""
+
+
+def why_no_start(context: bpy.types.Context) -> str:
+    """Return why no job can start in the scene: no worker, or one is running; ``""`` if it can."""
+    return worker_problem() or why_busy(context)
 
 
 def selected_regions(context: bpy.types.Context) -> list[bpy.types.Object]:
     """Return the selected region objects, the active one first; else the result's only region."""
     active = context.view_layer.objects.active
     things = [t for t in context.selected_objects if addon.kind_of(t) == "region"]
-    frame = None if things else addon.current_frame(context.scene, active)
+    frame = None if things else addon.current_frame(context)
     if frame is not None:
         own = [t for t in frame.children if addon.kind_of(t) == "region"]
         things = own if len(own) == 1 else []
     return sorted(things, key=lambda t: (t != active, t.name))
 
 
-def chosen_regions(context: bpy.types.Context, *, checked: bool) -> list[bpy.types.Object]:
-    """Return the checked regions of the scene by name, or the selected ones."""
-    if not checked:
-        return selected_regions(context)
+def checked_regions(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """Return the checked regions of the scene by name."""
     things = addon.objects_of_kind(context.scene, "region")
     return sorted((t for t in things if properties_of(t).checked), key=lambda t: t.name)
 
@@ -78,9 +71,14 @@ def chosen_regions(context: bpy.types.Context, *, checked: bool) -> list[bpy.typ
 class ConfirmsFolder(ReportsErrors):
     """Mixin: confirm a job folder known from the open file alone, which may come from elsewhere."""
 
+    def frame(self, context: bpy.types.Context) -> bpy.types.Object | None:
+        """Return the frame of the result that the operator would use."""
+        return addon.current_frame(context)
+
     def folder(self, context: bpy.types.Context) -> Path | None:
-        """Return the folder that the operator would use."""
-        raise NotImplementedError
+        """Return the job folder that the operator would use."""
+        frame = self.frame(context)
+        return addon.result_folder(frame).parent if frame and frame.get(addon.RESULT) else None
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
         """Ask for confirmation if the folder is unknown on this machine."""
@@ -94,6 +92,17 @@ class ConfirmsFolder(ReportsErrors):
             message=f"The file names a job folder not yet used on this computer: {folder}",
             confirm_text="Use Folder",
         )
+
+
+class OnRegions(ConfirmsFolder):
+    """Mixin: the operator works on regions of one result."""
+
+    def regions(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+        """Return these regions."""
+        return selected_regions(context)
+
+    def frame(self, context: bpy.types.Context) -> bpy.types.Object | None:
+        return addon.frame_of(next(iter(self.regions(context)), None))
 
 
 # -- Find the jobs named by the open file, and keep scenes and jobs connected across undo ---------
@@ -122,10 +131,7 @@ def find_job_folder(stored: str) -> Path | None:
 def attach(scene: bpy.types.Scene, folder: Path) -> JobStatus:
     """Watch the job of a folder; a running one is imported when done.
 
-    Raises
-    ------
-    UsageError
-        The folder contains no job.
+    Raises UsageError: the folder contains no job.
     """
     client = JobClient.attach(folder)
     status = client.poll()
@@ -162,7 +168,7 @@ def attach_open_file() -> None:
 
 
 def attach_later() -> bool:
-    """Attach once scripts can access the open file, at one tick of the timer."""
+    """Attach at one tick of the timer: until then, scripts cannot access the open file."""
     attach_open_file()
     return False
 
@@ -188,51 +194,57 @@ def after_undo(_scene: object = None, _unused: object = None) -> None:
 # -- Actions of the job buttons as plain functions: from properties to a running worker -----------
 
 
+def launch(
+    scene: bpy.types.Scene,
+    folder: Path,
+    job: JobFile,
+    choice: WorkerChoice,
+    command: str = "WRAP",
+    target_uid: int = 0,
+) -> None:
+    """Start a job and show it in a scene, as one that its button has started (``command``).
+
+    ``target_uid``: session uid of the object that photos are baked onto. Raises WrapError: there
+    is no worker, or the folder cannot be used.
+    """
+    client = JobClient.start(
+        folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
+    )
+    properties_of(scene).job_command = command
+    job_timer.watch(scene, folder, client, target_uid=target_uid)
+
+
 def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     """Start the whole pipeline for a scene's photos; return the job folder.
 
-    Raises
-    ------
-    WrapError
-        The source, the output or a setting cannot be used.
+    Raises WrapError: the source, the output or a setting cannot be used.
     """
-    properties = properties_of(scene)
     source = source_of(scene)
     folder = output_of(scene, source)
     job = make_job("wrap", source, job_settings(scene, choice.threads, choice.device))
     refuse_running(folder)
-    client = JobClient.start(
-        folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
-    )
-    properties.output = str(folder)
-    properties.job_command = "WRAP"
-    job_timer.watch(scene, folder, client)
+    launch(scene, folder, job, choice)
+    properties_of(scene).output = str(folder)
     return folder
 
 
 def start_mesh(
     scene: bpy.types.Scene, regions: list[bpy.types.Object], choice: WorkerChoice
-) -> Path:
-    """Mesh regions of a finished training, each at its resolution; return the job folder.
+) -> None:
+    """Mesh regions of a finished training, each at its resolution.
 
-    Parameters
-    ----------
-    regions : list of Object
-        Region objects under the frame of one result.
-
-    Raises
-    ------
-    WrapError
-        A region cannot be used, or the job folder contains no finished training.
+    Raises WrapError: a region cannot be used, or the job folder contains no finished training.
     """
-    frame = common_frame(regions)
-    folder = job_folder_of(frame)
-    _require_training(folder)
+    folder = job_folder_of(common_frame(regions))
+    if not any(read_done(path) for path in (folder / "stages").glob("train-*")):
+        raise UsageError(
+            f"{folder} holds no finished training.", "Wrap the scene again, or find its folder."
+        )
     refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
     changed = {"threads": choice.threads, "device": choice.device, **computers_choices(scene)}
     settings = with_values(earlier.settings, changed)
-    return start_on_regions(scene, regions, choice, "mesh", earlier.source, settings)
+    start_on_regions(scene, regions, choice, "mesh", earlier.source, settings)
 
 
 def start_on_regions(
@@ -242,74 +254,37 @@ def start_on_regions(
     command: str,
     source: str,
     settings: JobSettings,
-) -> Path:
-    """Start a job in the folder of a result that meshes regions; return the folder.
+) -> None:
+    """Start a job in the folder of a result that meshes regions.
 
-    Parameters
-    ----------
-    regions : list of Object
-        Region objects under the frame of the result.
-    command : str
-        Of the job.
-    source : str
-        Input of the job.
-    settings : JobSettings
-        Those of the regions, of meshing and texture are taken from the scene.
+    Of ``settings``, those of the regions, of meshing and texture are taken from the scene.
     """
     frame = common_frame(regions)
     folder = job_folder_of(frame)
     own = own_lengths(scene, regions, frame)
     requests = export_requests(regions, frame, folder)
-    settings = with_values(
-        settings,
-        {
-            "regions": tuple(requests),
-            **meshing_choices(scene, world_per_blender(frame)),
-            **texture_choices(scene),
-        },
-    )
-    lengths = {
-        request: length for request, length in zip(requests, own, strict=True) if length is not None
-    }
+    chosen = meshing_choices(scene, world_per_blender(frame)) | texture_choices(scene)
+    settings = with_values(settings, {"regions": tuple(requests), **chosen})
+    lengths = {r: length for r, length in zip(requests, own, strict=True) if length is not None}
     job = make_job(command, Path(source), settings, lengths)
     names = region_names(job.settings.regions, job.region_bodies)
-    client = JobClient.start(
-        folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
-    )
+    launch(scene, folder, job, choice, command.upper())
     for region, name in zip(regions, names, strict=True):
         region[addon.REGION] = name  # the import finds this box and adds no second one
-    properties_of(scene).job_command = command.upper()
-    job_timer.watch(scene, folder, client)
-    return folder
 
 
-def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerChoice) -> Path:
-    """Train a finished job further, then mesh and texture it again; return the job folder.
+def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerChoice) -> None:
+    """Train a finished job further, then mesh and texture it again.
 
-    Parameters
-    ----------
-    frame : Object
-        The frame of the job's result.
-
-    Raises
-    ------
-    WrapError
-        The job folder contains no finished training, or too many iterations are requested.
+    Raises WrapError: the job folder contains no finished training, or too many iterations are
+    requested.
     """
     folder = job_folder_of(frame)
     refuse_running(folder)
-    earlier = finished_job(JobFolder(folder))
-    job = continue_training_job(
-        JobFolder(folder), earlier, properties_of(scene).training.more_iterations
-    )
+    known, count = JobFolder(folder), properties_of(scene).training.more_iterations
+    job = continue_training_job(known, finished_job(known), count)
     changed = {"threads": choice.threads, "device": choice.device, **computers_choices(scene)}
-    job = replace(job, settings=with_values(job.settings, changed))
-    client = JobClient.start(
-        folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
-    )
-    properties_of(scene).job_command = "WRAP"
-    job_timer.watch(scene, folder, client)
-    return folder
+    launch(scene, folder, replace(job, settings=with_values(job.settings, changed)), choice)
 
 
 def resume(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
@@ -331,12 +306,14 @@ def export_requests(
 ) -> list[str]:
     """Write the files of regions into their job's folder; return their paths.
 
-    Raises
-    ------
-    WrapError
-        A region is linked from a library, or has no body.
+    Raises WrapError: a region is linked from a library, or has no body.
     """
-    _refuse_linked(regions)
+    for region in regions:
+        if not region.is_editable:
+            raise UsageError(
+                f"Region {region.name} is linked from a library.",
+                "Make it local (Object > Relations > Make Local).",
+            )
     requests = []
     for region in regions:
         path = folder / "regions" / f"{region.session_uid}.json"
@@ -344,22 +321,6 @@ def export_requests(
         export_region(region, path, _result_name(region, frame))
         requests.append(str(path))
     return requests
-
-
-def _require_training(folder: Path) -> None:
-    if not any(read_done(path) for path in (folder / "stages").glob("train-*")):
-        raise UsageError(
-            f"{folder} holds no finished training.", "Wrap the scene again, or find its folder."
-        )
-
-
-def _refuse_linked(regions: list[bpy.types.Object]) -> None:
-    for region in regions:
-        if not region.is_editable:
-            raise UsageError(
-                f"Region {region.name} is linked from a library.",
-                "Make it local (Object > Relations > Make Local).",
-            )
 
 
 def _result_name(region: bpy.types.Object, frame: bpy.types.Object) -> str:
@@ -400,10 +361,7 @@ def refuse_running(folder: Path) -> None:
 def common_frame(regions: list[bpy.types.Object]) -> bpy.types.Object:
     """Return the common frame of regions.
 
-    Raises
-    ------
-    UsageError
-        There is none, or there are several.
+    Raises UsageError: there is none, or there are several.
     """
     if not regions:
         raise UsageError("No region is selected.", "Select a region box.")
@@ -427,24 +385,21 @@ class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
     bl_description = "Make a textured mesh of the photos in a background process"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if not properties_of(context.scene).source:
-            cls.poll_message_set("Choose the folder of the photos first")
-            return False
+            return "Choose the folder of the photos first"
         if panel_settings.has_errors(context.scene):
-            cls.poll_message_set(
+            return (
                 "The photos cannot be used as they are: see Dataset, then press Check Photos again"
             )
-            return False
-        return has_worker(cls) and no_job_runs(cls, context)
+        return why_no_start(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        folder = start_wrap(context.scene, worker_setup.worker_choice(context))
+    def work(self, context: bpy.types.Context) -> None:
+        folder = start_wrap(context.scene, worker_choice(context))
         self.report({"INFO"}, f"Wrapping in {folder}")
-        return {"FINISHED"}
 
 
-class GWRAP_OT_mesh_region(ConfirmsFolder, bpy.types.Operator):
+class GWRAP_OT_mesh_region(OnRegions, bpy.types.Operator):
     bl_idname = "gwrap.mesh_region"
     bl_label = "Mesh Region"
     bl_description = (
@@ -455,32 +410,21 @@ class GWRAP_OT_mesh_region(ConfirmsFolder, bpy.types.Operator):
     checked: BoolProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("Needs a finished training: press Wrap Scene first")
-            return False
-        if not selected_regions(context) and not chosen_regions(context, checked=True):
-            cls.poll_message_set("Select or check a region in the list, or press Add Region Box")
-            return False
-        return has_worker(cls) and no_job_runs(cls, context)
+    def why_not(cls, context: bpy.types.Context) -> str:
+        if addon.current_frame(context) is None:
+            return "Needs a finished training: press Wrap Scene first"
+        if not selected_regions(context) and not checked_regions(context):
+            return "Select or check a region in the list, or press Add Region Box"
+        return why_no_start(context)
 
-    def _regions(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+    def regions(self, context: bpy.types.Context) -> list[bpy.types.Object]:
         # Without a selection, the checked regions are meant.
-        return (not self.checked and selected_regions(context)) or chosen_regions(
-            context, checked=True
-        )
+        return (not self.checked and selected_regions(context)) or checked_regions(context)
 
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        regions = self._regions(context)
-        frame = addon.frame_of(regions[0]) if regions else None
-        return addon.result_folder(frame).parent if frame and frame.get(addon.RESULT) else None
-
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        regions = self._regions(context)
-        choice = worker_setup.worker_choice(context)
-        start_mesh(context.scene, regions, choice)
+    def work(self, context: bpy.types.Context) -> None:
+        regions = self.regions(context)
+        start_mesh(context.scene, regions, worker_choice(context))
         self.report({"INFO"}, f"Meshing {', '.join(r.name for r in regions)}")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
@@ -489,38 +433,38 @@ class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
     bl_description = "Stop the job; it can be resumed from where it stopped"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not job_timer.is_running(properties_of(context.scene).job_folder):
-            cls.poll_message_set("No job is running; Wrap Scene starts one")
-            return False
-        return True
+    def why_not(cls, context: bpy.types.Context) -> str:
+        return "" if why_busy(context) else "No job is running; Wrap Scene starts one"
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         job_timer.cancel(properties_of(context.scene).job_folder)
-        return {"FINISHED"}
 
 
-class GWRAP_OT_resume_job(ConfirmsFolder, bpy.types.Operator):
+class OnSceneJob(ConfirmsFolder):
+    """Mixin: the operator works on the scene's own job."""
+
+    @classmethod
+    def why_not(cls, context: bpy.types.Context) -> str:
+        stored = properties_of(context.scene).job_folder
+        return "" if stored else "This scene has no job; press Wrap Scene, or find its folder"
+
+    def folder(self, context: bpy.types.Context) -> Path:
+        return Path(bpy.path.abspath(properties_of(context.scene).job_folder))
+
+
+class GWRAP_OT_resume_job(OnSceneJob, bpy.types.Operator):
     bl_idname = "gwrap.resume_job"
     bl_label = "Resume"
     bl_description = "Continue the job from its last checkpoint; finished stages are reused"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not properties_of(context.scene).job_folder:
-            cls.poll_message_set("This scene has no job; press Wrap Scene, or find its folder")
-            return False
+    def why_not(cls, context: bpy.types.Context) -> str:
         if job_timer.is_gone(properties_of(context.scene).job_folder):
-            cls.poll_message_set("The job folder is missing; press Find Job if it was moved")
-            return False
-        return no_job_runs(cls, context)
+            return "The job folder is missing; press Find Job if it was moved"
+        return super().why_not(context) or why_busy(context)
 
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        return Path(bpy.path.abspath(properties_of(context.scene).job_folder))
-
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        resume(context.scene, worker_setup.worker_choice(context))
-        return {"FINISHED"}
+    def work(self, context: bpy.types.Context) -> None:
+        resume(context.scene, worker_choice(context))
 
 
 class GWRAP_OT_find_job(ReportsErrors, bpy.types.Operator):
@@ -535,20 +479,16 @@ class GWRAP_OT_find_job(ReportsErrors, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose the folder of a job.")
         folder = real_path(bpy.path.abspath(self.directory))
         status = attach(context.scene, folder)
         addon.remember(folder)
         self.report({"INFO"}, f"Found a job: {status.state.lower()}")
-        return {"FINISHED"}
 
 
 CLASSES: Final = (
-    GWRAP_OT_wrap_scene,
-    GWRAP_OT_mesh_region,
-    GWRAP_OT_cancel_job,
-    GWRAP_OT_resume_job,
+    GWRAP_OT_wrap_scene, GWRAP_OT_mesh_region, GWRAP_OT_cancel_job, GWRAP_OT_resume_job,
     GWRAP_OT_find_job,
-)
+)  # fmt: skip

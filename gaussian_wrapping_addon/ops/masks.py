@@ -15,19 +15,20 @@ from ..core.jobs.store.job_folder import JobFolder
 from ..core.jobs.store.rollback import finished_job
 from ..core.masks.mask_folder import FOLDER, MadeMask, MaskList, read_list, write_list
 from ..core.settings import with_values
-from . import addon, worker_setup
-from .addon import OperatorResult, ReportsErrors, properties_of
+from . import addon
+from .addon import ReportsErrors
+from .job_timer import new_icon
 from .jobs import (
-    ConfirmsFolder,
+    OnRegions,
+    OnSceneJob,
     common_frame,
-    has_worker,
-    no_job_runs,
     refuse_running,
     selected_regions,
     start_on_regions,
+    why_no_start,
 )
 from .panel_settings import job_folder_of, job_settings
-from .worker_setup import WorkerChoice
+from .worker_setup import WorkerChoice, worker_choice
 
 # -- Start a job that masks the photos to what stands in regions, and trains anew -----------------
 
@@ -41,20 +42,12 @@ CAMERA_SETTINGS: Final = (
 
 def start_region_masks(
     scene: bpy.types.Scene, regions: list[bpy.types.Object], choice: WorkerChoice
-) -> Path:
-    """Train a finished job's photos anew, masked to regions, and mesh these; return its folder.
+) -> None:
+    """Train a finished job's photos anew, masked to regions, and mesh these.
 
     Cameras are re-used; so are masks that were made of the same regions.
 
-    Parameters
-    ----------
-    regions : list of Object
-        Region objects under the frame of one result.
-
-    Raises
-    ------
-    WrapError
-        A region or a setting cannot be used, or the job folder holds no job.
+    Raises WrapError: a region or a setting cannot be used, or the job folder holds no job.
     """
     folder = job_folder_of(common_frame(regions))
     refuse_running(folder)
@@ -63,7 +56,7 @@ def start_region_masks(
     changed = {name: getattr(earlier.settings, name) for name in CAMERA_SETTINGS}
     changed |= {"make_masks": "region", "mask_model": ""}
     settings = with_values(job_settings(scene, choice.threads, choice.device), changed)
-    return start_on_regions(scene, regions, choice, "wrap", earlier.source, settings)
+    start_on_regions(scene, regions, choice, "wrap", earlier.source, settings)
 
 
 # -- Look at made masks over their photos; decisions go into the job's folder at once -------------
@@ -99,14 +92,8 @@ _count = 0
 def begin(folder: Path) -> None:
     """Begin the review of a job's masks with the first photo.
 
-    Raises
-    ------
-    UsageError
-        The job has made no masks.
-    ParseError
-        Its list of masks is damaged.
-    DatasetError
-        A photo or mask cannot be read.
+    Raises UsageError: the job has made no masks; ParseError: its list of masks is damaged;
+    DatasetError: a photo or mask cannot be read.
     """
     global _review
     masks = read_list(folder / FOLDER)
@@ -126,12 +113,8 @@ def step(by: int) -> None:
 def decide(*, accepted: bool) -> None:
     """Accept or reject the photo that is shown, and write that down.
 
-    The list is read again first: the job may have replaced it by other masks.
-
-    Raises
-    ------
-    UsageError
-        Other masks were made meanwhile.
+    The list is read again first: the job may have replaced it by other masks. Raises UsageError:
+    other masks were made meanwhile.
     """
     review = _current()
     photo = review.masks.masks[review.index].photo
@@ -145,8 +128,6 @@ def decide(*, accepted: bool) -> None:
 
 def end() -> None:
     """Forget the review and its picture."""
-    global _review, _icons
-    _review = None
     image: Any = bpy.data.images.get(IMAGE_NAME)
     if image is not None and image.users <= 1:
         bpy.data.images.remove(image)
@@ -201,23 +182,17 @@ def _show() -> None:
     mask = review.masks.masks[review.index]
     photo = _pixels(review.folder / mask.image, LONGEST_PX)
     path = review.folder / FOLDER / mask.file
-    kept = (
-        _pixels(path, 0, (photo.shape[1], photo.shape[0]))[..., 0] >= THRESHOLD
-        if path.is_file()
-        else None
-    )
-    picture = overlaid(photo, np.zeros(photo.shape[:2], bool) if kept is None else kept)
+    kept = np.zeros(photo.shape[:2], bool)
+    if path.is_file():
+        kept = _pixels(path, 0, (photo.shape[1], photo.shape[0]))[..., 0] >= THRESHOLD
+    picture = overlaid(photo, kept)
     _put_into_image(picture)
     step_px = max(1, -(-max(picture.shape[:2]) // ICON_PX))
-    small = np.ascontiguousarray(picture[::step_px, ::step_px])
     if _icons is None:
         _icons = bpy.utils.previews.new()
     _icons.clear()
     _count += 1  # a new name each time: Blender caches what it has drawn under a name
-    icon = _icons.new(f"mask {_count}")
-    icon.image_size = small.shape[1::-1]
-    icon.image_pixels_float.foreach_set(small.ravel())
-    review.icon = int(icon.icon_id)
+    review.icon = new_icon(_icons, f"mask {_count}", picture[::step_px, ::step_px])
 
 
 def _pixels(path: Path, longest_px: int, size: tuple[int, int] | None = None) -> np.ndarray:
@@ -270,7 +245,7 @@ def _put_into_image(picture: np.ndarray) -> None:
 # -- Operators of masks: make them of a region, review, accept and reject them --------------------
 
 
-class GWRAP_OT_masks_from_region(ConfirmsFolder, bpy.types.Operator):
+class GWRAP_OT_masks_from_region(OnRegions, bpy.types.Operator):
     bl_idname = "gwrap.masks_from_region"
     bl_label = "Masks from Region"
     bl_description = (
@@ -279,58 +254,32 @@ class GWRAP_OT_masks_from_region(ConfirmsFolder, bpy.types.Operator):
     )
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if not selected_regions(context):
-            cls.poll_message_set("Select a region box around the object")
-            return False
-        return has_worker(cls) and no_job_runs(cls, context)
+            return "Select a region box around the object"
+        return why_no_start(context)
 
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        regions = selected_regions(context)
-        frame = addon.frame_of(regions[0]) if regions else None
-        return addon.result_folder(frame).parent if frame and frame.get(addon.RESULT) else None
-
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        regions = selected_regions(context)
-        choice = worker_setup.worker_choice(context)
-        start_region_masks(context.scene, regions, choice)
+    def work(self, context: bpy.types.Context) -> None:
+        regions = self.regions(context)
+        start_region_masks(context.scene, regions, worker_choice(context))
         self.report({"INFO"}, f"Masking to {', '.join(r.name for r in regions)}")
-        return {"FINISHED"}
 
 
-class GWRAP_OT_review_masks(ConfirmsFolder, bpy.types.Operator):
+class GWRAP_OT_review_masks(OnSceneJob, bpy.types.Operator):
     bl_idname = "gwrap.review_masks"
     bl_label = "Review Masks"
     bl_description = "Show each photo of the job with its mask, here and in an open Image Editor"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not properties_of(context.scene).job_folder:
-            cls.poll_message_set("This scene has no job; press Wrap Scene, or find its folder")
-            return False
-        return True
-
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        return Path(bpy.path.abspath(properties_of(context.scene).job_folder))
-
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        folder = self.folder(context)
-        if folder is None:
-            raise UsageError("This scene has no job.", "Wrap the scene first.")
-        begin(folder)
-        return {"FINISHED"}
+    def work(self, context: bpy.types.Context) -> None:
+        begin(self.folder(context))
 
 
 class _OfReview(ReportsErrors):
     """Mixin: available while masks are reviewed."""
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        """Tell whether masks are reviewed; Blender calls this."""
-        if not is_open():
-            cls.poll_message_set("Press Review Masks first")
-            return False
-        return True
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        return "" if is_open() else "Press Review Masks first"
 
 
 class GWRAP_OT_step_mask(_OfReview, bpy.types.Operator):
@@ -340,9 +289,8 @@ class GWRAP_OT_step_mask(_OfReview, bpy.types.Operator):
 
     by: IntProperty(default=1, options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def work(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         step(self.by)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_decide_mask(_OfReview, bpy.types.Operator):
@@ -354,10 +302,9 @@ class GWRAP_OT_decide_mask(_OfReview, bpy.types.Operator):
 
     accepted: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def work(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         decide(accepted=self.accepted)
         step(1)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_end_mask_review(_OfReview, bpy.types.Operator):
@@ -365,15 +312,11 @@ class GWRAP_OT_end_mask_review(_OfReview, bpy.types.Operator):
     bl_label = "Close"
     bl_description = "End the review; decisions stay"
 
-    def work(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         end()
-        return {"FINISHED"}
 
 
 CLASSES: Final = (
-    GWRAP_OT_masks_from_region,
-    GWRAP_OT_review_masks,
-    GWRAP_OT_step_mask,
-    GWRAP_OT_decide_mask,
+    GWRAP_OT_masks_from_region, GWRAP_OT_review_masks, GWRAP_OT_step_mask, GWRAP_OT_decide_mask,
     GWRAP_OT_end_mask_review,
-)
+)  # fmt: skip

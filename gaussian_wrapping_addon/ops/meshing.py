@@ -18,15 +18,16 @@ from ..core.files import write_json
 from ..core.jobs.client import worker_python
 from ..core.settings import MeshingSettings, to_json
 from ..core.worker.helper_process import child_command
-from . import addon, jobs, panel_settings, region_operators, worker_setup
-from .addon import NeedsObjectMode, OperatorResult, redraw
+from . import addon, region_operators
+from .addon import NeedsObjectMode, redraw
 from .background import Child, Lane, Task
-from .jobs import ConfirmsFolder, chosen_regions
+from .jobs import OnRegions, checked_regions, common_frame, selected_regions
 from .mesh_data import mesh_of
-from .panel_settings import method_choices
+from .panel_settings import job_folder_of, method_choices
 from .region_objects import region_body
 from .region_operators import checked_edge_length, edge_length_in_blender, world_per_blender
 from .training import Estimate, estimate_of, estimate_of_failure
+from .worker_setup import worker_choice
 
 # -- Estimate the meshes of regions (triangles, time, memory) by the worker, in the background ----
 #
@@ -56,25 +57,11 @@ class EstimateInputs:
         return self.rest == other.rest and bool(same)
 
 
-@dataclass(frozen=True)
-class _Request:
-    uid: int
-    body: dict[str, Any]
-    """The region file's content."""
-    request: dict[str, Any]
-    python: str
-
-
-@dataclass(frozen=True)
-class _Running:
-    child: Child
-    task: Task[Estimate]
-
-
 @dataclass
 class _State:
-    running: dict[int, _Running] = field(default_factory=dict)
     """By the region's session id."""
+
+    running: dict[int, Task[Estimate]] = field(default_factory=dict)
     inputs: dict[int, EstimateInputs] = field(default_factory=dict)
     estimates: dict[int, Estimate] = field(default_factory=dict)
 
@@ -91,7 +78,7 @@ def is_busy() -> bool:
 def is_waiting(region: bpy.types.Object) -> bool:
     """Return whether a region's estimate is running."""
     running = _state.running.get(region.session_uid)
-    return running is not None and running.task.pending
+    return running is not None and running.pending
 
 
 def estimate_for(scene: bpy.types.Scene, region: bpy.types.Object) -> tuple[Estimate | None, bool]:
@@ -126,56 +113,46 @@ def start(
 ) -> None:
     """Begin estimates for regions of one result; those of other regions stay.
 
-    Parameters
-    ----------
-    folder : Path
-        The job folder of the finished training.
-    python : str
-        From the preferences.
-
-    Raises
-    ------
-    WrapError
-        A region, its resolution or the interpreter cannot be used; no estimate is started.
+    ``folder``: the job folder of the finished training. ``python``: from the preferences.
+    Raises WrapError: a region, its resolution or the interpreter cannot be used; no estimate is
+    started.
     """
     interpreter = worker_python(python)
-    requests = [_request(scene, region, folder, interpreter) for region in regions]
+    requests = {
+        region.session_uid: (_request(scene, region, folder), region_body(region))
+        for region in regions
+    }
     cancel_estimates()
     for region in regions:
         _state.inputs[region.session_uid] = inputs_of(scene, region)
         _state.estimates.pop(region.session_uid, None)
-    for request in requests:
+    for uid, request in requests.items():
         child = Child()
-        task = _requests.submit(
-            partial(_run, child, request),
-            partial(_keep, request.uid),
-            failed=partial(_keep_failure, request.uid),
+        _state.running[uid] = _requests.submit(
+            partial(_run, child, interpreter, *request),
+            partial(_keep, uid),
+            failed=partial(_keep_failure, uid),
             end=child.end,
         )
-        _state.running[request.uid] = _Running(child, task)
 
 
-def _request(
-    scene: bpy.types.Scene, region: bpy.types.Object, folder: Path, python: str
-) -> _Request:
+def _request(scene: bpy.types.Scene, region: bpy.types.Object, folder: Path) -> dict[str, Any]:
     frame = addon.frame_of(region)
     assert frame is not None  # whoever starts has found the job folder by it
     length = checked_edge_length(scene, region) * world_per_blender(frame)
     values = {**method_choices(scene), "edge_length": length}
     if length:
         values["points"] = 0
-    meshing = MeshingSettings(**values)
-    request = {"out": str(folder), "meshing": to_json(meshing), "threads": 0}
-    return _Request(region.session_uid, region_body(region), request, python)
+    return {"out": str(folder), "meshing": to_json(MeshingSettings(**values)), "threads": 0}
 
 
-def _run(child: Child, request: _Request) -> Estimate:
-    """Run one estimate; in a thread."""
+def _run(child: Child, python: str, request: dict[str, Any], body: dict[str, Any]) -> Estimate:
+    """Run one estimate of a region file's content; in a thread."""
     with tempfile.TemporaryDirectory(prefix="gwrap-") as folder:
         path = os.path.join(folder, "region.json")
-        write_json(Path(path), request.body)
-        text = json.dumps({**request.request, "region": path}, allow_nan=False)
-        command = child_command(MODULE, text, python=request.python)
+        write_json(Path(path), body)
+        text = json.dumps({**request, "region": path}, allow_nan=False)
+        command = child_command(MODULE, text, python=python)
         return estimate_of(*child.run(command, DEADLINE_S))
 
 
@@ -205,7 +182,7 @@ def stop() -> None:
 # -- Operators of the region list: estimate and delete; checked regions instead of selected ones
 
 
-class GWRAP_OT_estimate_regions(ConfirmsFolder, bpy.types.Operator):
+class GWRAP_OT_estimate_regions(OnRegions, bpy.types.Operator):
     bl_idname = "gwrap.estimate_regions"
     bl_label = "Estimate"
     bl_description = (
@@ -215,23 +192,16 @@ class GWRAP_OT_estimate_regions(ConfirmsFolder, bpy.types.Operator):
     checked: BoolProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if is_busy():
-            cls.poll_message_set("An estimate is running")
-            return False
-        return True
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        return "An estimate is running" if is_busy() else ""
 
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        regions = chosen_regions(context, checked=self.checked)
-        frame = addon.frame_of(regions[0]) if regions else None
-        return addon.result_folder(frame).parent if frame and frame.get(addon.RESULT) else None
+    def regions(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+        return checked_regions(context) if self.checked else selected_regions(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        regions = chosen_regions(context, checked=self.checked)
-        folder = panel_settings.job_folder_of(jobs.common_frame(regions))
-        python = worker_setup.worker_choice(context).python
-        start(context.scene, regions, folder, python)
-        return {"FINISHED"}
+    def work(self, context: bpy.types.Context) -> None:
+        regions = self.regions(context)
+        folder = job_folder_of(common_frame(regions))
+        start(context.scene, regions, folder, worker_choice(context).python)
 
 
 class GWRAP_OT_delete_region(NeedsObjectMode, bpy.types.Operator):
@@ -242,7 +212,7 @@ class GWRAP_OT_delete_region(NeedsObjectMode, bpy.types.Operator):
 
     name: StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         thing = context.scene.objects.get(self.name)
         if thing is None or addon.kind_of(thing) != "region":
             raise UsageError(f"The scene has no region {self.name}.", "Choose one of the list.")
@@ -254,7 +224,6 @@ class GWRAP_OT_delete_region(NeedsObjectMode, bpy.types.Operator):
         bpy.data.objects.remove(thing)
         if mesh is not None and mesh.users == 0:
             bpy.data.meshes.remove(mesh)
-        return {"FINISHED"}
 
 
 CLASSES: Final = (GWRAP_OT_estimate_regions, GWRAP_OT_delete_region)

@@ -25,13 +25,7 @@ from .addon import properties_of, tr
 
 
 def source_of(scene: bpy.types.Scene) -> Path:
-    """Return the photo folder of a scene.
-
-    Raises
-    ------
-    UsageError
-        None is chosen.
-    """
+    """Return the photo folder of a scene. Raises UsageError: none is chosen."""
     if not properties_of(scene).source:
         raise UsageError("No photo folder is chosen.", "Choose one in Dataset.")
     return real_path(bpy.path.abspath(properties_of(scene).source))
@@ -40,10 +34,7 @@ def source_of(scene: bpy.types.Scene) -> Path:
 def output_of(scene: bpy.types.Scene, source: Path) -> Path:
     """Return the job folder for a source: the one chosen, or a sibling of the source.
 
-    Raises
-    ------
-    UsageError
-        It lies inside the photo folder, which is never written to.
+    Raises UsageError: it lies inside the photo folder, which is never written to.
     """
     text = "" if _is_of_other_photos(scene, source) else properties_of(scene).output
     if source.suffix.lower() == ".ply" or (is_video_path(source) and not source.is_dir()):
@@ -83,10 +74,7 @@ def _is_of_other_photos(scene: bpy.types.Scene, source: Path) -> bool:
 def job_folder_of(frame: bpy.types.Object) -> Path:
     """Return the job folder of a result's frame.
 
-    Raises
-    ------
-    UsageError
-        It has been moved or deleted.
+    Raises UsageError: it has been moved or deleted.
     """
     folder = real_path(addon.result_folder(frame)).parent
     if not JobFolder(folder).is_job():
@@ -101,11 +89,8 @@ def job_folder_of(frame: bpy.types.Object) -> Path:
 
 def settings_of_scene() -> list[Declaration]:
     """Return the settings that a scene has a property for."""
-    return [
-        declared
-        for declared in declarations(JobSettings)
-        if declared.panel is not None and declared.property_owner != "preferences"
-    ]
+    known = (d for d in declarations(JobSettings) if d.panel is not None)
+    return [declared for declared in known if declared.property_owner != "preferences"]
 
 
 def is_shown(declared: Declaration, properties: bpy.types.PropertyGroup) -> bool:
@@ -124,10 +109,7 @@ def chosen_values(
 
     Numbers left to the preset are omitted.
 
-    Parameters
-    ----------
-    properties : bpy.types.PropertyGroup
-        ``Scene.gwrap``.
+    ``properties``: ``Scene.gwrap``.
     """
     values = {}
     for declared in settings:
@@ -139,49 +121,44 @@ def chosen_values(
     return values
 
 
-def _stored(declared: Declaration, properties: bpy.types.PropertyGroup) -> Any:
-    owner: Any = properties
-    owner = owner.training if declared.property_owner == "training" else owner
-    return getattr(owner, declared.property_name)
+def owner_of(declared: Declaration, properties: Any) -> Any:
+    """Return which of ``Scene.gwrap`` and ``Scene.gwrap.training`` has a setting's property."""
+    return properties.training if declared.property_owner == "training" else properties
+
+
+def _stored(declared: Declaration, properties: Any) -> Any:
+    return getattr(owner_of(declared, properties), declared.property_name)
 
 
 def job_settings(scene: bpy.types.Scene, threads: int, device: str = "auto") -> JobSettings:
     """Return the job settings of a scene's panels: the preset, then the choices.
 
-    Meshing settings are omitted: a job that trains uses their defaults.
-
-    Raises
-    ------
-    UsageError
-        The splat to start from or the control points do not exist, or the markers are none.
+    Meshing settings are omitted: a job that trains uses their defaults. Raises UsageError: the
+    splat to start from or the control points do not exist, or the markers are none.
     """
     settings = [declared for declared in settings_of_scene() if declared.group != "meshing"]
     values = chosen_values(properties_of(scene), settings)
     values["start_splat"] = _splat(values["start_splat"])
     values["markers"] = checked_markers(values["markers"])
-    values["control_points"] = _control_points(values["control_points"])
-    values["mask_model"] = _mask_model(values["mask_model"])
+    if values["control_points"]:
+        path = _local(values["control_points"], "file")
+        values["control_points"] = _existing(path, "file of control points")
+    model = values["mask_model"]
+    values["mask_model"] = str(_local(model, "mask model")) if model else ""
     values |= computers_choices(scene)
     name = values.pop("preset")
-    decided = {
-        declared.path
-        for declared in settings
-        if declared.model_selection
-        and name in declared.presets
-        and values[declared.path] == declared.default
-    }  # Auto leaves it to the preset
-    given = {path: value for path, value in values.items() if path not in decided}
-    return with_values(preset(name, threads=threads, device=device), given)
+    for declared in settings:
+        auto = declared.model_selection and name in declared.presets
+        if auto and values[declared.path] == declared.default:
+            del values[declared.path]  # Auto leaves it to the preset
+    return with_values(preset(name, threads=threads, device=device), values)
 
 
 def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
     """Return the settings, by path, that say where the parts of a job run.
 
-    Raises
-    ------
-    UsageError
-        The address of the Dask scheduler is none, or not encrypted; the folder of the certificates
-        is on another computer.
+    Raises UsageError: the address of the Dask scheduler is none, or not encrypted; the folder of
+    the certificates is on another computer.
     """
     properties = properties_of(scene)
     choices, processes = properties.computers, properties.processes
@@ -199,10 +176,7 @@ def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
 def certificates_of(scene: bpy.types.Scene) -> str:
     """Return the folder of the farm's certificates; ``""`` leaves it to the environment.
 
-    Raises
-    ------
-    UsageError
-        It is on another computer.
+    Raises UsageError: it is on another computer.
     """
     stored = properties_of(scene).computers.certificates
     return str(_local(stored, "folder of certificates")) if stored else ""
@@ -211,10 +185,7 @@ def certificates_of(scene: bpy.types.Scene) -> str:
 def meshing_choices(scene: bpy.types.Scene, world_per_blender: float) -> dict[str, Any]:
     """Return the meshing settings, by path, of a scene's panels.
 
-    Parameters
-    ----------
-    world_per_blender : float
-        World units of the input per unit of length in Blender.
+    ``world_per_blender``: world units of the input per unit of length in Blender.
     """
     settings = [declared for declared in settings_of_scene() if declared.group == "meshing"]
     values = chosen_values(properties_of(scene), settings)
@@ -228,11 +199,8 @@ def method_choices(scene: bpy.types.Scene) -> dict[str, Any]:
 
     The edge length is as in Blender.
     """
-    settings = [
-        declared
-        for declared in settings_of_scene()
-        if declared.option is not None and declared.scope == "method"
-    ]
+    known = settings_of_scene()
+    settings = [d for d in known if d.option is not None and d.scope == "method"]
     values = chosen_values(properties_of(scene), settings)
     return {path.rpartition(".")[2]: value for path, value in values.items()}
 
@@ -243,15 +211,6 @@ def texture_choices(scene: bpy.types.Scene) -> dict[str, Any]:
     return chosen_values(properties_of(scene), settings)
 
 
-def _mask_model(stored: str) -> str:
-    if not stored:
-        return ""
-    path = Path(bpy.path.abspath(stored))
-    if addon.is_remote(path):  # as of a splat
-        raise UsageError(f"{path} is on another computer.", "Copy the mask model to this one.")
-    return str(path)
-
-
 def _splat(stored: str) -> str:
     if not stored:
         return ""
@@ -259,10 +218,6 @@ def _splat(stored: str) -> str:
     if path.suffix.lower() != ".ply":
         raise UsageError(f"{path.name} is not a PLY file.", "Choose a splat saved as PLY, or none.")
     return _existing(path, "splat")
-
-
-def _control_points(stored: str) -> str:
-    return _existing(_local(stored, "file"), "file of control points") if stored else ""
 
 
 def _local(stored: str, what: str) -> Path:
@@ -300,13 +255,10 @@ def preset_lines(name: str) -> tuple[str, ...]:
 def choices_key(scene: bpy.types.Scene) -> tuple[object, ...]:
     """Return what an estimate of time and memory depends on; reads no file, for panels."""
     properties = properties_of(scene)
+    known = settings_of_scene()
+    decisive = (d for d in known if d.property_owner == "training" or d.panel_name == "dataset")
     own = (properties.source, properties.preset, properties.texture_size)
-    decisive = [
-        d
-        for d in settings_of_scene()
-        if d.property_owner == "training" or d.panel_name == "dataset"
-    ]
-    return (*own, *(_stored(declared, properties) for declared in decisive))
+    return (*own, *(_stored(d, properties) for d in decisive))
 
 
 # -- Stage of a scene and the button of the next step; reads no file, for panels and polls --------
@@ -346,7 +298,7 @@ def stage_of(context: bpy.types.Context) -> Stage:
     """Return the stage of the scene."""
     scene = context.scene
     properties = properties_of(scene)
-    frame = addon.current_frame(scene, context.view_layer.objects.active)
+    frame = addon.current_frame(context)
     if properties.job_folder:
         status = job_timer.status_of(properties.job_folder)
         if status is None:

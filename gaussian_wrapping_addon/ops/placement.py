@@ -31,7 +31,7 @@ from ..core.scene.placement import (
 )
 from ..core.units.georeference import blender_start
 from . import addon
-from .addon import NeedsResult, OperatorResult, ReportsErrors
+from .addon import NeedsResult, OperatorResult, needed_frame
 from .cameras import cameras_under, scale_display
 from .mesh_data import mesh_of, values_of
 from .region_objects import hull_in_blender, matrix_of, scene_from_blender, transformed
@@ -45,11 +45,8 @@ _FLIP_YZ = np.array([1.0, -1.0, -1.0])
 def camera_poses(frame: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     """Return the poses of a result's photo cameras in Blender's world.
 
-    Returns
-    -------
-    rotations : (n, 3, 3) float64
-        ``cam_from_world``: x right, y down, z forward.
-    centers : (n, 3) float64
+    Returns ``rotations``, (n, 3, 3) float64: ``cam_from_world``: x right, y down, z forward;
+    ``centers``, (n, 3) float64.
     """
     rotations, centers = [], []
     for camera in cameras_under(frame):
@@ -63,13 +60,9 @@ def camera_poses(frame: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
 def automatic_plane(frame: bpy.types.Object) -> tuple[Plane, str]:
     """Find the ground of a result; return the plane and the rule used.
 
-    Up comes from the cameras. The ground is the main level plane of the meshes; if none is
-    clear, it passes through their lowest point; without meshes, through the regions' lowest corner.
-
-    Raises
-    ------
-    UsageError
-        The cameras do not determine up, or nothing determines the ground.
+    Up comes from the cameras. The ground is the main level plane of the meshes; if none is clear,
+    it passes through their lowest point; without meshes, through the regions' lowest corner. Raises
+    UsageError: the cameras do not determine up, or nothing determines the ground.
     """
     up, rule = camera_up(*camera_poses(frame))
     meshes = [c for c in frame.children if addon.kind_of(c) == "mesh" and c.type == "MESH"]
@@ -115,11 +108,8 @@ _POINT_SIZE = 0.05
 
 def point_empties(context: bpy.types.Context) -> list[bpy.types.Object]:
     """Return the selected empties that are points: no region, no parent of a result."""
-    return [
-        thing
-        for thing in context.selected_objects
-        if thing.type == "EMPTY" and addon.kind_of(thing) in ("", "point")
-    ]
+    empties = (thing for thing in context.selected_objects if thing.type == "EMPTY")
+    return [thing for thing in empties if addon.kind_of(thing) in ("", "point")]
 
 
 def picked_points(context: bpy.types.Context, frame: bpy.types.Object) -> np.ndarray:
@@ -128,15 +118,8 @@ def picked_points(context: bpy.types.Context, frame: bpy.types.Object) -> np.nda
     In Edit Mode the selected vertices of its meshes, else the selected empties; one without
     a parent becomes a child of the frame in place, so that it moves along.
 
-    Returns
-    -------
-    points : (n, 3) float64
-        Blender's world.
-
-    Raises
-    ------
-    UsageError
-        A mesh in Edit Mode, or an empty, belongs to something else.
+    Returns ``points``, (n, 3) float64: Blender's world.
+    Raises UsageError: a mesh in Edit Mode, or an empty, belongs to something else.
     """
     if context.mode == "EDIT_MESH":
         found = [_selected_vertices(thing, frame) for thing in context.objects_in_mode]
@@ -187,9 +170,8 @@ def add_point(context: bpy.types.Context, frame: bpy.types.Object) -> bpy.types.
     point.parent = frame
     point.location = transformed(scene_from_blender(frame), cursor[None])[0].tolist()
     point[addon.KIND] = "point"
-    (frame.users_collection[0] if frame.users_collection else context.collection).objects.link(
-        point
-    )
+    collection = frame.users_collection[0] if frame.users_collection else context.collection
+    collection.objects.link(point)
     context.view_layer.update()  # a new object cannot be selected before
     point.select_set(True)
     context.view_layer.objects.active = point
@@ -225,10 +207,7 @@ _written: dict[Path, tuple[str, str]] = {}
 def placement_of(frame: bpy.types.Object) -> Similarity:
     """Return ``blender_from_scene``: in double if it was set so, else Blender's matrix.
 
-    Raises
-    ------
-    UsageError
-        The empty is scaled differently along its axes, mirrored or has no size.
+    Raises UsageError: the empty is scaled differently along its axes, mirrored or has no size.
     """
     matrix = matrix_of(frame)
     stored = _stored(frame)
@@ -249,15 +228,8 @@ def place(frame: bpy.types.Object, placement: Similarity) -> str:
     Nothing but the empty is moved; clipping and frustum size of the photo cameras follow its
     scale, since Blender does not let them.
 
-    Returns
-    -------
-    note : str
-        Why the placement could not be saved beside the result; ``""`` if it was.
-
-    Raises
-    ------
-    UsageError
-        The scale is out of range, or something else holds the empty in place.
+    Returns ``note``: why the placement could not be saved beside the result; ``""`` if it was.
+    Raises UsageError: the scale is out of range, or something else holds the empty in place.
     """
     check_scale(placement)
     before = frame.matrix_basis.copy()
@@ -371,33 +343,23 @@ _TARGETS: Final = (
 )
 
 
-class _Tool(NeedsResult, ReportsErrors):
+class _Tool(NeedsResult):
     """Mixin: a tool for Object Mode, and for vertices of a mesh in Edit Mode."""
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Return whether the tool can run; Blender calls this."""
+    def why_not(cls, context: bpy.types.Context) -> str:
         if context.mode not in ("OBJECT", "EDIT_MESH"):
-            cls.poll_message_set("Leave the current mode first")
-            return False
-        return super().poll(context)
-
-    def frame(self, context: bpy.types.Context) -> bpy.types.Object:
-        """Return the parent empty that the tool transforms."""
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-        if frame is None:
-            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
-        return frame
+            return "Leave the current mode first"
+        return super().why_not(context)
 
     def apply(
         self, context: bpy.types.Context, frame: bpy.types.Object, step: Similarity, done: str
-    ) -> OperatorResult:
+    ) -> None:
         """Apply a step to the placement of the frame."""
         placement = step.after(placement_of(frame))
         release(context)
         note = place(frame, placement)
         self.report({"WARNING"} if note else {"INFO"}, f"{done}. {note}".strip())
-        return {"FINISHED"}
 
 
 class GWRAP_OT_add_point(_Tool, bpy.types.Operator):
@@ -410,15 +372,13 @@ class GWRAP_OT_add_point(_Tool, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if context.mode != "OBJECT":
-            cls.poll_message_set("In Edit Mode, select vertices instead")
-            return False
-        return super().poll(context)
+            return "In Edit Mode, select vertices instead"
+        return super().why_not(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        add_point(context, self.frame(context))
-        return {"FINISHED"}
+    def work(self, context: bpy.types.Context) -> None:
+        add_point(context, needed_frame(context))
 
 
 class GWRAP_OT_set_scale(_Tool, bpy.types.Operator):
@@ -432,18 +392,13 @@ class GWRAP_OT_set_scale(_Tool, bpy.types.Operator):
     distance: FloatProperty(  # type: ignore[valid-type]
         name="True Distance",
         description="Distance of the two points; units may be typed, such as 35 cm",
-        default=1.0,
-        min=0.0,
-        soft_min=1e-3,
-        precision=4,
-        subtype="DISTANCE",
-        unit="LENGTH",
+        default=1.0, min=0.0, soft_min=1e-3, precision=4, subtype="DISTANCE", unit="LENGTH",
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         try:
-            points = picked_points(context, self.frame(context))
+            points = picked_points(context, needed_frame(context))
             scale_step(points, 1.0)
         except WrapError as error:
             self.report({"ERROR"}, str(error))
@@ -452,10 +407,10 @@ class GWRAP_OT_set_scale(_Tool, bpy.types.Operator):
             self.distance = float(np.linalg.norm(points[1] - points[0]))
         return context.window_manager.invoke_props_dialog(self)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = self.frame(context)
+    def work(self, context: bpy.types.Context) -> None:
+        frame = needed_frame(context)
         step = scale_step(picked_points(context, frame), self.distance)
-        return self.apply(context, frame, step, f"Scaled by {step.scale:.6g}")
+        self.apply(context, frame, step, f"Scaled by {step.scale:.6g}")
 
 
 class GWRAP_OT_set_ground(_Tool, bpy.types.Operator):
@@ -471,12 +426,12 @@ class GWRAP_OT_set_ground(_Tool, bpy.types.Operator):
         name="Flip", description="The other side of the plane is up", options={"SKIP_SAVE"}
     )
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = self.frame(context)
+    def work(self, context: bpy.types.Context) -> None:
+        frame = needed_frame(context)
         plane = plane_through(picked_points(context, frame), camera_poses(frame)[1])
         if self.flip:
             plane = Plane(plane.point, -plane.normal)
-        return self.apply(context, frame, ground_step(plane), "The points lie on the ground")
+        self.apply(context, frame, ground_step(plane), "The points lie on the ground")
 
 
 class GWRAP_OT_auto_ground(_Tool, bpy.types.Operator):
@@ -488,11 +443,11 @@ class GWRAP_OT_auto_ground(_Tool, bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = self.frame(context)
+    def work(self, context: bpy.types.Context) -> None:
+        frame = needed_frame(context)
         release(context)  # edits of a mesh reach its data when Edit Mode ends
         plane, how = automatic_plane(frame)
-        return self.apply(context, frame, ground_step(plane), how)
+        self.apply(context, frame, ground_step(plane), how)
 
 
 class GWRAP_OT_set_origin(_Tool, bpy.types.Operator):
@@ -503,8 +458,8 @@ class GWRAP_OT_set_origin(_Tool, bpy.types.Operator):
 
     target: EnumProperty(name="Target", items=_TARGETS, default="POINTS")  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = self.frame(context)
+    def work(self, context: bpy.types.Context) -> None:
+        frame = needed_frame(context)
         if self.target == "CURSOR":
             point = np.array(context.scene.cursor.location, np.float64)
         else:
@@ -512,7 +467,7 @@ class GWRAP_OT_set_origin(_Tool, bpy.types.Operator):
             if len(points) == 0:
                 raise UsageError("No point is picked.", "Select a vertex or a point.")
             point = points.mean(0)
-        return self.apply(context, frame, origin_step(point), "The point is the origin")
+        self.apply(context, frame, origin_step(point), "The point is the origin")
 
 
 class GWRAP_OT_keep_placement(_Tool, bpy.types.Operator):
@@ -524,8 +479,8 @@ class GWRAP_OT_keep_placement(_Tool, bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        return self.apply(context, self.frame(context), Similarity(), "The placement is saved")
+    def work(self, context: bpy.types.Context) -> None:
+        self.apply(context, needed_frame(context), Similarity(), "The placement is saved")
 
 
 class GWRAP_OT_reset_placement(_Tool, bpy.types.Operator):
@@ -537,21 +492,15 @@ class GWRAP_OT_reset_placement(_Tool, bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = self.frame(context)
+    def work(self, context: bpy.types.Context) -> None:
+        frame = needed_frame(context)
         release(context)
         note = place(frame, first_placement(frame))
         if note:
             self.report({"WARNING"}, note)
-        return {"FINISHED"}
 
 
 CLASSES: Final = (
-    GWRAP_OT_add_point,
-    GWRAP_OT_set_scale,
-    GWRAP_OT_set_ground,
-    GWRAP_OT_auto_ground,
-    GWRAP_OT_set_origin,
-    GWRAP_OT_keep_placement,
-    GWRAP_OT_reset_placement,
-)
+    GWRAP_OT_add_point, GWRAP_OT_set_scale, GWRAP_OT_set_ground, GWRAP_OT_auto_ground,
+    GWRAP_OT_set_origin, GWRAP_OT_keep_placement, GWRAP_OT_reset_placement,
+)  # fmt: skip

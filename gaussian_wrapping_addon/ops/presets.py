@@ -2,7 +2,7 @@
 """The user's presets."""
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import bpy
 from bpy.props import StringProperty
@@ -10,10 +10,10 @@ from bpy.props import StringProperty
 from ..core.errors import UsageError
 from ..core.files import is_link
 from ..core.names import file_stem
-from ..core.settings import Declaration
 from ..core.settings.job import read_saved_settings, savable_settings, write_saved_settings
 from .addon import OperatorResult, ReportsErrors, properties_of, redraw
-from .jobs import no_job_runs
+from .jobs import why_busy
+from .panel_settings import owner_of
 
 # -- Files of the user's presets, in Blender's folder for presets, which outlives the add-on ------
 
@@ -42,10 +42,7 @@ def shown_name(name: str) -> str:
 def save_preset(scene: bpy.types.Scene, wanted: str) -> str:
     """Save the settings of a scene's panels; return the preset's name.
 
-    Raises
-    ------
-    UsageError
-        The name is empty, there are too many, or the file cannot be written.
+    Raises UsageError: the name is empty, there are too many, or the file cannot be written.
     """
     if not wanted.strip():
         raise UsageError("The preset has no name.", "Type one.")
@@ -58,10 +55,8 @@ def save_preset(scene: bpy.types.Scene, wanted: str) -> str:
         raise UsageError(f"There are {len(names)} presets already.", "Delete one.")
     properties = properties_of(scene)
     values = {
-        declared.path: declared.from_panel(
-            getattr(_owner(declared, properties), declared.property_name)
-        )
-        for declared in savable_settings()
+        d.path: d.from_panel(getattr(owner_of(d, properties), d.property_name))
+        for d in savable_settings()
     }
     panel = {name: getattr(properties, name) for name in PANEL_CHOICES}
     try:
@@ -76,10 +71,8 @@ def save_preset(scene: bpy.types.Scene, wanted: str) -> str:
 def apply_preset(scene: bpy.types.Scene, name: str) -> tuple[str, ...]:
     """Give a scene's panels the settings of a preset; return notes on what was left out.
 
-    Raises
-    ------
-    UsageError, ParseError
-        There is no such preset, or its file cannot be used. Nothing was changed.
+    Raises UsageError, ParseError: there is no such preset, or its file cannot be used. Nothing was
+    changed.
     """
     path = _existing(name)
     try:
@@ -88,31 +81,24 @@ def apply_preset(scene: bpy.types.Scene, name: str) -> tuple[str, ...]:
         raise UsageError(f"{path} cannot be read: {error.strerror}.", "Check the file.") from None
     properties = properties_of(scene)
     notes = list(saved.notes)
-    for declared in savable_settings():
-        if declared.path in saved.values:
-            owner = _owner(declared, properties)
+    chosen = [
+        (d.path, owner_of(d, properties), d.property_name, d.to_panel, saved.values)
+        for d in savable_settings()
+    ]
+    chosen += [(name, properties, name, lambda value: value, saved.panel) for name in PANEL_CHOICES]
+    for called, owner, name, to_panel, values in chosen:
+        if called in values:
             try:
-                setattr(
-                    owner, declared.property_name, declared.to_panel(saved.values[declared.path])
-                )
+                setattr(owner, name, to_panel(values[called]))
             except (TypeError, ValueError, OverflowError):
-                notes.append(f"{declared.path} is no choice of the panel, and stays as it is.")
-    for choice in PANEL_CHOICES:
-        if choice in saved.panel:
-            try:
-                setattr(properties, choice, saved.panel[choice])
-            except (TypeError, ValueError, OverflowError):
-                notes.append(f"{choice} is no choice of the panel, and stays as it is.")
+                notes.append(f"{called} is no choice of the panel, and stays as it is.")
     return tuple(notes)
 
 
 def delete_preset(name: str) -> None:
     """Delete the file of a preset.
 
-    Raises
-    ------
-    UsageError
-        There is no such preset, or it cannot be deleted.
+    Raises UsageError: there is no such preset, or it cannot be deleted.
     """
     path = _existing(name)
     try:
@@ -136,10 +122,6 @@ def _existing(name: str) -> Path:
     return folder / f"{name}.json"
 
 
-def _owner(declared: Declaration, properties: Any) -> Any:
-    return properties.training if declared.property_owner == "training" else properties
-
-
 # -- Operators of the menu of presets: save, apply, delete ----------------------------------------
 
 
@@ -161,10 +143,9 @@ class GWRAP_OT_save_preset(ReportsErrors, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_props_dialog(self)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         name = save_preset(context.scene, self.name)
         self.report({"INFO"}, f"Saved preset {shown_name(name)}")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_apply_preset(ReportsErrors, bpy.types.Operator):
@@ -176,15 +157,14 @@ class GWRAP_OT_apply_preset(ReportsErrors, bpy.types.Operator):
     name: StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return no_job_runs(cls, context)
+    def why_not(cls, context: bpy.types.Context) -> str:
+        return why_busy(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         notes = apply_preset(context.scene, self.name)
         if notes:
             self.report({"WARNING"}, " ".join(notes))
         redraw()
-        return {"FINISHED"}
 
 
 class GWRAP_OT_delete_preset(ReportsErrors, bpy.types.Operator):
@@ -197,10 +177,9 @@ class GWRAP_OT_delete_preset(ReportsErrors, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_confirm(self, event)
 
-    def work(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         delete_preset(self.name)
         self.report({"INFO"}, f"Deleted preset {shown_name(self.name)}")
-        return {"FINISHED"}
 
 
 CLASSES: Final = (GWRAP_OT_save_preset, GWRAP_OT_apply_preset, GWRAP_OT_delete_preset)

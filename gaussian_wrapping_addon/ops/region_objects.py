@@ -38,21 +38,11 @@ Triangles = list[tuple[int, int, int]]
 def convex_hull(points: np.ndarray, name: str) -> tuple[np.ndarray, Triangles]:
     """Return the convex hull of points.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    name : str
-        Of the object, for messages.
-
-    Returns
-    -------
-    vertices : (k, 3) float64
-    triangles : list of index triples
-
-    Raises
-    ------
-    UsageError
-        The points enclose no volume, are not finite, or too many of them may be corners.
+    ``points``: (n, 3) float64.
+    ``name``: of the object, for messages.
+    Returns ``vertices``, (k, 3) float64; ``triangles``.
+    Raises UsageError: the points enclose no volume, are not finite, or too many of them may be
+    corners.
     """
     if len(points) < 4:
         raise UsageError(f"Region {name} has {len(points)} vertices.", "Use a box or a solid.")
@@ -155,10 +145,7 @@ def transformed(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
 def scene_from_blender(frame: bpy.types.Object | None) -> np.ndarray:
     """Return the (4, 4) matrix from Blender's world to the scene frame.
 
-    Raises
-    ------
-    UsageError
-        The scale of the frame is zero.
+    Raises UsageError: the scale of the frame is zero.
     """
     if frame is None:
         return np.eye(4)
@@ -171,23 +158,12 @@ def scene_from_blender(frame: bpy.types.Object | None) -> np.ndarray:
     return inverse
 
 
-def hull_in_blender(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
+def hull_in_blender(thing: bpy.types.Object) -> tuple[np.ndarray, Triangles]:
     """Return the convex hull of a region object in Blender's world.
 
-    Parameters
-    ----------
-    thing : Object
-        An Empty displayed as a cube, or a mesh (with its modifiers).
-
-    Returns
-    -------
-    vertices : (n, 3) float64
-    triangles : list of index triples
-
-    Raises
-    ------
-    UsageError, MeshingError
-        The object is of another type, or encloses no volume.
+    ``thing``: an Empty displayed as a cube, or a mesh (with its modifiers).
+    Returns ``vertices``, (n, 3) float64; ``triangles``.
+    Raises UsageError, MeshingError: the object is of another type, or encloses no volume.
     """
     local, triangles = local_hull(thing)
     vertices = transformed(matrix_of(thing), local)
@@ -195,7 +171,7 @@ def hull_in_blender(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int
     return vertices, triangles
 
 
-def local_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
+def local_hull(thing: bpy.types.Object) -> tuple[np.ndarray, Triangles]:
     """Return the convex hull of a region object in its own coordinates.
 
     As :func:`hull_in_blender`, which also checks that it encloses a volume.
@@ -213,7 +189,7 @@ def local_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int
     )
 
 
-def _mesh_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
+def _mesh_hull(thing: bpy.types.Object) -> tuple[np.ndarray, Triangles]:
     shown = evaluated(thing)
     mesh = shown.to_mesh()
     points = values_of(mesh.vertices, "co", 3, np.float32)
@@ -243,12 +219,8 @@ def region_body(thing: bpy.types.Object, name: str = "") -> dict[str, Any]:
 
     Its hull is in the world of the input. The way is Blender -> scene frame (the parent empty's
     matrix) -> world (its ``world_from_scene``); an object outside a result is taken to be in world
-    coordinates.
-
-    Raises
-    ------
-    UsageError, MeshingError
-        The object cannot be a region, or its frame has lost its coordinates.
+    coordinates. Raises UsageError, MeshingError: the object cannot be a region, or its frame has
+    lost its coordinates.
     """
     frame = addon.frame_of(thing)
     vertices, triangles = hull_in_blender(thing)
@@ -290,7 +262,16 @@ def create_region(
         thing.matrix_basis = Matrix(matrix.tolist())
     else:
         center = vertices.mean(0)
-        thing = bpy.data.objects.new(name, _hull_mesh(name, vertices - center))
+        mesh = bpy.data.meshes.new(name)
+        work = bmesh.new()
+        try:
+            for vertex in vertices - center:
+                work.verts.new(vertex.tolist())
+            bmesh.ops.convex_hull(work, input=work.verts[:])
+            work.to_mesh(mesh)
+        finally:
+            work.free()
+        thing = bpy.data.objects.new(name, mesh)
         thing.display_type = "WIRE"
         thing.hide_render = True
         thing.location = center.tolist()
@@ -302,26 +283,10 @@ def create_region(
     return thing
 
 
-def _hull_mesh(name: str, vertices: np.ndarray) -> bpy.types.Mesh:
-    work = bmesh.new()
-    try:
-        for vertex in vertices:
-            work.verts.new(vertex.tolist())
-        bmesh.ops.convex_hull(work, input=work.verts[:])
-        mesh = bpy.data.meshes.new(name)
-        work.to_mesh(mesh)
-    finally:
-        work.free()
-    return mesh
-
-
 def box_around(things: list[bpy.types.Object], frame: bpy.types.Object | None) -> np.ndarray:
     """Return the (8, 3) corners, in the scene frame, of the box around objects.
 
-    Raises
-    ------
-    UsageError
-        None of the objects has an extent.
+    Raises UsageError: none of the objects has an extent.
     """
     corners = [
         transformed(matrix_of(thing), np.array(thing.bound_box, np.float64))
@@ -383,11 +348,9 @@ def _axes(thing: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
 def cage_frame(thing: bpy.types.Object, origin: np.ndarray) -> np.ndarray:
     """Return the (4, 4) matrix from a space along the box's axes to Blender's world.
 
-    Parameters
-    ----------
-    origin : (3,) float64
-        Along the axes, as the translation of :func:`cage_matrix`. It must stay while a cage is
-        dragged, and lie at its depth: the mouse is followed in the view's plane through it.
+    ``origin``: (3,) float64. Along the axes, as the translation of :func:`cage_matrix`. It must
+    stay while a cage is dragged, and lie at its depth: the mouse is followed in the view's plane
+    through it.
     """
     parent = _parent_matrix(thing)
     assert parent is not None  # is_editable_box
@@ -411,10 +374,7 @@ def set_cage_matrix(thing: bpy.types.Object, cage: np.ndarray) -> None:
     A side that would come closer than ``2 * LEAST_HALF`` to the opposite one, or pass it, stops
     there.
 
-    Parameters
-    ----------
-    cage : (4, 4) float64
-        As :func:`cage_matrix`: a scale along the axes and a translation.
+    ``cage``: (4, 4) float64. As :func:`cage_matrix`: a scale along the axes and a translation.
     """
     if not np.isfinite(cage).all():
         return
@@ -442,10 +402,8 @@ def steadied(cage: np.ndarray, first: np.ndarray, before: np.ndarray) -> np.ndar
     Blender puts a side where the mouse is in the view's plane through the middle of the cage,
     which is not where the side is seen: at the first touch it would jump.
 
-    Parameters
-    ----------
-    cage, first, before : (4, 4) float64
-        The cage as Blender wants it now, as it first wanted it in this drag, and as it was.
+    ``cage``, ``first``, ``before``: (4, 4) float64. The cage as Blender wants it now, as it first
+    wanted it in this drag, and as it was.
     """
     result = cage.copy()
     for axis in range(3):
@@ -463,23 +421,3 @@ def steadied(cage: np.ndarray, first: np.ndarray, before: np.ndarray) -> np.ndar
                 low = now
         result[axis, axis], result[axis, 3] = 0.5 * (now - low), center + 0.5 * (now + low)
     return result
-
-
-def is_moved_only(cage: np.ndarray, before: np.ndarray) -> bool:
-    """Return whether a cage has kept its size."""
-    return bool(np.allclose(cage.diagonal(), before.diagonal(), rtol=1e-6))
-
-
-def as_columns(matrix: np.ndarray) -> list[float]:
-    """Return the 16 numbers of a matrix in the order of gizmos."""
-    return [float(value) for value in matrix.T.ravel()]
-
-
-def from_columns(values: object) -> np.ndarray:
-    """Return the (4, 4) matrix of a gizmo's 16 numbers."""
-    return np.array(values, np.float64).reshape(4, 4).T
-
-
-def same_place(a: Matrix, b: Matrix) -> bool:
-    """Return whether two matrices are equal up to rounding."""
-    return bool(np.allclose(np.array(a), np.array(b), rtol=1e-6, atol=1e-9))

@@ -46,20 +46,15 @@ def edge_length_in_blender(scene: bpy.types.Scene, region: bpy.types.Object) -> 
     """Return the edge length that applies, in Blender units; 0 if none does."""
     if has_own(scene, region):
         return float(properties_of(region).edge_length)
-    return (
-        float(properties_of(scene).edge_length)
-        if properties_of(scene).resolution == "EDGE_LENGTH"
-        else 0.0
-    )
+    applies = properties_of(scene).resolution == "EDGE_LENGTH"
+    return float(properties_of(scene).edge_length) if applies else 0.0
 
 
 def checked_edge_length(scene: bpy.types.Scene, region: bpy.types.Object) -> float:
     """Return :func:`edge_length_in_blender`, checked against the region's size.
 
-    Raises
-    ------
-    UsageError
-        The region encloses no volume, or the length is no positive number, too long or too short.
+    Raises UsageError: the region encloses no volume, or the length is no positive number, too long
+    or too short.
     """
     edge_length = edge_length_in_blender(scene, region)
     diagonal = float(np.linalg.norm(np.ptp(hull_in_blender(region)[0], 0)))
@@ -96,17 +91,11 @@ def own_lengths(
 ) -> list[float | None]:
     """Return each region's own edge length in world units, None if it has none.
 
-    Raises
-    ------
-    UsageError
-        A region or its edge length cannot be used.
+    Raises UsageError: a region or its edge length cannot be used.
     """
-    lengths = [checked_edge_length(scene, region) for region in regions]
+    lengths = {region: checked_edge_length(scene, region) for region in regions}
     scale = world_per_blender(frame)
-    return [
-        length * scale if has_own(scene, region) else None
-        for region, length in zip(regions, lengths, strict=True)
-    ]
+    return [length * scale if has_own(scene, r) else None for r, length in lengths.items()]
 
 
 # -- Cache of a scene's regions and their shapes, updated by handlers -----------------------------
@@ -145,13 +134,8 @@ def after_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None 
 
 
 @persistent
-def after_load(*_arguments: object) -> None:
-    """Handler: another file, or an undo; session ids may mean other objects."""
-    forget()
-
-
-def forget() -> None:
-    """Clear the cache."""
+def forget(*_arguments: object) -> None:
+    """Clear the cache. Handler: another file, or an undo; session ids may mean other objects."""
     _known.names.clear()
     _known.versions.clear()
 
@@ -207,18 +191,14 @@ def _active(context: bpy.types.Context) -> bpy.types.Object:
 
 def _target(context: bpy.types.Context) -> tuple[bpy.types.Object | None, bpy.types.Collection]:
     """Return the frame and the collection for a new region."""
-    frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+    frame = addon.current_frame(context)
     if frame is None:
         return None, context.scene.collection
     # Linked and overridden collections accept no new objects; objects excluded from the view layer
     # cannot be selected.
     shown = _shown_collections(context.view_layer.layer_collection)
-    places = [
-        c
-        for c in frame.users_collection
-        if c in shown and c.library is None and c.override_library is None
-    ]
-    return frame, places[0] if places else context.scene.collection
+    own = (c for c in frame.users_collection if c.library is None and c.override_library is None)
+    return frame, next((c for c in own if c in shown), context.scene.collection)
 
 
 def _shown_collections(layer: bpy.types.LayerCollection) -> list[bpy.types.Collection]:
@@ -245,13 +225,13 @@ class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
 
     around: EnumProperty(name="Around", items=_AROUND, default="CURSOR")  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         frame, collection = _target(context)
         if self.around == "SELECTED":
             things = [t for t in context.selected_objects if addon.kind_of(t) != "region"]
             vertices = box_around(things, frame)
         elif self.around == "RESULT":
-            vertices = self._result_box(context, frame)
+            vertices = self._result_box(context)
         else:
             inverse = scene_from_blender(frame)
             cursor = np.array(context.scene.cursor.location, np.float64)
@@ -259,16 +239,11 @@ class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
         thing = create_region(_free_name(frame), vertices, frame, collection)
         thing.show_name = True
         _select_only(context, thing)
-        return {"FINISHED"}
 
-    def _result_box(self, context: bpy.types.Context, frame: bpy.types.Object | None) -> np.ndarray:
-        if frame is None:
-            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
-        regions = [
-            t
-            for t in addon.objects_of_kind(context.scene, "region")
-            if addon.frame_of(t) == frame and t.get(addon.REGION)
-        ]
+    def _result_box(self, context: bpy.types.Context) -> np.ndarray:
+        frame = addon.needed_frame(context)
+        own = (t for t in addon.objects_of_kind(context.scene, "region") if t.get(addon.REGION))
+        regions = [t for t in own if addon.frame_of(t) == frame]
         regions.sort(key=lambda t: t[addon.REGION] != "auto")
         if not regions:
             return box_around([t for t in frame.children if addon.kind_of(t) == "mesh"], frame)
@@ -288,7 +263,7 @@ class GWRAP_OT_select_region(NeedsObjectMode, bpy.types.Operator):
         self.extend = event.shift
         return self.execute(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         thing = context.view_layer.objects.get(self.name)
         if thing is None:
             raise UsageError(f"Region {self.name} is not in this view layer.", "Enable it.")
@@ -297,7 +272,6 @@ class GWRAP_OT_select_region(NeedsObjectMode, bpy.types.Operator):
             context.view_layer.objects.active = thing
         else:
             _select_only(context, thing)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
@@ -311,12 +285,10 @@ class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
     file_format: EnumProperty(name="Format", items=_FORMATS, default="JSON")  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         active = context.view_layer.objects.active
-        if active is None or active.type not in ("EMPTY", "MESH"):
-            cls.poll_message_set("Select a region box or a mesh")
-            return False
-        return True
+        is_shape = active is not None and active.type in ("EMPTY", "MESH")
+        return "" if is_shape else "Select a region box or a mesh"
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         name = file_stem(_active(context).name, 0)
@@ -335,11 +307,10 @@ class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
         self.filepath = str(path.with_suffix(suffix) if known else path) + ("" if known else suffix)
         return True
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         path = Path(bpy.path.abspath(self.filepath))
         export_region(_active(context), path)
         self.report({"INFO"}, f"Wrote {path}")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
@@ -355,7 +326,7 @@ class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         path = Path(bpy.path.abspath(self.filepath))
         vertices = read_region_file(path).vertices
         frame, collection = _target(context)
@@ -364,7 +335,6 @@ class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
         thing = create_region(path.stem, vertices, frame, collection)
         thing.show_name = True
         _select_only(context, thing)
-        return {"FINISHED"}
 
 
 class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
@@ -374,14 +344,13 @@ class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         active = context.view_layer.objects.active
         if active is None or active.type != "MESH" or addon.kind_of(active):
-            cls.poll_message_set("Select a mesh that is neither a region nor a result")
-            return False
-        return super().poll(context)
+            return "Select a mesh that is neither a region nor a result"
+        return super().why_not(context)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         active = _active(context)
         frame, _ = _target(context)
         if not active.is_editable:
@@ -400,15 +369,10 @@ class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
             active.matrix_world = matrix
         active[addon.KIND] = "region"
         active.display_type = "WIRE"
-        active.show_in_front = True
-        active.hide_render = True
-        return {"FINISHED"}
+        active.show_in_front = active.hide_render = True
 
 
 CLASSES: Final = (
-    GWRAP_OT_add_region_box,
-    GWRAP_OT_select_region,
-    GWRAP_OT_export_region,
-    GWRAP_OT_import_region,
+    GWRAP_OT_add_region_box, GWRAP_OT_select_region, GWRAP_OT_export_region, GWRAP_OT_import_region,
     GWRAP_OT_use_as_region,
-)
+)  # fmt: skip

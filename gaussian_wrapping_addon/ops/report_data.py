@@ -28,13 +28,9 @@ MAX_ROWS = 100
 """Stages and regions stored at most."""
 
 _DECISIONS = {
-    "exposure": "Exposure",
-    "multi_view": "Compare Photos",
-    "growth": "Add Gaussians",
-    "full_size": "Photo Size",
-    "dense_start": "Dense Start",
-    "refine_poses": "Refine Cameras",
-}
+    "exposure": "Exposure", "multi_view": "Compare Photos", "growth": "Add Gaussians",
+    "full_size": "Photo Size", "dense_start": "Dense Start", "refine_poses": "Refine Cameras",
+}  # fmt: skip
 """Labels of what was decided, as the panel Training has them."""
 
 _STAGES = {
@@ -93,20 +89,12 @@ class ReportData:
 def figures_of_report(report: Any) -> dict[str, Any]:
     """Select the figures that the panel shows; those missing from the report are omitted.
 
-    Parameters
-    ----------
-    report : any
-        Content of ``report.json``, of any version.
-
-    Returns
-    -------
-    dict
-        ``seconds``, ``gaussians``, ``psnr`` (held-out photos, dB), ``psnr_count``,
-        ``memory_bytes``, ``device``, ``device_reason``, ``stages`` (pairs of name and seconds),
-        ``decisions`` (name, choice and setting), ``warnings`` (texts), and
-        ``regions``: for each name ``faces``, ``vertices``, ``closed``, ``coverage``,
-        ``mesh_psnr`` (dB, where the mesh covers the photos), ``uncovered`` (share of the photos)
-        and ``whole_psnr`` (dB, uncovered pixels black).
+    ``report``: content of ``report.json``, of any version.
+    Returns dict: ``seconds``, ``gaussians``, ``psnr`` (held-out photos, dB), ``psnr_count``,
+    ``memory_bytes``, ``device``, ``device_reason``, ``stages`` (pairs of name and seconds),
+    ``decisions`` (name, choice and setting), ``warnings`` (texts), and ``regions``: for each name
+    ``faces``, ``vertices``, ``closed``, ``coverage``, ``mesh_psnr`` (dB, where the mesh covers the
+    photos), ``uncovered`` (share of the photos) and ``whole_psnr`` (dB, uncovered pixels black).
     """
     if not isinstance(report, dict) or not report:
         return {}
@@ -167,10 +155,7 @@ def _measured(**values: Any) -> dict[str, Any]:
 def report_of(text: str) -> ReportData:
     """Parse the figures stored in a .blend for the panel; any text is accepted.
 
-    Parameters
-    ----------
-    text : str
-        JSON text of :func:`figures_of_report`; parsed once, as panels draw often.
+    ``text``: JSON text of :func:`figures_of_report`; parsed once, as panels draw often.
     """
     try:
         figures = json.loads(text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,8 @@ MAX_MESH_BYTES = 4 * 2**30
 
 
 @dataclass(frozen=True)
-class LevelResult:
-    """One level of detail below a region's mesh."""
+class MeshResult:
+    """A mesh and its textures: of a region, or of a level of detail below it."""
 
     vertices: np.ndarray
     """(v, 3) float64, scene frame, finite."""
@@ -42,37 +42,24 @@ class LevelResult:
     """One for each atlas."""
     normal_map: tuple[Path, ...]
     """The same, or empty."""
-    face_atlas: np.ndarray | None = None
+    occlusion: tuple[Path, ...]
+    """Ambient occlusion: the same, or empty."""
+    face_atlas: np.ndarray | None
     """(f,) uint8 atlas of each face; None if there is one."""
-    occlusion: tuple[Path, ...] = ()
-    """Ambient occlusion, one for each atlas, or empty."""
 
 
 @dataclass(frozen=True)
 class RegionResult:
-    """One region's mesh and texture."""
+    """One region's mesh, its box and its coarser levels."""
 
     name: str
-    vertices: np.ndarray
-    """(v, 3) float64, scene frame, finite."""
-    faces: np.ndarray
-    """(f, 3) int32, indices within range."""
-    corner_uvs: np.ndarray
-    """(f, 3, 2) float32, finite."""
-    albedo: tuple[Path, ...]
-    """One for each atlas."""
+    mesh: MeshResult
     box_vertices: np.ndarray
     """(n, 3) float64, world frame: corners of the region."""
     stamp: str
     """Changes when the mesh file changes."""
-    normal_map: tuple[Path, ...] = ()
-    """One for each atlas, or empty."""
-    face_atlas: np.ndarray | None = None
-    """(f,) uint8 atlas of each face; None if there is one."""
-    levels: tuple[LevelResult, ...] = ()
+    levels: tuple[MeshResult, ...]
     """Levels of detail 1, 2, ..."""
-    occlusion: tuple[Path, ...] = ()
-    """Ambient occlusion, one for each atlas, or empty."""
 
 
 @dataclass(frozen=True)
@@ -87,21 +74,17 @@ class ResultFiles:
     fingerprint: str
     """Hash of ``scene.json``: finds a result again whose folder was moved."""
     regions: tuple[RegionResult, ...]
-    figures: dict[str, Any] = field(default_factory=dict)
+    figures: dict[str, Any]
     """The figures of the report that the panel shows; empty without a report."""
-    placement: Similarity | None = None
+    placement: Similarity | None
     """``blender_from_scene`` if the scene was placed before."""
 
 
 def read_result(folder: Path) -> ResultFiles:
     """Read and check ``DIR/result`` (docs/architecture.md, "Result folder").
 
-    Raises
-    ------
-    DatasetError
-        The folder is not a result folder, contains no region, or holds links.
-    ParseError
-        A file is invalid; names file and position.
+    Raises DatasetError: the folder is not a result folder, contains no region, or holds links;
+    ParseError: a file is invalid; names file and position.
     """
     folder = real_path(folder)
     scene_path = folder / "scene.json"
@@ -124,16 +107,11 @@ def read_result(folder: Path) -> ResultFiles:
         placement = read_placement(placement_path, world_from_scene)
         if placement is None:
             _logger.warning("%s is for other cameras: not used", placement_path)
+    fingerprint = hashlib.sha256(scene_path.read_bytes()).hexdigest()[:16]
     return ResultFiles(
-        folder,
-        cameras,
-        world_from_scene,
-        radius,
-        hashlib.sha256(scene_path.read_bytes()).hexdigest()[:16],
-        regions,
-        figures_of_report(report),
-        placement,
-    )
+        folder, cameras, world_from_scene, radius, fingerprint, regions,
+        figures_of_report(report), placement,
+    )  # fmt: skip
 
 
 def _scene(path: Path) -> tuple[tuple[tuple[Camera, str], ...], Similarity, float]:
@@ -150,17 +128,10 @@ def _scene(path: Path) -> tuple[tuple[tuple[Camera, str], ...], Similarity, floa
             entry = dict(entry)
             photo = str(entry.pop("photo"))
             cameras.append((Camera.from_json(entry), photo))
-        numbers = np.concatenate(
-            [
-                world_from_scene.matrix().ravel(),
-                np.array([radius]),
-                *(
-                    np.array([*c.cam_from_world.ravel(), c.fx, c.fy, c.cx, c.cy, c.width, c.height])
-                    for c, _ in cameras
-                ),
-            ]
-        )
-        if not np.isfinite(numbers).all():
+        numbers = [*world_from_scene.matrix().ravel(), radius]
+        for c, _ in cameras:
+            numbers += [*c.cam_from_world.ravel(), c.fx, c.fy, c.cx, c.cy, c.width, c.height]
+        if not np.isfinite(np.array(numbers, np.float64)).all():
             raise ValueError("a number is not finite")
         if not (world_from_scene.scale > 0.0 and radius > 0.0):
             raise ValueError("the scale or the radius is not positive")
@@ -172,48 +143,34 @@ def _scene(path: Path) -> tuple[tuple[tuple[Camera, str], ...], Similarity, floa
 
 
 def _region(folder: Path) -> RegionResult:
-    path = folder / "mesh.npz"
-    vertices, faces, corner_uvs, face_atlas = read_mesh_arrays(path)
-    state = path.stat()
+    state = (folder / "mesh.npz").stat()
     region_path = folder / "region.json"
     if not region_path.is_file():
         raise DatasetError(f"{folder} holds no region.json.", "Mesh the region again.")
-    albedo, normal_map = _textures(folder, face_atlas)
-    box = read_region_file(region_path).vertices
-    stamp = f"{state.st_size}:{state.st_mtime_ns}"
-    levels: list[LevelResult] = []
+    mesh, box = _mesh(folder), read_region_file(region_path).vertices
+    levels: list[MeshResult] = []
     while (level := folder / f"lod{len(levels) + 1}" / "mesh.npz").is_file():
         if len(levels) == MAX_LODS:
             raise DatasetError(f"{folder} holds too many levels.", "Mesh the region again.")
-        arrays = read_mesh_arrays(level)
-        textures = _textures(level.parent, arrays[3])
-        dark = _occlusion(level.parent, len(textures[0]))
-        levels.append(LevelResult(*arrays[:3], *textures, arrays[3], dark))
-    return RegionResult(
-        folder.name, vertices, faces, corner_uvs, albedo, box, stamp, normal_map, face_atlas,
-        tuple(levels), _occlusion(folder, len(albedo)),
-    )  # fmt: skip
+        levels.append(_mesh(level.parent))
+    stamp = f"{state.st_size}:{state.st_mtime_ns}"
+    return RegionResult(folder.name, mesh, box, stamp, tuple(levels))
 
 
-def _textures(
-    folder: Path, face_atlas: np.ndarray | None
-) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+def _mesh(folder: Path) -> MeshResult:
+    vertices, faces, corner_uvs, face_atlas = read_mesh_arrays(folder / "mesh.npz")
     atlases = range(1 if face_atlas is None else int(face_atlas.max()) + 1)
-    albedo, normal_map = (
+    albedo, normal_map, occlusion = (
         tuple(folder / atlas_file(name, number) for number in atlases)
-        for name in ("albedo", "normal")
+        for name in ("albedo", "normal", "occlusion")
     )
-    # Normal maps exist for all atlases or for none.
-    for path in (*albedo, *(normal_map if normal_map[0].is_file() else ())):
+    # Normal maps exist for all atlases or for none; occlusion counts where it does for all.
+    normal_map = normal_map if normal_map[0].is_file() else ()
+    for path in (*albedo, *normal_map):
         if not path.is_file():
             raise DatasetError(f"{folder} holds no {path.name}.", "Mesh the region again.")
-    return albedo, normal_map if normal_map[0].is_file() else ()
-
-
-def _occlusion(folder: Path, atlases: int) -> tuple[Path, ...]:
-    """Return the occlusion maps if there is one for each atlas; they are optional."""
-    paths = tuple(folder / atlas_file("occlusion", number) for number in range(atlases))
-    return paths if all(path.is_file() for path in paths) else ()
+    occlusion = occlusion if all(path.is_file() for path in occlusion) else ()
+    return MeshResult(vertices, faces, corner_uvs, albedo, normal_map, occlusion, face_atlas)
 
 
 def read_mesh_arrays(
@@ -221,20 +178,9 @@ def read_mesh_arrays(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
     """Read and check ``mesh.npz``.
 
-    Parameters
-    ----------
-    path : Path
-    repair : bool
-        Whether broken faces are left out.
-
-    Returns
-    -------
-    vertices, faces, corner_uvs, face_atlas
-
-    Raises
-    ------
-    ParseError
-        The file is invalid; names the position.
+    ``repair``: whether broken faces are left out.
+    Returns vertices, faces, corner_uvs, face_atlas.
+    Raises ParseError: the file is invalid; names the position.
     """
     hint = "Mesh the region again."
     try:
@@ -277,10 +223,7 @@ def read_mesh_arrays(
 def sound_faces(faces: np.ndarray) -> np.ndarray:
     """Return (f,) bool: three different corners, and no earlier face of the same three.
 
-    Parameters
-    ----------
-    faces : (f, 3) ndarray of int
-        Indices within range.
+    ``faces``: (f, 3) ndarray of int. Indices within range.
     """
     corners = np.sort(faces.astype(np.int64), axis=1)  # (f, 3)
     a, b, c = corners.T

@@ -10,7 +10,7 @@ from bpy.props import EnumProperty, StringProperty
 from ..core.errors import UsageError
 from ..core.files import real_path
 from . import addon, scene_objects
-from .addon import NeedsObjectMode, NeedsResult, OperatorResult, ReportsErrors
+from .addon import NeedsObjectMode, NeedsResult, OperatorResult, needed_frame
 from .mesh_data import mesh_of
 from .report_data import report_of
 from .scene_objects import import_result
@@ -25,15 +25,10 @@ _PICTURES = ("preview.png", "report/held-out-*.jpg", "*/comparison-*.jpg")
 def _result_folder(context: bpy.types.Context) -> Path:
     """Return the result folder of the scene if its files may be opened.
 
-    Raises
-    ------
-    UsageError
-        There is none, or it is known from the open file alone, which may come from elsewhere.
+    Raises UsageError: there is none, or it is known from the open file alone, which may come from
+    elsewhere.
     """
-    frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-    if frame is None:
-        raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
-    folder = addon.result_folder(frame)
+    folder = addon.result_folder(needed_frame(context))
     if not addon.is_trusted(folder.parent):
         raise UsageError(
             f"{folder} has not been used on this computer.",
@@ -51,36 +46,26 @@ def _inside(folder: Path, path: Path) -> bool:
     return path.is_file() and path.resolve().is_relative_to(folder.resolve())
 
 
-class _NeedsResult(ReportsErrors):
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("The scene has no result; wrap it, or import one")
-            return False
-        return True
-
-
-class GWRAP_OT_read_report(_NeedsResult, bpy.types.Operator):
+class GWRAP_OT_read_report(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.read_report"
     bl_label = "Open Report"
     bl_description = "Open report.md: all figures of the job, its warnings and pictures"
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         folder = _result_folder(context)
         path = folder / "report.md"
         if path.is_symlink() or not _inside(folder, path):
             raise UsageError(f"{folder} holds no report.md.", "Run the job again.")
         bpy.ops.wm.path_open(filepath=str(path))
-        return {"FINISHED"}
 
 
-class GWRAP_OT_show_pictures(_NeedsResult, bpy.types.Operator):
+class GWRAP_OT_show_pictures(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.show_pictures"
     bl_label = "Show Pictures"
     bl_description = "Load the report's pictures; they are listed in the Image Editor"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         folder = _result_folder(context)
         paths = [path for pattern in _PICTURES for path in sorted(folder.glob(pattern))]
         paths = [path for path in paths if _inside(folder, path)][:MAX_PICTURES]
@@ -98,30 +83,24 @@ class GWRAP_OT_show_pictures(_NeedsResult, bpy.types.Operator):
                 editor: Any = area.spaces.active
                 editor.image = images[min(1, len(images) - 1)]
         self.report({"INFO"}, f"{len(images)} pictures are loaded; the Image Editor lists them")
-        return {"FINISHED"}
 
 
-class GWRAP_OT_copy_report(_NeedsResult, bpy.types.Operator):
+class GWRAP_OT_copy_report(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.copy_report"
     bl_label = "Copy"
     bl_description = "Copy the figures and warnings shown here, to paste them elsewhere"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not super().poll(context):
-            return False
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-        if not report_of(addon.figures_of(frame)).known:
-            cls.poll_message_set("The result has no report; run the job again")
-            return False
-        return True
+    def why_not(cls, context: bpy.types.Context) -> str:
+        known = report_of(addon.figures_of(addon.current_frame(context))).known
+        unknown = "" if known else "The result has no report; run the job again"
+        return super().why_not(context) or unknown
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+    def work(self, context: bpy.types.Context) -> None:
+        frame = addon.current_frame(context)
         text = report_of(addon.figures_of(frame)).as_text()
         context.window_manager.clipboard = text.replace(str(Path.home()), "~")
         self.report({"INFO"}, "Copied the report to the clipboard")
-        return {"FINISHED"}
 
 
 # -- Operators that import results, open their folder and set their shading -----------------------
@@ -142,7 +121,7 @@ class GWRAP_OT_import_result(NeedsObjectMode, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose a job folder or its result folder.")
         folder = real_path(bpy.path.abspath(self.directory))
@@ -152,26 +131,21 @@ class GWRAP_OT_import_result(NeedsObjectMode, bpy.types.Operator):
         addon.remember(folder.parent)
         faces = sum(len(mesh_of(m).polygons) for m in imported.meshes)
         self.report({"INFO"}, f"{len(imported.meshes)} meshes, {faces} faces")
-        return {"FINISHED"}
 
 
-class GWRAP_OT_open_report(NeedsResult, ReportsErrors, bpy.types.Operator):
+class GWRAP_OT_open_report(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.open_report"
     bl_label = "Open Report Folder"
     bl_description = "Show the folder with report.md, the meshes and the textures"
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-        if frame is None:
-            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
-        folder = addon.result_folder(frame)
+    def work(self, context: bpy.types.Context) -> None:
+        folder = addon.result_folder(needed_frame(context))
         # A folder only: the path comes from the .blend, and opening a file could run it.
         if addon.is_remote(folder) or not (folder.is_dir() and (folder / "scene.json").is_file()):
             raise UsageError(
                 f"{folder} is not a result folder.", "Import the result from where it is now."
             )
         bpy.ops.wm.path_open(filepath=str(folder))
-        return {"FINISHED"}
 
 
 class GWRAP_OT_set_shading(NeedsResult, bpy.types.Operator):
@@ -187,32 +161,12 @@ class GWRAP_OT_set_shading(NeedsResult, bpy.types.Operator):
         )
     )
 
-    def execute(self, context: bpy.types.Context) -> OperatorResult:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
-        for material in materials_of(frame):
+    def work(self, context: bpy.types.Context) -> None:
+        for material in scene_objects.materials_of(addon.current_frame(context)):
             scene_objects.set_shading(material, self.shading)
-        return {"FINISHED"}
-
-
-def materials_of(frame: bpy.types.Object | None) -> list[bpy.types.Material]:
-    """Return our materials on the meshes of a result, coarser and lighter ones included."""
-    children = frame.children if frame is not None else ()
-    found = [
-        material
-        for child in children
-        if addon.kind_of(child) in addon.WITH_TEXTURE
-        for slot in child.material_slots
-        if (material := slot.material) is not None
-        and scene_objects.shading_of(material) is not None
-    ]
-    return list(dict.fromkeys(found))
 
 
 CLASSES: Final = (
-    GWRAP_OT_import_result,
-    GWRAP_OT_open_report,
-    GWRAP_OT_set_shading,
-    GWRAP_OT_read_report,
-    GWRAP_OT_show_pictures,
-    GWRAP_OT_copy_report,
-)
+    GWRAP_OT_import_result, GWRAP_OT_open_report, GWRAP_OT_set_shading, GWRAP_OT_read_report,
+    GWRAP_OT_show_pictures, GWRAP_OT_copy_report,
+)  # fmt: skip

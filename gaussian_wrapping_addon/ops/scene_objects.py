@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from .cameras import create_camera, look_through, scale_display
 from .mesh_data import build_mesh, mesh_of
 from .placement import restore, scale_of
 from .region_objects import create_region
-from .result_files import RegionResult, ResultFiles, read_result
+from .result_files import MeshResult, RegionResult, ResultFiles, read_result
 
 # -- Material of a result: the photo texture, lit or unlit, both exportable to glTF ---------------
 
@@ -51,9 +51,12 @@ def load_texture(path: Path, colorspace: str = "sRGB") -> bpy.types.Image:
 
 
 def create_material(
-    name: str, image: bpy.types.Image, normal_map: bpy.types.Image | None = None
+    name: str,
+    image: bpy.types.Image,
+    normal_map: bpy.types.Image | None = None,
+    occlusion: bpy.types.Image | None = None,
 ) -> bpy.types.Material:
-    """Create a material with both branches, linked as lit; the lit one takes the normal map.
+    """Create a material with both branches, linked as lit; the lit one takes the further maps.
 
     Unlit is the node pattern that the glTF exporter writes as ``KHR_materials_unlit``.
     """
@@ -63,61 +66,54 @@ def create_material(
     tree: Any = material.node_tree
     nodes, links = tree.nodes, tree.links
     nodes.clear()
-    texture = nodes.new("ShaderNodeTexImage")
-    texture.name, texture.image, texture.location = _IMAGE, image, (-600, 200)
-    lit = nodes.new("ShaderNodeBsdfPrincipled")
-    lit.name, lit.location = _LIT, (-200, 400)
+    texture = _new_node(nodes, "TexImage", (-600, 200), _IMAGE)
+    texture.image = image
+    lit = _new_node(nodes, "BsdfPrincipled", (-200, 400), _LIT)
     lit.inputs["Roughness"].default_value = ROUGHNESS
     lit.inputs["Specular IOR Level"].default_value = SPECULAR_LEVEL
     links.new(texture.outputs["Color"], lit.inputs["Base Color"])
-    emission = nodes.new("ShaderNodeEmission")
-    emission.location = (-200, -300)
+    emission = _new_node(nodes, "Emission", (-200, -300))
     links.new(texture.outputs["Color"], emission.inputs["Color"])
-    transparent = nodes.new("ShaderNodeBsdfTransparent")
-    transparent.location = (-200, -450)
-    path = nodes.new("ShaderNodeLightPath")
-    path.location = (-600, -200)
-    unlit = nodes.new("ShaderNodeMixShader")
-    unlit.name, unlit.location = _UNLIT, (50, -300)
+    transparent = _new_node(nodes, "BsdfTransparent", (-200, -450))
+    path = _new_node(nodes, "LightPath", (-600, -200))
+    unlit = _new_node(nodes, "MixShader", (50, -300), _UNLIT)
     links.new(path.outputs["Is Camera Ray"], unlit.inputs[0])
     links.new(transparent.outputs[0], unlit.inputs[1])
     links.new(emission.outputs[0], unlit.inputs[2])
-    output = nodes.new("ShaderNodeOutputMaterial")
-    output.name, output.location = _OUTPUT, (300, 200)
+    output = _new_node(nodes, "OutputMaterial", (300, 200), _OUTPUT)
     links.new(lit.outputs[0], output.inputs["Surface"])
     # Workbench draws the texture of the active image node.
     nodes.active = texture
     set_normal_map(material, normal_map)
+    set_occlusion(material, occlusion)
     return material
 
 
-def create_materials(
-    name: str,
-    albedo: Sequence[Path],
-    normal_map: Sequence[Path],
-    occlusion: Sequence[Path] = (),
-) -> list[bpy.types.Material]:
-    """Create a material for each atlas: ``name``, then ``name 2`` and on.
+def _new_node(nodes: Any, kind: str, location: tuple[int, int], name: str = "") -> Any:
+    node = nodes.new(f"ShaderNode{kind}")
+    node.location = location
+    if name:
+        node.name = name
+    return node
 
-    Parameters
-    ----------
-    albedo, normal_map, occlusion : sequence of Path
-        Images, one for each atlas; the last two may be empty.
-    """
-    normals = load_data_maps(normal_map, len(albedo))
-    dark = load_data_maps(occlusion, len(albedo))
-    materials = []
-    for number, (path, normal) in enumerate(zip(albedo, normals, strict=True), 1):
+
+def _textured_mesh(name: str, made: MeshResult) -> bpy.types.Mesh:
+    """Build a mesh with a material for each atlas: ``name``, then ``name 2`` and on."""
+    mesh = build_mesh(name, made.vertices, made.faces, made.corner_uvs, made.face_atlas)
+    for number, (image, normal_map, dark) in enumerate(_images_of(made), 1):
         called = f"{name} {number}" if number > 1 else name
-        material = create_material(called, load_texture(path), normal)
-        set_occlusion(material, dark[number - 1])
-        materials.append(material)
-    return materials
+        mesh.materials.append(create_material(called, image, normal_map, dark))
+    return mesh
 
 
-def load_data_maps(paths: Sequence[Path], count: int) -> list[bpy.types.Image | None]:
-    """Load maps that are no colours, of ``count`` atlases; each None if there are none."""
-    return [load_texture(path, "Non-Color") for path in paths] or [None] * count
+def _images_of(made: MeshResult) -> list[tuple[bpy.types.Image, Any, Any]]:
+    """Load photo texture, normal map and occlusion of each atlas; the last two may be None."""
+    none = [None] * len(made.albedo)
+    normal_maps, dark = (
+        [load_texture(path, "Non-Color") for path in paths] or none
+        for paths in (made.normal_map, made.occlusion)
+    )
+    return list(zip(map(load_texture, made.albedo), normal_maps, dark, strict=True))
 
 
 def set_normal_map(material: bpy.types.Material, image: bpy.types.Image | None) -> bool:
@@ -138,10 +134,8 @@ def set_normal_map(material: bpy.types.Material, image: bpy.types.Image | None) 
     if texture is None or normal is None:
         set_normal_map(material, None)
         active = nodes.active
-        texture = nodes.new("ShaderNodeTexImage")
-        texture.name, texture.location = _NORMAL_IMAGE, (-900, 500)
-        normal = nodes.new("ShaderNodeNormalMap")
-        normal.name, normal.location = _NORMAL, (-450, 500)
+        texture = _new_node(nodes, "TexImage", (-900, 500), _NORMAL_IMAGE)
+        normal = _new_node(nodes, "NormalMap", (-450, 500), _NORMAL)
         links.new(texture.outputs["Color"], normal.inputs["Color"])
         links.new(normal.outputs["Normal"], nodes[_LIT].inputs["Normal"])
         nodes.active = active  # Workbench draws the active image
@@ -164,27 +158,23 @@ def set_occlusion(material: bpy.types.Material, image: bpy.types.Image | None) -
     if image is None:
         return True
     active = nodes.active
-    texture = nodes.new("ShaderNodeTexImage")
-    texture.name, texture.image, texture.location = _OCCLUSION_IMAGE, image, (-600, 700)
-    red = nodes.new("ShaderNodeSeparateColor")
-    red.name, red.location = _OCCLUSION_RED, (-250, 700)
-    group = nodes.new("ShaderNodeGroup")
-    group.name, group.node_tree, group.location = _OCCLUSION, _gltf_group(), (50, 700)
+    texture = _new_node(nodes, "TexImage", (-600, 700), _OCCLUSION_IMAGE)
+    texture.image = image
+    red = _new_node(nodes, "SeparateColor", (-250, 700), _OCCLUSION_RED)
+    group = _new_node(nodes, "Group", (50, 700), _OCCLUSION)
+    group.node_tree = _gltf_group()
     links.new(texture.outputs["Color"], red.inputs["Color"])
     links.new(red.outputs["Red"], group.inputs["Occlusion"])
     nodes.active = active  # Workbench draws the active image
     return True
 
 
-def _gltf_group() -> bpy.types.NodeTree:
-    group: Any = bpy.data.node_groups.get(_GLTF_GROUP)
-    if group is None:
-        groups: Any = bpy.data.node_groups
-        group = groups.new(_GLTF_GROUP, "ShaderNodeTree")
+def _gltf_group() -> Any:
+    groups: Any = bpy.data.node_groups
+    group = groups.get(_GLTF_GROUP) or groups.new(_GLTF_GROUP, "ShaderNodeTree")
     if "Occlusion" not in group.interface.items_tree:
         group.interface.new_socket("Occlusion", in_out="INPUT", socket_type="NodeSocketFloat")
-    found: bpy.types.NodeTree = group
-    return found
+    return group
 
 
 def set_shading(material: bpy.types.Material, shading: str) -> bool:
@@ -249,22 +239,23 @@ def texture_of(material: bpy.types.Material | None) -> bpy.types.Image | None:
     return None if node is None else node.image
 
 
-def _nodes_of(material: Any) -> Any:
-    return material.node_tree.nodes
-
-
 def images_of(frame: bpy.types.Object | None) -> list[bpy.types.Image]:
     """Return the images in our materials on the meshes of a result, each once."""
-    found = [
-        node.image
-        for child in (frame.children_recursive if frame is not None else ())
-        if addon.kind_of(child) in addon.WITH_TEXTURE
-        for slot in child.material_slots
-        if shading_of(slot.material) is not None
-        for node in _nodes_of(slot.material)
-        if node.bl_idname == "ShaderNodeTexImage" and node.image is not None
-    ]
-    return list(dict.fromkeys(found))
+    materials = _ours_on(frame.children_recursive if frame is not None else ())
+    nodes = (node for material in materials for node in material.node_tree.nodes)
+    images = (node.image for node in nodes if node.bl_idname == "ShaderNodeTexImage")
+    return list(dict.fromkeys(image for image in images if image is not None))
+
+
+def materials_of(frame: bpy.types.Object | None) -> list[bpy.types.Material]:
+    """Return our materials on the meshes of a result, coarser and lighter ones included."""
+    return list(dict.fromkeys(_ours_on(frame.children if frame is not None else ())))
+
+
+def _ours_on(children: Iterable[bpy.types.Object]) -> list[Any]:
+    meshes = [child for child in children if addon.kind_of(child) in addon.WITH_TEXTURE]
+    materials = (slot.material for child in meshes for slot in child.material_slots)
+    return [material for material in materials if shading_of(material) is not None]
 
 
 # -- Levels of detail of a region, in a collection of their own; only the finest is shown ---------
@@ -281,15 +272,9 @@ def update_levels(
     Levels are replaced when the region's mesh has changed: they are made from it. The region's own
     object is level 0; it moves into the levels' collection, unless the user has put it elsewhere.
 
-    Parameters
-    ----------
-    region : RegionResult
-    mesh : Object
-        The region's mesh object, up to date; its parent is that of the levels.
-    levels : list of Object
-        All levels of the result; those of other regions are left alone.
-    collection : Collection
-        The result's collection, parent of that of the levels.
+    ``mesh``: the region's mesh object, up to date; its parent is that of the levels.
+    ``levels``: all levels of the result; those of other regions are left alone.
+    ``collection``: the result's collection, parent of that of the levels.
     """
     old = [t for t in levels if t.get(addon.REGION) == region.name]
     if old and all(c.get(addon.STAMP) == region.stamp for c in old):
@@ -311,10 +296,7 @@ def update_levels(
     made = []
     for number, level in enumerate(region.levels, 1):
         name = f"{region.name} LOD{number}"
-        data = build_mesh(name, level.vertices, level.faces, level.corner_uvs, level.face_atlas)
-        for material in create_materials(name, level.albedo, level.normal_map, level.occlusion):
-            data.materials.append(material)
-        thing = bpy.data.objects.new(name, data)
+        thing = bpy.data.objects.new(name, _textured_mesh(name, level))
         thing.parent = mesh.parent
         thing.matrix_basis = mesh.matrix_basis
         thing[addon.KIND] = "lod"
@@ -371,29 +353,22 @@ def import_result(
     what is missing is added, and everything else, such as the transforms, modifiers and materials
     of the user, stays.
 
-    Parameters
-    ----------
-    folder : Path
-        ``DIR/result`` (docs/architecture.md).
-    scene : Scene
-        Where new objects are linked.
-    files : ResultFiles, optional
-        The content of the folder if it has been read already.
-
-    Raises
-    ------
-    DatasetError, ParseError
-        The folder contains no valid result; nothing has been changed.
-    UsageError
-        A mesh that has changed is in Edit Mode in another scene; nothing has been changed.
+    ``folder``: ``DIR/result`` (docs/architecture.md).
+    ``scene``: where new objects are linked.
+    ``files``: the content of the folder if it has been read already.
+    Raises DatasetError, ParseError: the folder contains no valid result; nothing has been changed;
+    UsageError: a mesh that has changed is in Edit Mode in another scene; nothing has been changed.
     """
     files = files or read_result(folder)
     frame = _find_frame(files, scene)
+    new = frame is None
     if frame is not None:
         _refuse_edited(files, frame)
-    new = frame is None
-    if frame is None:
-        frame = _create_frame(files)
+    else:
+        frame = bpy.data.objects.new(FRAME_NAME, None)
+        frame.empty_display_type = "PLAIN_AXES"
+        frame.empty_display_size = 0.2 * files.radius
+        frame[addon.KIND] = "frame"
     frame[addon.RESULT] = str(files.folder)
     frame[addon.FINGERPRINT] = files.fingerprint
     frame[addon.WORLD_FROM_SCENE] = json.dumps(files.world_from_scene.to_json())
@@ -405,7 +380,12 @@ def import_result(
     meshes, regions = [], []
     for region in files.regions:
         meshes.append(_update_mesh(region, children, frame, collection))
-        regions.append(_update_region(region, files, children, frame, collection))
+        box = _found(children, "region", region.name)
+        if box is None:
+            corners = files.world_from_scene.inverse().points(region.box_vertices)
+            box = create_region(f"{region.name} region", corners, frame, collection)
+            box[addon.REGION] = region.name
+        regions.append(box)
     for thing in (*meshes, *regions):
         if not thing.users_collection:  # the user has deleted the collection, not its objects
             collection.objects.link(thing)
@@ -448,14 +428,6 @@ def _find_frame(files: ResultFiles, scene: bpy.types.Scene) -> bpy.types.Object 
     return moved
 
 
-def _create_frame(files: ResultFiles) -> bpy.types.Object:
-    frame = bpy.data.objects.new(FRAME_NAME, None)
-    frame.empty_display_type = "PLAIN_AXES"
-    frame.empty_display_size = 0.2 * files.radius
-    frame[addon.KIND] = "frame"
-    return frame
-
-
 def _collection_of(
     frame: bpy.types.Object, files: ResultFiles, scene: bpy.types.Scene
 ) -> bpy.types.Collection:
@@ -470,10 +442,9 @@ def _collection_of(
     return collection
 
 
-def _found(
-    children: list[bpy.types.Object], kind: str, key: str, value: str
-) -> bpy.types.Object | None:
-    return next((c for c in children if addon.kind_of(c) == kind and c.get(key) == value), None)
+def _found(children: list[bpy.types.Object], kind: str, region: str) -> bpy.types.Object | None:
+    found = (c for c in children if addon.kind_of(c) == kind and c.get(addon.REGION) == region)
+    return next(found, None)
 
 
 def _update_mesh(
@@ -482,18 +453,11 @@ def _update_mesh(
     frame: bpy.types.Object,
     collection: bpy.types.Collection,
 ) -> bpy.types.Object:
-    thing = _found(children, "mesh", addon.REGION, region.name)
+    thing = _found(children, "mesh", region.name)
     if thing is not None and thing.get(addon.STAMP) == region.stamp:
         return thing
-    mesh = build_mesh(
-        region.name, region.vertices, region.faces, region.corner_uvs, region.face_atlas
-    )
     if thing is None:
-        for material in create_materials(
-            region.name, region.albedo, region.normal_map, region.occlusion
-        ):
-            mesh.materials.append(material)
-        thing = bpy.data.objects.new(region.name, mesh)
+        thing = bpy.data.objects.new(region.name, _textured_mesh(region.name, region.mesh))
         thing.parent = frame
         thing[addon.KIND] = "mesh"
         thing[addon.REGION] = region.name
@@ -501,13 +465,14 @@ def _update_mesh(
     else:
         old = mesh_of(thing)
         if thing.get(addon.BAKE):  # its material shows a bake onto the mesh that is replaced
-            for material in create_materials(
-                region.name, region.albedo, region.normal_map, region.occlusion
-            ):
-                mesh.materials.append(material)
+            mesh = _textured_mesh(region.name, region.mesh)
             for tag in (addon.BAKE, addon.BAKE_NOTE):
                 thing.pop(tag, None)
         else:
+            made = region.mesh
+            mesh = build_mesh(
+                region.name, made.vertices, made.faces, made.corner_uvs, made.face_atlas
+            )
             _keep_materials(list(old.materials), mesh, region)
         thing.data = mesh
         if old.users == 0:
@@ -525,40 +490,21 @@ def _keep_materials(
 
     Slots of atlases that no longer exist stay if they contain a material of the user.
     """
-    images = [load_texture(path) for path in region.albedo]
-    normals = load_data_maps(region.normal_map, len(images))
-    dark = load_data_maps(region.occlusion, len(images))
-    for number, (image, normal_map) in enumerate(zip(images, normals, strict=True)):
+    images = _images_of(region.mesh)
+    for number, (image, normal_map, dark) in enumerate(images):
         if number < len(old):
             kept = old[number]
             mesh.materials.append(kept)
             if kept is not None:
                 set_normal_map(kept, normal_map)
-                set_occlusion(kept, dark[number])
+                set_occlusion(kept, dark)
         else:
-            name = f"{region.name} {number + 1}"
-            material = create_material(name, image, normal_map)
-            set_occlusion(material, dark[number])
+            material = create_material(f"{region.name} {number + 1}", image, normal_map, dark)
             set_shading(material, shading_of(old[0] if old else None) or "LIT")
             mesh.materials.append(material)
     for further in old[len(images) :]:
         if shading_of(further) is None:
             mesh.materials.append(further)
-
-
-def _update_region(
-    region: RegionResult,
-    files: ResultFiles,
-    children: list[bpy.types.Object],
-    frame: bpy.types.Object,
-    collection: bpy.types.Collection,
-) -> bpy.types.Object:
-    thing = _found(children, "region", addon.REGION, region.name)
-    if thing is None:
-        vertices = files.world_from_scene.inverse().points(region.box_vertices)
-        thing = create_region(f"{region.name} region", vertices, frame, collection)
-        thing[addon.REGION] = region.name
-    return thing
 
 
 def cameras_of(collection: bpy.types.Collection) -> bpy.types.Collection | None:
@@ -596,15 +542,9 @@ def _update_cameras(
 def write_blend(result_folder: Path, path: Path) -> None:
     """Write a .blend file of a result; images stay beside it, with relative paths.
 
-    The file that is open in this Blender is closed without saving, so this is for
-    background Blender only.
-
-    Raises
-    ------
-    UsageError
-        Blender has a window, or the file cannot be written.
-    DatasetError, ParseError
-        The folder contains no valid result.
+    The file that is open in this Blender is closed without saving, so this is for background
+    Blender only. Raises UsageError: Blender has a window, or the file cannot be written;
+    DatasetError, ParseError: the folder contains no valid result.
     """
     path = path.resolve()
     start_empty("Writing a .blend file of a result")
@@ -638,21 +578,14 @@ def export_usd(result_folder: Path) -> list[Path]:
     """Write ``<region>/mesh.usdc`` for each region of a result, textures by relative path.
 
     Closes the open file, as :func:`write_blend` does.
-
-    Returns
-    -------
-    paths : list of Path
-        The files written.
     """
     start_empty("Writing USD")
     imported = import_result(result_folder, bpy.context.scene)
     options = {
-        "selected_objects_only": True,
-        "export_materials": True,
-        "relative_paths": True,
+        "selected_objects_only": True, "export_materials": True, "relative_paths": True,
         "export_textures": False,  # before Blender 4.4
         "export_textures_mode": "KEEP",  # since
-    }
+    }  # fmt: skip
     usd_export: Any = bpy.ops.wm.usd_export
     known = usd_export.get_rna_type().properties.keys()
     paths = []

@@ -5,19 +5,18 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import bpy
 
-from ..core.errors import UsageError, WorkerError, WrapError
+from ..core.errors import WorkerError, WrapError
 from ..core.jobs.client import worker_python
 from ..core.jobs.store.job_file import make_job
 from ..core.worker.helper_process import child_command
 from . import addon, background, jobs, worker_setup
-from .addon import OperatorResult, ReportsErrors, properties_of, redraw
+from .addon import ReportsErrors, properties_of, redraw
 from .background import Child, Lane
-from .jobs import ConfirmsFolder, no_job_runs
+from .jobs import ConfirmsFolder, why_busy
 from .panel_settings import choices_key, job_settings, source_of
 from .worker_setup import WorkerChoice
 
@@ -76,10 +75,7 @@ def forget() -> None:
 def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
     """Start an estimate for a scene's photos and settings.
 
-    Raises
-    ------
-    WrapError
-        The source, a choice or the interpreter cannot be used.
+    Raises WrapError: the source, a choice or the interpreter cannot be used.
     """
     job = make_job("wrap", source_of(scene), job_settings(scene, choice.threads, choice.device))
     command = child_command(
@@ -103,18 +99,11 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
 def estimate_of(messages: list[dict[str, Any]], last_words: str = "") -> Estimate:
     """Convert the child's output into lines for the panel.
 
-    Parameters
-    ----------
-    messages : list of dict
-        ``{"line": text}`` for each line and ``{"warning": text}`` for each warning, or
-        ``{"error": text, "hint": text}``.
-    last_words : str
-        The last line of the child's standard error, reported if there is no other output.
-
-    Raises
-    ------
-    WorkerError
-        There is no output.
+    ``messages``: ``{"line": text}`` for each line and ``{"warning": text}`` for each warning, or
+    ``{"error": text, "hint": text}``.
+    ``last_words``: the last line of the child's standard error, reported if there is no other
+    output.
+    Raises WorkerError: there is no output.
     """
     for values in messages:
         if values.get("error"):
@@ -157,28 +146,19 @@ def stop() -> None:
 # -- Operators of the sub-panel "Training": estimate, train more, back to the preset's choices ----
 
 
-def _frame(context: bpy.types.Context) -> bpy.types.Object | None:
-    return addon.current_frame(context.scene, context.view_layer.objects.active)
-
-
 class GWRAP_OT_estimate(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.estimate"
     bl_label = "Estimate"
     bl_description = "Estimate the time, memory and disk space that this training needs"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if not properties_of(context.scene).source:
-            cls.poll_message_set("Choose the folder of the photos first")
-            return False
-        if is_busy():
-            cls.poll_message_set("The estimate is running; it takes seconds")
-            return False
-        return True
+            return "Choose the folder of the photos first"
+        return "The estimate is running; it takes seconds" if is_busy() else ""
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         start(context.scene, worker_setup.worker_choice(context))
-        return {"FINISHED"}
 
 
 class GWRAP_OT_train_more(ConfirmsFolder, bpy.types.Operator):
@@ -189,42 +169,33 @@ class GWRAP_OT_train_more(ConfirmsFolder, bpy.types.Operator):
     )
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if _frame(context) is None:
-            cls.poll_message_set("Needs a finished training: press Wrap Scene first")
-            return False
-        return no_job_runs(cls, context)
+    def why_not(cls, context: bpy.types.Context) -> str:
+        if addon.current_frame(context) is None:
+            return "Needs a finished training: press Wrap Scene first"
+        return why_busy(context)
 
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        frame = _frame(context)
-        return addon.result_folder(frame).parent if frame and frame.get(addon.RESULT) else None
-
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        frame = _frame(context)
-        if frame is None:
-            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
+    def work(self, context: bpy.types.Context) -> None:
+        frame = addon.needed_frame(context)
         jobs.start_more(context.scene, frame, worker_setup.worker_choice(context))
         count = properties_of(context.scene).training.more_iterations
         self.report({"INFO"}, f"Training {count:,} iterations more")
-        return {"FINISHED"}
 
 
-class GWRAP_OT_reset_training(bpy.types.Operator):
+class GWRAP_OT_reset_training(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.reset_training"
     bl_label = "Back to Preset"
     bl_description = "Reset every setting of this panel to that of the preset or to Auto"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return no_job_runs(cls, context)
+    def why_not(cls, context: bpy.types.Context) -> str:
+        return why_busy(context)
 
-    def execute(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         training = properties_of(context.scene).training
         for name in training.bl_rna.properties.keys():  # noqa: SIM118 - no mapping
             if name != "rna_type":
                 training.property_unset(name)
-        return {"FINISHED"}
 
 
 CLASSES: Final = (GWRAP_OT_estimate, GWRAP_OT_train_more, GWRAP_OT_reset_training)

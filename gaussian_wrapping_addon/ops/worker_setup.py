@@ -86,10 +86,10 @@ def is_busy() -> bool:
 
 def as_text() -> str:
     """Return the findings for a bug report, with the home folder masked."""
-    lines = [
+    lines = (
         f"good {f.subject}: {f.finding}" if f.good else f"BAD  {f.subject}: {f.finding} {f.hint}"
         for f in _findings
-    ]
+    )
     return "\n".join(lines).replace(str(Path.home()), "~")
 
 
@@ -123,32 +123,24 @@ class GWRAP_OT_check_worker(ReportsErrors, bpy.types.Operator):
     bl_description = "Check in the background that the worker's Python has all that jobs need"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if is_busy():
-            cls.poll_message_set("The check is running; it takes seconds")
-            return False
-        return True
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        return "The check is running; it takes seconds" if is_busy() else ""
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         start(worker_choice(context).python)
-        return {"FINISHED"}
 
 
-class GWRAP_OT_copy_findings(bpy.types.Operator):
+class GWRAP_OT_copy_findings(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.copy_findings"
     bl_label = "Copy Findings"
     bl_description = "Copy the findings about the worker, to paste them into a bug report"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not findings():
-            cls.poll_message_set("Press Check Worker first")
-            return False
-        return True
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        return "" if findings() else "Press Check Worker first"
 
-    def execute(self, context: bpy.types.Context) -> OperatorResult:
+    def work(self, context: bpy.types.Context) -> None:
         context.window_manager.clipboard = as_text()
-        return {"FINISHED"}
 
 
 # -- State of the worker's environment: readiness, search for Pythons, set-up and removal ---------
@@ -241,19 +233,11 @@ def _keep_search(found: tuple[bool, list[FoundPython]]) -> None:
 
 
 def request_for(
-    python: str,
-    torch: str,
-    wheel_folder: str,
-    extras: Iterable[str] = (),
-    *,
-    adds: bool = False,
+    python: str, torch: str, wheel_folder: str, extras: Iterable[str] = (), *, adds: bool = False
 ) -> SetupRequest:
     """Return the request of a set-up with these choices, or of adding extras to the present one.
 
-    Raises
-    ------
-    UsageError
-        The add-on's list of packages is missing.
+    Raises UsageError: the add-on's list of packages is missing.
     """
     folder = bpy.path.abspath(wheel_folder) if wheel_folder else ""
     root, requirements = str(environment().root), str(requirements_file())
@@ -264,10 +248,7 @@ def request_for(
 def lines_that_add(extra: str, wheel_folder: str) -> list[str]:
     """Return the commands that add an extra to the present environment; starts no process.
 
-    Raises
-    ------
-    UsageError
-        There is no environment to add to.
+    Raises UsageError: there is no environment to add to.
     """
     path = str(environment().marker().get("python", ""))
     unknown = FoundPython(path, (*OLDEST, 0))
@@ -277,13 +258,7 @@ def lines_that_add(extra: str, wheel_folder: str) -> list[str]:
 
 
 def start_setup(request: SetupRequest, *, removes: bool = False) -> None:
-    """Start a set-up or a removal.
-
-    Raises
-    ------
-    UsageError
-        One is running.
-    """
+    """Start a set-up or a removal. Raises UsageError: one is running."""
     if state.task is not None and state.task.status.active:
         raise UsageError("A set-up is running.", "Cancel it or wait for it.")
     state.task, state.is_busy = SetupTask(request, removes=removes), True
@@ -369,14 +344,11 @@ def _reads(extra: Extra) -> str:
 
 
 def command_lines(
-    context: bpy.types.Context, path: str, torch: str, extras: Iterable[str] = ()
+    context: bpy.types.Context, path: str, torch: str, extras: Iterable[str]
 ) -> list[str]:
     """Return the commands that a set-up with these choices runs.
 
-    Raises
-    ------
-    UsageError
-        The Python or the choice cannot be used.
+    Raises UsageError: the Python or the choice cannot be used.
     """
     request = request_for(path, torch, wheel_folder(context), extras)
     found = [p for p in state.pythons or () if p.path == path]
@@ -429,15 +401,14 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
     )  # fmt: skip
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         reason = _why_not_now(context)
         if not reason and state.pythons is None:
             search_pythons()
-            reason = "Searching for Python installations"
-        elif not reason and not state.pythons:
-            reason = "No Python 3.11 or newer was found: install one from python.org"
-        cls.poll_message_set(reason)
-        return not reason
+            return "Searching for Python installations"
+        if not reason and not state.pythons:
+            return "No Python 3.11 or newer was found: install one from python.org"
+        return reason
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         known = {extra.name for extra in EXTRAS}
@@ -456,19 +427,15 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
         _draw_commands(layout, lines)
         if self.torch == CUDA:
             layout.label(text=tr(CUDA_BRINGS), icon="MEMORY", translate=False)
-        text = (
-            tr("About 2 GiB on the disk; several minutes. Blender stays usable meanwhile")
-            if self.torch == "cpu"
-            else tr("Up to 10 GiB on the disk; many minutes. Blender stays usable meanwhile")
-        )
-        layout.label(text=text, icon="INFO", translate=False)
+        text = "Up to 10 GiB on the disk; many minutes. Blender stays usable meanwhile"
+        if self.torch == "cpu":
+            text = "About 2 GiB on the disk; several minutes. Blender stays usable meanwhile"
+        layout.label(text=tr(text), icon="INFO", translate=False)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        found = state.pythons or []
-        python = self.python or found[0].path
-        request = request_for(python, self.torch or "cpu", wheel_folder(context), self.extras)
-        start_setup(request)
-        return {"FINISHED"}
+    def work(self, context: bpy.types.Context) -> None:
+        python = self.python or (state.pythons or [])[0].path
+        folder = wheel_folder(context)
+        start_setup(request_for(python, self.torch or "cpu", folder, self.extras))
 
 
 class GWRAP_OT_add_extra(ReportsErrors, bpy.types.Operator):
@@ -482,12 +449,9 @@ class GWRAP_OT_add_extra(ReportsErrors, bpy.types.Operator):
     extra: EnumProperty(name="Package", items=_extra_items())  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         reason = _why_not_now(context)
-        if not reason and not environment().is_ready():
-            reason = "Set up the worker first"
-        cls.poll_message_set(reason)
-        return not reason
+        return "Set up the worker first" if not reason and not environment().is_ready() else reason
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_props_dialog(self, width=_DIALOG_PX)
@@ -501,10 +465,8 @@ class GWRAP_OT_add_extra(ReportsErrors, bpy.types.Operator):
             lines = [str(error)]
         _draw_commands(layout, lines)
 
-    def work(self, context: bpy.types.Context) -> OperatorResult:
-        request = request_for("", "cpu", wheel_folder(context), (self.extra,), adds=True)
-        start_setup(request)
-        return {"FINISHED"}
+    def work(self, context: bpy.types.Context) -> None:
+        start_setup(request_for("", "cpu", wheel_folder(context), (self.extra,), adds=True))
 
 
 class GWRAP_OT_copy_setup_commands(bpy.types.Operator):
@@ -525,36 +487,31 @@ class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
     bl_description = "Delete the worker's environment that this add-on has made, and nothing else"
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        reason = "" if environment().is_ours() else "No worker has been set up here"
-        reason = "A set-up is running; cancel it or wait for it" if state.is_busy else reason
-        cls.poll_message_set(reason)
-        return not reason
+    def why_not(cls, _context: bpy.types.Context) -> str:
+        if state.is_busy:
+            return "A set-up is running; cancel it or wait for it"
+        return "" if environment().is_ours() else "No worker has been set up here"
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_confirm(self, event)
 
-    def work(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         start_setup(request_for("", "cpu", ""), removes=True)
-        return {"FINISHED"}
 
 
-class GWRAP_OT_cancel_setup(bpy.types.Operator):
+class GWRAP_OT_cancel_setup(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.cancel_setup"
     bl_label = "Cancel"
     bl_description = "Stop the set-up and delete its unfinished environment"
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        reason = "" if state.is_busy else "No set-up is running"
+    def why_not(cls, _context: bpy.types.Context) -> str:
         if state.is_busy and state.task is not None and state.task.is_cancelling:
-            reason = "The set-up is being cancelled"
-        cls.poll_message_set(reason)
-        return not reason
+            return "The set-up is being cancelled"
+        return "" if state.is_busy else "No set-up is running"
 
-    def execute(self, _context: bpy.types.Context) -> OperatorResult:
+    def work(self, _context: bpy.types.Context) -> None:
         cancel()
-        return {"FINISHED"}
 
 
 class GWRAP_OT_open_preferences(bpy.types.Operator):
@@ -572,12 +529,7 @@ class GWRAP_OT_open_preferences(bpy.types.Operator):
 
 
 CLASSES: Final = (
-    GWRAP_OT_set_up_worker,
-    GWRAP_OT_add_extra,
-    GWRAP_OT_copy_setup_commands,
-    GWRAP_OT_remove_worker,
-    GWRAP_OT_cancel_setup,
-    GWRAP_OT_open_preferences,
-    GWRAP_OT_check_worker,
+    GWRAP_OT_set_up_worker, GWRAP_OT_add_extra, GWRAP_OT_copy_setup_commands,
+    GWRAP_OT_remove_worker, GWRAP_OT_cancel_setup, GWRAP_OT_open_preferences, GWRAP_OT_check_worker,
     GWRAP_OT_copy_findings,
-)
+)  # fmt: skip

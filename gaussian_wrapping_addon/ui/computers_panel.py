@@ -7,15 +7,15 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ..core.jobs.parts.states import PartBoard
-from ..ops import computers, job_timer
+from ..ops import computers
 from ..ops.addon import properties_of, tr
-from ..ops.computers import Look, shown_folder
+from ..ops.job_timer import key_of
 from .panel_base import (
     Readiness,
     TabPanel,
     characters_of,
+    column_of_choices,
     draw_settings,
-    plain,
     settings_in,
     table,
     wrapped_label,
@@ -34,9 +34,7 @@ class GWRAP_PG_computers(bpy.types.PropertyGroup):
     """Which computers run the jobs of a scene."""
 
     kind: EnumProperty(  # type: ignore[valid-type]
-        name="Computers",
-        description="Computers that run the jobs of this scene",
-        items=_KINDS,
+        name="Computers", description="Computers that run the jobs of this scene", items=_KINDS
     )
     dask_address: StringProperty(  # type: ignore[valid-type]
         name="Scheduler",
@@ -78,20 +76,18 @@ class GWRAP_PT_computers(TabPanel, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - Blender's convention
 
     def readiness(self, context: bpy.types.Context) -> Readiness:
-        look = computers.look_at(shown_folder(context.scene))
-        if look is not None and look.board.counts:
-            done, _, failed, _ = look.board.totals
-            total = sum(look.board.totals)
+        board = computers.look_at(key_of(properties_of(context.scene).job_folder))
+        if board is not None and board.counts:
+            done, _, failed, _ = board.totals
+            total = sum(board.totals)
             icon = "ERROR" if failed else "CHECKMARK" if done == total else "SORTTIME"
             return Readiness(tr("{done} of {total}", done=done, total=total), icon)
         return Readiness(_KIND_NAMES[properties_of(context.scene).computers.kind])
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, properties = self.layout, properties_of(context.scene)
-        plain(layout)
         choices = properties.computers
-        column = layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column = column_of_choices(layout, properties)
         row = column.row()
         row.use_property_split = False  # the names need the whole width
         row.prop(choices, "kind", expand=True)
@@ -105,16 +101,20 @@ class GWRAP_PT_computers(TabPanel, bpy.types.Panel):
         self._parts(layout, context)
 
     def _parts(self, layout: Any, context: bpy.types.Context) -> None:
-        folder = shown_folder(context.scene)
-        look = computers.look_at(folder)
-        if look is None:
+        board = computers.look_at(key_of(properties_of(context.scene).job_folder))
+        if board is None:
             return
         characters = characters_of(context)
-        if look.board.problem:
-            wrapped_label(layout, look.board.problem, characters, icon="ERROR")
+        if board.problem:
+            wrapped_label(layout, board.problem, characters, icon="ERROR")
         else:
-            table(layout.box(), part_rows(look.board))
-        _draw_failed(layout, context, look)
+            table(layout.box(), part_rows(board))
+        for part in board.failed[:_MAX_FAILED]:
+            box = layout.box()
+            place = f" · {part.place[:_MAX_NAME]}" if part.place else ""
+            wrapped_label(box, part.name[:_MAX_NAME] + place, characters - 4, icon="ERROR")
+            if part.error:
+                wrapped_label(box, part.error, characters - 4, icon="BLANK1")
         row = layout.row(align=True)
         row.operator("gwrap.resume_job", text="Retry", icon="FILE_REFRESH")
         row.operator("gwrap.cancel_job", icon="X")
@@ -144,19 +144,6 @@ def _draw_outcome(layout: Any, context: bpy.types.Context, about: str) -> None:
         icon = "BLANK1"
     for is_good, line in outcome.rows:
         wrapped_label(layout, line, characters, icon=_ICONS[is_good])
-
-
-def _draw_failed(layout: Any, context: bpy.types.Context, look: Look) -> None:
-    """Draw failed parts with their computer and last error."""
-    characters = characters_of(context)
-    for part in look.board.failed[:_MAX_FAILED]:
-        box = layout.box()
-        head = part.name[:_MAX_NAME]
-        if part.place:
-            head = f"{head} · {part.place[:_MAX_NAME]}"
-        wrapped_label(box, head, characters - 4, icon="ERROR")
-        if part.error:
-            wrapped_label(box, part.error, characters - 4, icon="BLANK1")
 
 
 CLASSES: Final = (GWRAP_PT_computers,)

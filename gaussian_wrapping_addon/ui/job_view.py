@@ -54,12 +54,9 @@ Row = tuple[str, str]
 def live_rows(status: JobStatus) -> tuple[Row, ...]:
     """Return the rows that the panel shows of a running training; none in other stages.
 
-    Parameters
-    ----------
-    status : JobStatus
-        With ``figures``: ``iteration``, ``iterations`` (of the whole plan), ``gaussians``,
-        ``held_out_psnr`` (dB), ``psnr`` (dB, of the photos being trained),
-        ``iterations_per_s``. What is missing has no row.
+    ``status``: with ``figures``: ``iteration``, ``iterations`` (of the whole plan), ``gaussians``,
+    ``held_out_psnr`` (dB), ``psnr`` (dB, of the photos being trained), ``iterations_per_s``. What
+    is missing has no row.
     """
     figures = part({"live": status.figures}, "live")
     if not status.active or measured(figures.get("iteration")) is None:
@@ -243,8 +240,6 @@ def _draw_status(layout: Any) -> None:
 # mode) Blender never calls it.
 
 
-SHADERS: Final = ("POINT_FLAT_COLOR", "FLAT_COLOR")
-"""Blender 4.5 and later have a shader of their own for points."""
 SIZE_PX: Final = 2.5
 
 
@@ -286,21 +281,15 @@ def _make_batch(points: LivePoints) -> None:
     from gpu_extras.batch import batch_for_shader
 
     if _drawing.shader is None:
-        _drawing.shader = _point_shader()
+        import gpu
+
+        try:
+            _drawing.shader = gpu.shader.from_builtin("POINT_FLAT_COLOR")
+        except ValueError:  # before Blender 4.5, which has a shader of its own for points
+            _drawing.shader = gpu.shader.from_builtin("FLAT_COLOR")
     values = {"pos": points.positions, "color": points.colors}
     _drawing.batch = batch_for_shader(_drawing.shader, "POINTS", values)
     _drawing.stamp = points.stamp
-
-
-def _point_shader() -> Any:
-    import gpu
-
-    for name in SHADERS[:-1]:
-        try:
-            return gpu.shader.from_builtin(name)
-        except ValueError:  # an older Blender
-            continue
-    return gpu.shader.from_builtin(SHADERS[-1])
 
 
 def _forget() -> None:

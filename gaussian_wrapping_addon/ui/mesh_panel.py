@@ -6,21 +6,21 @@ from typing import Final
 import bpy
 from bpy.props import EnumProperty, IntProperty, PointerProperty
 
-from ..ops import addon, job_timer
+from ..ops import addon
 from ..ops.addon import properties_of, tr
 from ..ops.bake_objects import MAX_TRIANGLES
 from ..ops.baking import bake_target
 from ..ops.jobs import selected_regions
 from .job_view import draw_job, job_readiness
 from .panel_base import (
-    CATEGORY,
+    InTab,
     Readiness,
     TabPanel,
     button,
     characters_of,
+    column_of_choices,
     count_of_regions,
     draw_settings,
-    plain,
     settings_in,
     wrapped_label,
 )
@@ -36,16 +36,11 @@ _UVS: Final = (
 _FACES: Final = (
     ("KEEP", "As They Are", "Bake onto the selected mesh itself"),
     ("DECIMATE", "Decimate", "Make a lighter mesh of triangles; its lost detail is a normal map"),
-    (
-        "QUADS",
-        "Quads",
-        (
-            "Make a new mesh of quads with QuadriFlow; the detail of this one is a normal map. "
-            "Blender waits for QuadriFlow, for seconds or a few minutes; meshes of more than "
-            f"{MAX_TRIANGLES:,} triangles are decimated for it"
-        ),
-    ),
-)
+    ("QUADS", "Quads",
+     ("Make a new mesh of quads with QuadriFlow; the detail of this one is a normal map. "
+      "Blender waits for QuadriFlow, for seconds or a few minutes; meshes of more than "
+      f"{MAX_TRIANGLES:,} triangles are decimated for it")),
+)  # fmt: skip
 
 
 class GWRAP_PG_bake(bpy.types.PropertyGroup):
@@ -56,23 +51,13 @@ class GWRAP_PG_bake(bpy.types.PropertyGroup):
         name="Faces", description="Which faces the photos are baked onto", items=_FACES
     )
     faces: IntProperty(  # type: ignore[valid-type]
-        name="Target",
-        description="Faces of the lighter mesh",
-        default=5000,
-        min=4,
-        soft_min=100,
-        soft_max=100_000,
-        max=100_000_000,
-    )
+        name="Target", description="Faces of the lighter mesh", default=5000,
+        min=4, soft_min=100, soft_max=100_000, max=100_000_000,
+    )  # fmt: skip
     quads: IntProperty(  # type: ignore[valid-type]
-        name="Target",
-        description="Quads of the new mesh; QuadriFlow makes up to a quarter fewer",
-        default=5000,
-        min=4,
-        soft_min=100,
-        soft_max=50_000,
-        max=100_000,
-    )
+        name="Target", description="Quads of the new mesh; QuadriFlow makes up to a quarter fewer",
+        default=5000, min=4, soft_min=100, soft_max=50_000, max=100_000,
+    )  # fmt: skip
     dense: PointerProperty(  # type: ignore[valid-type]
         name="Detail From",
         description="Dense mesh at the same place, whose detail is baked into a normal map",
@@ -93,7 +78,7 @@ class GWRAP_PT_mesh(TabPanel, bpy.types.Panel):
         job = job_readiness(context, "MESH")
         if job is not None:
             return job
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
+        if addon.current_frame(context) is None:
             return Readiness("Needs a training")
         count = len(selected_regions(context))
         if not count:
@@ -102,16 +87,14 @@ class GWRAP_PT_mesh(TabPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, properties = self.layout, properties_of(context.scene)
-        plain(layout)
         selected = selected_regions(context)
-        column = layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column = column_of_choices(layout, properties)
         column.prop(properties, "resolution")
         draw_settings(column, properties, settings_in("mesh"))
         if draw_job(layout, context, "MESH"):
             return
         characters = characters_of(context)
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
+        if addon.current_frame(context) is None:
             wrapped_label(layout, "Needs a finished training.", characters, icon="INFO")
         elif selected:
             names = ", ".join(region.name for region in selected)
@@ -125,19 +108,14 @@ class GWRAP_PT_mesh(TabPanel, bpy.types.Panel):
         button(layout, context, "gwrap.mesh_region", text=text, icon="MESH_DATA")
 
 
-class GWRAP_PT_mesh_advanced(bpy.types.Panel):
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = CATEGORY
+class GWRAP_PT_mesh_advanced(InTab, bpy.types.Panel):
     bl_parent_id = "GWRAP_PT_mesh"
     bl_label = "Advanced"
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - Blender's convention
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, properties = self.layout, properties_of(context.scene)
-        plain(layout)
-        column = layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        properties = properties_of(context.scene)
+        column = column_of_choices(self.layout, properties)
         column.prop(properties, "decimate")
         draw_settings(column, properties, settings_in("mesh_advanced"))
 
@@ -158,9 +136,7 @@ class GWRAP_PT_texture(TabPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, properties = self.layout, properties_of(context.scene)
-        plain(layout)
-        column = layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column = column_of_choices(layout, properties)
         draw_settings(column, properties, settings_in("texture"))
         text = "Applies to the next Wrap Scene, Mesh Region or Bake Photos."
         wrapped_label(layout, text, characters_of(context), icon="INFO")
@@ -177,18 +153,16 @@ class GWRAP_PT_bake(TabPanel, bpy.types.Panel):
         job = job_readiness(context, "BAKE")
         if job is not None:
             return job
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
+        if addon.current_frame(context) is None:
             return Readiness("Needs a result")
         thing = bake_target(context)
-        return (
-            Readiness("No mesh selected") if thing is None else Readiness(thing.name, "MESH_DATA")
-        )
+        if thing is None:
+            return Readiness("No mesh selected")
+        return Readiness(thing.name, "MESH_DATA")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, properties = self.layout, properties_of(context.scene)
-        plain(layout)
-        column = layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column = column_of_choices(layout, properties)
         bake = properties.bake
         column.prop(bake, "retopology")
         if bake.retopology == "KEEP":
@@ -200,7 +174,7 @@ class GWRAP_PT_bake(TabPanel, bpy.types.Panel):
             return
         characters = characters_of(context)
         thing = bake_target(context)
-        if addon.current_frame(context.scene, context.view_layer.objects.active) is None:
+        if addon.current_frame(context) is None:
             wrapped_label(layout, "Needs a finished job.", characters, icon="INFO")
         elif thing is None:
             text = "Select a mesh: edited, retopologised, or of your own."
@@ -214,9 +188,4 @@ class GWRAP_PT_bake(TabPanel, bpy.types.Panel):
         wrapped_label(layout, text, characters, icon="INFO")
 
 
-CLASSES: Final = (
-    GWRAP_PT_mesh,
-    GWRAP_PT_mesh_advanced,
-    GWRAP_PT_texture,
-    GWRAP_PT_bake,
-)
+CLASSES: Final = (GWRAP_PT_mesh, GWRAP_PT_mesh_advanced, GWRAP_PT_texture, GWRAP_PT_bake)

@@ -17,9 +17,9 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 from ..core.evaluation.report.figures import duration
 from ..core.settings import Declaration, JobSettings, declarations
 from ..core.settings.declaration import Owner, PanelName, Range
-from ..ops import panel_settings
+from ..ops import job_timer
 from ..ops.addon import tr
-from ..ops.panel_settings import is_shown
+from ..ops.panel_settings import is_shown, owner_of, primary_of
 
 # -- Text for narrow panels: wrapped lines, spans of time, counts ---------------------------------
 
@@ -57,7 +57,7 @@ def wrapped(text: str, characters: int) -> list[str]:
         return textwrap.wrap(text, characters) or [""]
     lines, width = [""], 0
     for piece in _pieces(text, characters):
-        wide = sum(2 if _is_wide(character) else 1 for character in piece)
+        wide = sum(1 + _is_wide(character) for character in piece)
         if lines[-1] and width + wide > characters and piece not in _NEVER_FIRST:
             lines.append("")
             width = 0
@@ -84,16 +84,11 @@ def _is_wide(character: str) -> bool:
     return unicodedata.east_asian_width(character) in "WF"
 
 
-def time_span(seconds: float) -> str:
-    """Return a time span in words."""
-    return duration(seconds)
-
-
 def progress_text(stage: str, fraction: float, seconds_left: float | None) -> str:
     """Return the line on the progress bar: stage, percent, time left."""
     parts = [tr(stage.capitalize() or "Starting"), f"{100 * fraction:.0f} %"]
     if seconds_left is not None:
-        parts.append(tr("{time} left", time=time_span(seconds_left)))
+        parts.append(tr("{time} left", time=duration(seconds_left)))
     return " · ".join(parts)
 
 
@@ -125,12 +120,16 @@ class Readiness:
     """``"NONE"`` dims the text: nothing is there yet."""
 
 
-class TabPanel(_Panel):
-    """Mixin: a panel of our tab; :meth:`readiness` is drawn in its header."""
+class InTab(_Panel):
+    """Mixin: a panel of our tab."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = CATEGORY
+
+
+class TabPanel(InTab):
+    """Mixin: a panel of our tab; :meth:`readiness` is drawn in its header."""
 
     def readiness(self, context: bpy.types.Context) -> Readiness:
         """Return the progress of the panel's part, from memory alone."""
@@ -145,16 +144,24 @@ class TabPanel(_Panel):
         row.separator(factor=0.25)
 
 
-def plain(layout: Any) -> None:
-    """Set the layout: names at the left, values at the right, no animation dots."""
+def plain(layout: Any) -> Any:
+    """Set the layout: names at the left, values at the right, no animation dots; return it."""
     layout.use_property_split = True
     layout.use_property_decorate = False
+    return layout
+
+
+def column_of_choices(layout: Any, properties: Any) -> Any:
+    """Return a new column of a plain layout, dimmed while the scene's job runs."""
+    column = plain(layout).column()
+    column.enabled = not job_timer.is_running(properties.job_folder)
+    return column
 
 
 def button(layout: Any, context: bpy.types.Context, operator: str, **keywords: Any) -> Any:
     """Draw an operator, large if it is the next step; return its properties."""
     row = layout.row()
-    if panel_settings.primary_of(context) == operator:
+    if primary_of(context) == operator:
         row.scale_y = LARGE
     return row.operator(operator, **keywords)
 
@@ -180,10 +187,7 @@ _Group = TypeVar("_Group", bound=type)
 def property_of(declared: Declaration, **changes: Any) -> Any:
     """Return the property of a setting, for a class's annotations.
 
-    Parameters
-    ----------
-    changes : dict
-        Keywords of Blender's property that differ from the declaration.
+    ``changes``: keywords of Blender's property that differ from the declaration.
     """
     panel = declared.panel
     assert panel is not None
@@ -214,11 +218,9 @@ def _limits(declared: Declaration) -> dict[str, Any]:
         if low is None:
             low = 0 if panel.preset_if_zero else check.lowest
     numbers = {
-        "min": low,
-        "max": high if math.isfinite(high) else None,
-        "soft_min": panel.soft_low,
-        "soft_max": panel.soft_high,
-    }
+        "min": low, "max": high if math.isfinite(high) else None,
+        "soft_min": panel.soft_low, "soft_max": panel.soft_high,
+    }  # fmt: skip
     limits = {name: declared.kind(value) for name, value in numbers.items() if value is not None}
     shown = {"step": panel.step, "precision": panel.precision}
     return limits | {name: value for name, value in shown.items() if value is not None}
@@ -247,21 +249,17 @@ def settings_in(panel_name: PanelName) -> list[Declaration]:
 def draw_settings(layout: Any, properties: Any, settings: Iterable[Declaration]) -> None:
     """Draw a row for each setting that applies to the current choices.
 
-    Parameters
-    ----------
-    properties : bpy.types.PropertyGroup
-        ``Scene.gwrap``.
+    ``properties``: ``Scene.gwrap``.
     """
     for declared in settings:
         panel = declared.panel
         if panel is None or not is_shown(declared, properties):
             continue
-        owner = properties.training if declared.property_owner == "training" else properties
         target = layout.row() if panel.expand else layout
         keywords: dict[str, Any] = {"text": panel.drawn_label} if panel.drawn_label else {}
         if panel.expand:
             keywords["expand"] = True
-        target.prop(owner, declared.property_name, **keywords)
+        target.prop(owner_of(declared, properties), declared.property_name, **keywords)
 
 
 # -- Draw handlers of the 3D views: added once, taken away whole, and no error at every redraw ----
@@ -273,14 +271,9 @@ _logger = logging.getLogger(__name__)
 class ViewDrawing:
     """What draws into each 3D view with shown overlays.
 
-    Parameters
-    ----------
-    what : str
-        What is drawn, for the log.
-    draw : callable
-        Draws into the view of a context.
-    forget : callable
-        Gives up shaders and batches; they are made again next time.
+    ``what``: what is drawn, for the log.
+    ``draw``: draws into the view of a context.
+    ``forget``: gives up shaders and batches; they are made again next time.
     """
 
     def __init__(

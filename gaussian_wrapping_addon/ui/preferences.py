@@ -7,7 +7,7 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ..core.settings import declared
-from .panel_base import property_of
+from .panel_base import plain, property_of
 from .worker_setup_view import draw_doctor, draw_setup
 
 
@@ -35,20 +35,15 @@ class GWRAP_preferences(bpy.types.AddonPreferences):
     keep_running: BoolProperty(  # type: ignore[valid-type]
         name="Keep Jobs Running After Blender Closes",
         description="Jobs continue after Blender closes; opening the file again finds them",
-        default=False,
     )
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = plain(self.layout)
         box = layout.box()
         draw_setup(box, context)
         box.prop(self, "wheel_folder")
-        layout.prop(self, "worker_python")
-        layout.prop(self, "threads")
-        layout.prop(self, "device")
-        layout.prop(self, "keep_running")
+        for name in ("worker_python", "threads", "device", "keep_running"):
+            layout.prop(self, name)
         draw_doctor(layout, context)
 
 

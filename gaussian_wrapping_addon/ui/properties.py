@@ -65,7 +65,6 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     decimate: BoolProperty(  # type: ignore[valid-type]
         name="Limit Faces",
         description="Decimate the mesh; it stays closed and keeps its parts and holes",
-        default=False,
     )
     show_points: BoolProperty(  # type: ignore[valid-type]
         name="Points in 3D View",
@@ -75,8 +74,7 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     training: PointerProperty(type=GWRAP_PG_training)  # type: ignore[valid-type]
     job_folder: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     job_command: EnumProperty(  # type: ignore[valid-type]
-        items=(("WRAP", "Wrap", ""), ("MESH", "Mesh", ""), ("BAKE", "Bake", "")),
-        options={"HIDDEN"},
+        items=(("WRAP", "Wrap", ""), ("MESH", "Mesh", ""), ("BAKE", "Bake", "")), options={"HIDDEN"}
     )
     bake: PointerProperty(type=GWRAP_PG_bake)  # type: ignore[valid-type]
     computers: PointerProperty(type=GWRAP_PG_computers)  # type: ignore[valid-type]

@@ -15,14 +15,10 @@ from ..core.settings import declared
 from ..ops import addon, meshing, region_operators
 from ..ops.addon import properties_of, redraw, tr
 from ..ops.region_objects import (
-    as_columns,
     cage_frame,
     cage_matrix,
-    from_columns,
     is_editable_box,
-    is_moved_only,
     local_hull,
-    same_place,
     set_cage_matrix,
     steadied,
 )
@@ -34,6 +30,7 @@ from .panel_base import (
     ViewDrawing,
     characters_of,
     count_of_regions,
+    plain,
     property_of,
     wrapped_label,
 )
@@ -45,12 +42,10 @@ class GWRAP_PG_region(bpy.types.PropertyGroup):
     checked: BoolProperty(  # type: ignore[valid-type]
         name="Mesh Together",
         description="Mesh and estimate this region together with the other checked ones",
-        default=False,
     )
     own_edge_length: BoolProperty(  # type: ignore[valid-type]
         name="Own Edge Length",
         description="Mesh this region with its own edge length, not that of the Mesh panel",
-        default=False,
     )
     edge_length: property_of(  # type: ignore[valid-type]
         declared("meshing.edge_length"),
@@ -98,12 +93,13 @@ class GWRAP_PT_region(TabPanel, bpy.types.Panel):
         checked = [region for region in regions if properties_of(region).checked]
         if checked:
             row = layout.row(align=True)
-            text = tr("Estimate {count} Checked", count=len(checked))
-            estimate: Any = row.operator("gwrap.estimate_regions", text=text, icon="TIME")
-            estimate.checked = True
-            text = tr("Mesh {count} Checked", count=len(checked))
-            mesh: Any = row.operator("gwrap.mesh_region", text=text, icon="MESH_DATA")
-            mesh.checked = True
+            for operator, text, icon in (
+                ("gwrap.estimate_regions", "Estimate {count} Checked", "TIME"),
+                ("gwrap.mesh_region", "Mesh {count} Checked", "MESH_DATA"),
+            ):
+                text = tr(text, count=len(checked))
+                button: Any = row.operator(operator, text=text, icon=icon)
+                button.checked = True
         draw_masks(layout, characters_of(context))
         if active is not None and active.type == "MESH" and not addon.kind_of(active):
             layout.operator("gwrap.use_as_region", icon="MESH_ICOSPHERE")
@@ -129,9 +125,7 @@ def _draw_row(layout: Any, region: bpy.types.Object) -> None:
 
 def _draw_active(layout: Any, context: bpy.types.Context, region: bpy.types.Object) -> None:
     box = layout.box()
-    column = box.column()
-    column.use_property_split = True
-    column.use_property_decorate = False
+    column = plain(box.column())
     column.prop(region, "name")
     scene = context.scene
     own = properties_of(region)
@@ -212,13 +206,6 @@ def visible_regions(
     return sorted(found, key=lambda thing: (thing == view_layer.objects.active, thing.select_get()))
 
 
-def colour_of(thing: bpy.types.Object, active: bpy.types.Object | None) -> tuple[float, ...]:
-    """Return the colour of a region's edges."""
-    if not thing.select_get():
-        return PLAIN
-    return ACTIVE if thing == active else SELECTED
-
-
 def edges_of(thing: bpy.types.Object) -> np.ndarray | None:
     """Return the (n, 2, 3) float32 edges of a region's hull in its own coordinates, or None."""
     try:
@@ -249,8 +236,10 @@ def _draw(context: bpy.types.Context) -> None:
             batch = _batch(thing)
             if batch is None:
                 continue
-            colour = colour_of(thing, active)
-            width = ACTIVE_WIDTH_PX if thing == active and thing.select_get() else WIDTH_PX
+            colour, width = PLAIN, WIDTH_PX
+            if thing.select_get():
+                is_active = thing == active
+                colour, width = (ACTIVE, ACTIVE_WIDTH_PX) if is_active else (SELECTED, WIDTH_PX)
             shader.uniform_float("lineWidth", width * scale)
             with gpu.matrix.push_pop():
                 gpu.matrix.multiply_matrix(thing.matrix_world)
@@ -325,22 +314,23 @@ def _shifted(cage: np.ndarray, by: np.ndarray) -> np.ndarray:
 
 
 def get_cage() -> list[float]:
-    """Return the cage of the active box; Blender asks whenever it draws."""
+    """Return the cage of the active box, by columns; Blender asks whenever it draws."""
     box = _box(bpy.context)
-    return as_columns(np.eye(4) if box is None else _shifted(cage_matrix(box), -_drag.origin))
+    cage = np.eye(4) if box is None else _shifted(cage_matrix(box), -_drag.origin)
+    return [float(value) for value in cage.T.ravel()]
 
 
 def set_cage(values: Any) -> None:
-    """Apply a cage that is being dragged."""
+    """Apply a cage that is being dragged, given by columns."""
     box = _box(bpy.context)
     if box is None:
         return
-    cage = _shifted(from_columns(values), _drag.origin)
+    cage = _shifted(np.array(values, np.float64).reshape(4, 4).T, _drag.origin)
     if _drag.before is None or _drag.cage is None or _drag.first is None:
         _drag.name, _drag.before = box.name, box.matrix_basis.copy()
         _drag.cage, _drag.first = cage_matrix(box), cage
-    moved = is_moved_only(cage, _drag.cage)
-    set_cage_matrix(box, cage if moved else steadied(cage, _drag.first, _drag.cage))
+    keeps_size = np.allclose(cage.diagonal(), _drag.cage.diagonal(), rtol=1e-6)
+    set_cage_matrix(box, cage if keeps_size else steadied(cage, _drag.first, _drag.cage))
 
 
 def end_drag() -> None:
@@ -348,9 +338,10 @@ def end_drag() -> None:
     name, before = _drag.name, _drag.before
     _drag.name, _drag.before, _drag.cage, _drag.first = "", None, None, None
     box = bpy.context.view_layer.objects.get(name) if name else None
-    if box is None or before is None or same_place(before, box.matrix_basis):
+    if box is None or before is None:
         return
-    bpy.ops.ed.undo_push(message="Edit Region Box")
+    if not np.allclose(np.array(before), np.array(box.matrix_basis), rtol=1e-6, atol=1e-9):
+        bpy.ops.ed.undo_push(message="Edit Region Box")
 
 
 def _end_later() -> float | None:
@@ -421,7 +412,4 @@ class GWRAP_GGT_region_box(bpy.types.GizmoGroup):
             bpy.app.timers.register(_end_later, first_interval=_POLL_S)
 
 
-CLASSES: Final = (
-    GWRAP_PT_region,
-    GWRAP_GGT_region_box,
-)
+CLASSES: Final = (GWRAP_PT_region, GWRAP_GGT_region_box)

@@ -15,9 +15,8 @@ from ..ops.addon import tr
 from ..ops.cameras import cameras_under
 from ..ops.placement import point_empties
 from ..ops.report_data import report_of
-from ..ops.results import materials_of
-from ..ops.scene_objects import cameras_of, images_of, shading_of
-from .panel_base import Readiness, TabPanel, characters_of, table, wrapped_label
+from ..ops.scene_objects import cameras_of, images_of, materials_of, shading_of
+from .panel_base import InTab, Readiness, TabPanel, characters_of, table, wrapped_label
 
 # -- The sub-panel "Report" of the result: times, accuracy, regions, warnings ---------------------
 
@@ -25,20 +24,17 @@ from .panel_base import Readiness, TabPanel, characters_of, table, wrapped_label
 _MAX_WARNINGS: Final = 8
 
 
-class GWRAP_PT_report(bpy.types.Panel):
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "Gaussian Wrapping"
+class GWRAP_PT_report(InTab, bpy.types.Panel):
     bl_parent_id = "GWRAP_PT_result"
     bl_label = "Report"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return addon.current_frame(context.scene, context.view_layer.objects.active) is not None
+        return addon.current_frame(context) is not None
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         report = report_of(addon.figures_of(frame))
         if not report.known:
             layout.label(text=tr("No report yet"), icon="INFO", translate=False)
@@ -46,18 +42,15 @@ class GWRAP_PT_report(bpy.types.Panel):
         table(layout, report.rows)
         if report.device_reason:
             wrapped_label(layout, report.device_reason, characters_of(context))
-        if report.stages:
-            box = layout.box()
-            box.label(text=tr("Time of the Stages"), icon="TIME", translate=False)
-            table(box, report.stages)
-        if report.decisions:
-            box = layout.box()
-            box.label(text=tr("Model Selection"), icon="OPTIONS", translate=False)
-            table(box, report.decisions)
-        for region in report.regions:
-            box = layout.box()
-            box.label(text=region.name, icon="MESH_DATA", translate=False)
-            table(box, region.rows)
+        for title, icon, rows in (
+            (tr("Time of the Stages"), "TIME", report.stages),
+            (tr("Model Selection"), "OPTIONS", report.decisions),
+            *((region.name, "MESH_DATA", region.rows) for region in report.regions),
+        ):
+            if rows:
+                box = layout.box()
+                box.label(text=title, icon=icon, translate=False)
+                table(box, rows)
         self._warnings(layout, report.warnings, characters_of(context))
         column = layout.column(align=True)
         row = column.row(align=True)
@@ -84,7 +77,7 @@ class GWRAP_PT_result(TabPanel, bpy.types.Panel):
     bl_label = "Result"
 
     def readiness(self, context: bpy.types.Context) -> Readiness:
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if frame is None:
             return Readiness("No result")
         count = sum(addon.kind_of(child) == "mesh" for child in frame.children)
@@ -93,7 +86,7 @@ class GWRAP_PT_result(TabPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if frame is not None:
             found = materials_of(frame)
             if found:
@@ -123,15 +116,12 @@ class GWRAP_PT_result(TabPanel, bpy.types.Panel):
 # -- The panel "Scene Tools": photo cameras, true scale, ground and origin of a result ------------
 
 
-class GWRAP_PT_scene_tools(bpy.types.Panel):
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "Gaussian Wrapping"
+class GWRAP_PT_scene_tools(InTab, bpy.types.Panel):
     bl_label = "Scene Tools"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if frame is None:
             layout.label(text=tr("No result yet"), icon="INFO", translate=False)
             return
@@ -149,21 +139,15 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
         collection = cameras_of(frame.users_collection[0]) if frame.users_collection else None
         if collection is not None:
             self.layout.prop(
-                collection,
-                "hide_viewport",
-                text=tr("Show Photo Cameras"),
-                translate=False,
-                invert_checkbox=True,
-            )
+                collection, "hide_viewport", text=tr("Show Photo Cameras"),
+                translate=False, invert_checkbox=True,
+            )  # fmt: skip
         if not cameras_under(frame):
             return
-        row = self.layout.row(align=True)
-        selected: Any = row.operator("gwrap.view_photo", icon="CAMERA_DATA")
-        selected.step = 0
-        previous: Any = row.operator("gwrap.view_photo", text="", icon="TRIA_LEFT")
-        previous.step = -1
-        following: Any = row.operator("gwrap.view_photo", text="", icon="TRIA_RIGHT")
-        following.step = 1
+        row: Any = self.layout.row(align=True)
+        row.operator("gwrap.view_photo", icon="CAMERA_DATA").step = 0
+        row.operator("gwrap.view_photo", text="", icon="TRIA_LEFT").step = -1
+        row.operator("gwrap.view_photo", text="", icon="TRIA_RIGHT").step = 1
 
     def _points(self, context: bpy.types.Context) -> None:
         layout, characters = self.layout, characters_of(context)
@@ -177,12 +161,9 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
             wrapped_label(layout, text, characters, icon="INFO")
         elif len(points) == 2:
             first, second = (p.matrix_world.translation for p in points)
-            distance = bpy.utils.units.to_string(
-                context.scene.unit_settings.system,
-                "LENGTH",
-                (second - first).length * context.scene.unit_settings.scale_length,
-                precision=4,
-            )
+            units = context.scene.unit_settings
+            length = (second - first).length * units.scale_length
+            distance = bpy.utils.units.to_string(units.system, "LENGTH", length, precision=4)
             text = tr("2 points selected, {distance} apart", distance=distance)
             layout.label(text=text, translate=False)
         else:
@@ -204,8 +185,4 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
         row.operator("gwrap.reset_placement", text="Reset", icon="LOOP_BACK")
 
 
-CLASSES: Final = (
-    GWRAP_PT_result,
-    GWRAP_PT_report,
-    GWRAP_PT_scene_tools,
-)
+CLASSES: Final = (GWRAP_PT_result, GWRAP_PT_report, GWRAP_PT_scene_tools)

@@ -14,11 +14,12 @@ from ..ops.presets import preset_names, shown_name
 from ..ops.report_data import report_of
 from .job_view import draw_job, job_readiness
 from .panel_base import (
-    CATEGORY,
+    InTab,
     Readiness,
     TabPanel,
     button,
     characters_of,
+    column_of_choices,
     draw_settings,
     plain,
     settings_in,
@@ -61,13 +62,8 @@ class GWRAP_PG_training(bpy.types.PropertyGroup):
     more_iterations: IntProperty(  # type: ignore[valid-type]
         name="Iterations",
         description="How many iterations Train More adds to the finished training",
-        default=1000,
-        min=1,
-        max=1_000_000,
-        soft_min=100,
-        soft_max=10_000,
-        step=100,
-    )
+        default=1000, min=1, max=1_000_000, soft_min=100, soft_max=10_000, step=100,
+    )  # fmt: skip
 
 
 PROPERTIES: Final = (GWRAP_PG_training,)
@@ -88,24 +84,22 @@ class GWRAP_PT_train(TabPanel, bpy.types.Panel):
         job = job_readiness(context, "WRAP")
         if job is not None:
             return job
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if frame is None:
             return Readiness("Not trained")
         training = report_of(addon.figures_of(frame)).training
         return Readiness(training.rpartition(", ")[2] or "Trained", "CHECKMARK")
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, properties = self.layout, properties_of(context.scene)
-        plain(layout)
+        layout, properties = plain(self.layout), properties_of(context.scene)
         characters = characters_of(context)
-        frame = addon.current_frame(context.scene, context.view_layer.objects.active)
+        frame = addon.current_frame(context)
         if frame is not None:
             training = report_of(addon.figures_of(frame)).training
             words = tr("Trained: {figures}", figures=training) if training else "Trained"
             wrapped_label(layout, words, characters)
         running = job_timer.is_running(properties.job_folder)
-        column = layout.column()
-        column.enabled = not running
+        column = column_of_choices(layout, properties)
         column.prop(properties, "preset")  # a list: five names do not fit beside each other
         column.menu("GWRAP_MT_presets", icon="PRESET")
         column.prop(properties, "output")
@@ -147,36 +141,28 @@ def estimate_rows(lines: tuple[str, ...]) -> tuple[tuple[tuple[str, str], ...], 
 
     The first line, the photos, is left out: the panel Dataset has it.
     """
-    parts = [line.partition(": ") for line in lines]
-    short = [bool(value) and len(value) <= _MAX_VALUE for _, _, value in parts]
-    rows = tuple(
-        (name.partition(" (")[0], value)
-        for (name, _, value), row in zip(parts, short, strict=True)
-        if row
-    )
-    remarks = tuple(
-        line for line, row in zip(lines, short, strict=True) if not row and "long side" not in line
-    )
-    return rows, remarks
+    rows, remarks = [], []
+    for line in lines:
+        name, _, value = line.partition(": ")
+        if 0 < len(value) <= _MAX_VALUE:
+            rows.append((name.partition(" (")[0], value))
+        elif "long side" not in line:
+            remarks.append(line)
+    return tuple(rows), tuple(remarks)
 
 
 # -- The sub-panel "Advanced" of "Train": model selection, limits, start --------------------------
 
 
-class GWRAP_PT_train_advanced(bpy.types.Panel):
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = CATEGORY
+class GWRAP_PT_train_advanced(InTab, bpy.types.Panel):
     bl_parent_id = "GWRAP_PT_train"
     bl_label = "Advanced"
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - Blender's convention
 
     def draw(self, context: bpy.types.Context) -> None:
-        plain(self.layout)
         properties = properties_of(context.scene)
         training = properties.training
-        column = self.layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column = column_of_choices(self.layout, properties)
         shown = settings_in("train_advanced")
         selection = [d for d in shown if d.model_selection]
         limits = [d for d in shown if d.panel is not None and d.panel.preset_if_zero]
@@ -199,8 +185,4 @@ class GWRAP_PT_train_advanced(bpy.types.Panel):
         column.operator("gwrap.reset_training", icon="LOOP_BACK")
 
 
-CLASSES: Final = (
-    GWRAP_MT_presets,
-    GWRAP_PT_train,
-    GWRAP_PT_train_advanced,
-)
+CLASSES: Final = (GWRAP_MT_presets, GWRAP_PT_train, GWRAP_PT_train_advanced)
