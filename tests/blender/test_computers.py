@@ -62,7 +62,7 @@ def show(folder: Path) -> None:
 def shown(folder: Path) -> FakeLayout:
     """Show the parts of a folder as they are now."""
     show(folder)
-    computers.stop_watching()
+    computers.stop()
     draw(PANEL)
     wait_for(lambda: computers._watched[str(folder)].read_s > 0.0)
     return draw(PANEL)

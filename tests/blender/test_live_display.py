@@ -188,7 +188,7 @@ def context(*, overlays: bool = True) -> Any:
     )
 
 
-@pytest.mark.parametrize("known", job_view.SHADERS)
+@pytest.mark.parametrize("known", ["POINT_FLAT_COLOR", "FLAT_COLOR"])
 def test_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known: str) -> None:
     gpu = Gpu(monkeypatch, known)
     job_view._draw_points(context())

@@ -403,7 +403,7 @@ def test_copying_the_report(tmp_path: Path) -> None:
     assert not bpy.ops.gwrap.copy_report.poll()
     done(tmp_path)
     assert bpy.ops.gwrap.copy_report() == {"FINISHED"}
-    frame = addon.current_frame(bpy.context.scene, None)
+    frame = addon.current_frame(bpy.context)
     report = report_of(addon.figures_of(frame))
     text = report.as_text()
     for name, value in (*report.rows, *report.stages, *report.regions[0].rows):

@@ -15,7 +15,7 @@ from gaussian_wrapping_addon.core.jobs.store.job_folder import STATES, JobStatus
 from gaussian_wrapping_addon.ops import addon, job_timer, worker_setup
 from gaussian_wrapping_addon.ops.scene_objects import import_result
 from gaussian_wrapping_addon.ui import mesh_panel, preferences, result_panel, training_panel
-from gaussian_wrapping_addon.ui.panel_base import progress_text, time_span
+from gaussian_wrapping_addon.ui.panel_base import progress_text
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.synthetic_result import write_result
 
@@ -198,7 +198,7 @@ def test_preferences_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_time_span(seconds: float, text: str) -> None:
-    assert time_span(seconds) == text
+    assert progress_text("train", 0.5, seconds).endswith(f" {text} left")
 
 
 def test_progress_text() -> None:

@@ -122,8 +122,9 @@ def test_disabling_the_addon_ends_the_process(
     region = region_of(folder)
     slow = [sys.executable, "-c", "import time; time.sleep(100)"]
     monkeypatch.setattr(meshing, "child_command", lambda *_, **__: slow)
+    child = background.Child()
+    monkeypatch.setattr(meshing, "Child", lambda: child)
     meshing.start(bpy.context.scene, [region], folder, sys.executable)
-    child = meshing._state.running[region.session_uid].child
     play_until(lambda: child.process is not None)
     process = child.process
     assert process is not None
@@ -153,4 +154,4 @@ def test_a_worker_that_says_nothing_is_an_answer(
         assert estimate is not None
         assert estimate.warnings
         assert words in " ".join(estimate.warnings)
-    assert background.run_child([sys.executable, "-c", "print(1)"], lambda _: True, 20)[0] == []
+    assert background.Child().run([sys.executable, "-c", "print(1)"], 20)[0] == []
