@@ -45,10 +45,7 @@ def texel_corners(corner_uvs: np.ndarray, size_px: int) -> np.ndarray:
 
 
 def raster_atlas(
-    corner_uvs: np.ndarray,
-    size_px: int,
-    threads: int,
-    faces: np.ndarray | None = None,
+    corner_uvs: np.ndarray, size_px: int, threads: int, faces: np.ndarray | None = None
 ) -> AtlasRaster:
     """Rasterise UV triangles: exact at centres, plus one ring of texels that are only touched.
 

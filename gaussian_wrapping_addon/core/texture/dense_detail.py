@@ -392,11 +392,7 @@ class OcclusionMap:
 
 
 def bake_occlusion(
-    light: SurfaceMesh,
-    raster: AtlasRaster,
-    dense: DenseSurface,
-    gutter_px: int,
-    progress: Progress,
+    light: SurfaceMesh, raster: AtlasRaster, dense: DenseSurface, gutter_px: int, progress: Progress
 ) -> OcclusionMap:
     """Bake the occlusion of the dense mesh at points that correspond to texels of the light one.
 

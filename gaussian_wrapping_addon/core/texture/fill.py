@@ -52,10 +52,7 @@ class HarmonicFill:
     """
 
     def __init__(
-        self,
-        known: np.ndarray,
-        colors: np.ndarray,
-        queries: Callable[[], Iterable[np.ndarray]],
+        self, known: np.ndarray, colors: np.ndarray, queries: Callable[[], Iterable[np.ndarray]]
     ) -> None:
         self._keys = np.empty(0, np.int64)
         if len(known) == 0:

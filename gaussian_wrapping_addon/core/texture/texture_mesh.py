@@ -189,12 +189,7 @@ def _plan(
 
 
 def _sample_surface(
-    mesh: SurfaceMesh,
-    graph: FaceGraph,
-    unwrapped: Unwrap,
-    size_px: int,
-    photos: int,
-    threads: int,
+    mesh: SurfaceMesh, graph: FaceGraph, unwrapped: Unwrap, size_px: int, photos: int, threads: int
 ) -> tuple[SurfaceArrays, SurfacePoints, AtlasRaster | None]:
     """Return the surface with its texel size, evenly spread points, and the raster if only one.
 

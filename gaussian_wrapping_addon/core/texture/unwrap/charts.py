@@ -652,12 +652,7 @@ def _run(helper: str, folder: Path, faces: int, progress: Progress) -> dict[str,
 
 
 def pack_charts(
-    charts: Charts,
-    size_px: int,
-    gutter_px: int,
-    folder: Path,
-    progress: Progress,
-    atlases: int = 1,
+    charts: Charts, size_px: int, gutter_px: int, folder: Path, progress: Progress, atlases: int = 1
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Pack charts into at most ``atlases`` unit squares, all at the same scale.
 

@@ -63,10 +63,7 @@ def packing_scale(extents: np.ndarray, side_px: int, padding_px: int, squares: i
 
 
 def split_wide_charts(
-    corner_uvs: np.ndarray,
-    charts: np.ndarray,
-    squares: int,
-    polygons: np.ndarray | None = None,
+    corner_uvs: np.ndarray, charts: np.ndarray, squares: int, polygons: np.ndarray | None = None
 ) -> np.ndarray:
     """Split charts that are too wide for several squares.
 
