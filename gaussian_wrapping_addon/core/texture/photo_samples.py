@@ -99,29 +99,13 @@ def _clearance(depth: Any, jump: float) -> np.ndarray:
 
 @inline
 def hidden_pixels(
-    depth: Any,
-    x: float,
-    y: float,
-    intrinsics: Any,
-    nx: float,
-    ny: float,
-    nz: float,
-    plane: float,
-    z: float,
-) -> int:
+    depth: Any, x: float, y: float, intrinsics: Any,
+    nx: float, ny: float, nz: float, plane: float, z: float,
+) -> int:  # fmt: skip
     """Count the pixels around a position (0 to 4) at which the plane ``n . p = plane`` is occluded.
 
-    Parameters
-    ----------
-    depth : (h, w) float32
-    x, y : float
-        Projection of the point, pixels.
-    intrinsics : (4,) float64
-        fx, fy, cx, cy.
-    nx, ny, nz, plane : float
-        The face's plane in camera coordinates; the normal points towards the camera.
-    z : float
-        Depth of the point.
+    The plane is that of a face in camera coordinates, its normal points towards the camera; x, y
+    are pixels, z the depth of the point, and the intrinsics fx, fy, cx, cy.
     """
     height, width = depth.shape
     tolerance = z * (BIAS_RELATIVE + BIAS_PX / min(intrinsics[0], intrinsics[1]))
@@ -224,15 +208,9 @@ class PhotoView:
 
 
 def sample_photo(
-    points: SurfacePoints,
-    surface: SurfaceArrays,
-    view: PhotoView,
-    factors: np.ndarray,
-    weights: np.ndarray,
-    colors: np.ndarray,
-    best_clearance: np.ndarray,
-    threads: int,
-) -> None:
+    points: SurfacePoints, surface: SurfaceArrays, view: PhotoView, factors: np.ndarray,
+    weights: np.ndarray, colors: np.ndarray, best_clearance: np.ndarray, threads: int,
+) -> None:  # fmt: skip
     """Sample the photo at every point; each point keeps its k best views.
 
     Parameters
@@ -252,28 +230,11 @@ def sample_photo(
 
     def chunk(begin: int, end: int) -> None:
         _sample(
-            points.face,
-            points.bary,
-            begin,
-            end,
-            surface.vertices,
-            surface.faces,
-            surface.face_normals,
-            surface.vertex_normals,
-            surface.texel_size,
-            pose,
-            intrinsics,
-            view.focal_px,
-            view.visibility.depth,
-            view.visibility.clearance,
-            view.mask,
-            view.image.pixels,
-            view.image.levels,
-            factors,
-            weights,
-            colors,
-            best_clearance,
-        )
+            points.face, points.bary, begin, end, surface.vertices, surface.faces,
+            surface.face_normals, surface.vertex_normals, surface.texel_size, pose, intrinsics,
+            view.focal_px, view.visibility.depth, view.visibility.clearance, view.mask,
+            view.image.pixels, view.image.levels, factors, weights, colors, best_clearance,
+        )  # fmt: skip
 
     run_chunks(chunk, even_bounds(len(points), threads, 16), threads)
 
@@ -285,28 +246,11 @@ def _fade(distance: float, width: float, floor: float) -> float:
 
 @kernel(fast=False)
 def _sample(
-    point_face: Any,
-    point_bary: Any,
-    begin: int,
-    end: int,
-    vertices: Any,
-    faces: Any,
-    face_normals: Any,
-    corner_normals: Any,
-    texel_size: float,
-    pose: Any,
-    intrinsics: Any,
-    focal_px: float,
-    depth: Any,
-    clearance: Any,
-    mask: Any,
-    pixels: Any,
-    levels: Any,
-    factors: Any,
-    weights: Any,
-    colors: Any,
-    best_clearance: Any,
-) -> None:
+    point_face: Any, point_bary: Any, begin: int, end: int, vertices: Any, faces: Any,
+    face_normals: Any, corner_normals: Any, texel_size: float, pose: Any, intrinsics: Any,
+    focal_px: float, depth: Any, clearance: Any, mask: Any, pixels: Any, levels: Any,
+    factors: Any, weights: Any, colors: Any, best_clearance: Any,
+) -> None:  # fmt: skip
     height, width = depth.shape
     has_mask = mask.shape[0] == height and mask.shape[1] == width
     kept = weights.shape[1]
