@@ -191,6 +191,8 @@ class SurfaceArrays:
         cls, vertices: np.ndarray, faces: np.ndarray, face_normals: np.ndarray, texel_size: float
     ) -> SurfaceArrays:
         """Construct with vertex normals computed."""
+        vertices = np.ascontiguousarray(vertices, np.float64)
+        faces = np.ascontiguousarray(faces, np.int32)
         return cls(vertices, faces, face_normals, vertex_normals(vertices, faces), texel_size)
 
 

@@ -40,38 +40,21 @@ MIN_UV_AREA = 1e-4
 
 
 def texture_mesh(
-    mesh: SurfaceMesh,
-    scene: Scene,
-    photos: PhotoSource,
-    settings: TextureSettings,
-    work_folder: Path,
-    progress: Progress,
-    *,
-    threads: int,
-    dense: SurfaceMesh | None = None,
-    free_bytes: int = 0,
-    unwrapped: Unwrap | None = None,
-    polygons: np.ndarray | None = None,
-) -> TexturedMesh:
-    """Unwrap a mesh and bake its texture from the photos (docs/method.md, section 8).
+    mesh: SurfaceMesh, scene: Scene, photos: PhotoSource, settings: TextureSettings,
+    work_folder: Path, progress: Progress, *, threads: int, dense: SurfaceMesh | None = None,
+    free_bytes: int = 0, unwrapped: Unwrap | None = None, polygons: np.ndarray | None = None,
+) -> TexturedMesh:  # fmt: skip
+    """Unwrap a mesh of the scene frame and bake its texture (docs/method.md, section 8).
 
     Parameters
     ----------
-    mesh : SurfaceMesh
-        In the scene frame.
-    scene : Scene
-        Views of the photos.
-    photos : PhotoStore
-        Any object with ``camera``, ``photo`` and ``mask`` by index and divisor.
     settings : TextureSettings
         ``size_px = 0`` chooses the size from the photos' footprint, ``max_atlases = 0`` the number
         of textures.
     work_folder : Path
         For a temporary sub-folder of the unwrap.
-    progress : Progress
-        Span of this step.
     threads : int
-        Threads to use; the result does not depend on it.
+        The result does not depend on it.
     dense : SurfaceMesh, optional
         The mesh before decimation; its detail goes into the normal map.
     free_bytes : int
@@ -116,14 +99,12 @@ def texture_mesh(
     for number in range(atlases):
         span = progress.span(0.42 + 0.48 * number / atlases, 0.42 + 0.48 * (number + 1) / atlases)
         raster = unwrapped.raster(size_px, threads, number) if first is None else first
-        details.append(
-            bake_detail(
-                mesh, unwrapped, raster, dense, settings, span.span(0.0, 0.2),
-                threads=threads, atlas=number,
-            )
+        detail = bake_detail(
+            mesh, unwrapped, raster, dense, settings, span.span(0.0, 0.2),
+            threads=threads, atlas=number,
         )  # fmt: skip
-        overlaps = raster.overlaps
-        atlas = atlas_points(raster, unwrapped.charts)
+        details.append(detail)
+        overlaps, atlas = raster.overlaps, atlas_points(raster, unwrapped.charts)
         del raster
         first = None  # half of the memory
         baked = bake(
@@ -139,11 +120,12 @@ def texture_mesh(
     progress.update(0.9, "filling unseen texels")
     fill = fill_harmonically(colors, surface)
     images = []
-    while colors:
+    while colors:  # frees each
         images.append(colors.pop(0).finish(fill, surface, gutter_px))
     stretch = texture_stretch(mesh.vertices, mesh.faces, unwrapped.corner_uvs)
     statistics = {
         **coverage.statistics(size_px, settings, unwrapped, graph.areas),
+        **preparation.statistics,
         "stretch_mean": stretch.mean,
         "stretch_p95": stretch.p95,
         "area_collapsed_share": stretch.collapsed_share,
@@ -161,14 +143,9 @@ def texture_mesh(
 
 
 def _plan(
-    graph: FaceGraph,
-    photos: PhotoSource,
-    count: int,
-    settings: TextureSettings,
-    dense: SurfaceMesh | None,
-    free_bytes: int,
-    unwrapped: Unwrap | None,
-) -> tuple[int, int, ReportWarning | None]:
+    graph: FaceGraph, photos: PhotoSource, count: int, settings: TextureSettings,
+    dense: SurfaceMesh | None, free_bytes: int, unwrapped: Unwrap | None,
+) -> tuple[int, int, ReportWarning | None]:  # fmt: skip
     """Return side and number of textures, and a warning if memory limits them."""
     detail_points = 0
     if dense is not None and wants_normal_map(settings, is_decimated=True):
@@ -205,12 +182,7 @@ def _sample_surface(
         counts.append(used)
         samples.append(_even_texels(raster, used, min(wanted, used)))
     texel_size = math.sqrt(float(graph.areas.sum()) / max(inside, 1))
-    surface = SurfaceArrays.of(
-        np.ascontiguousarray(mesh.vertices, np.float64),
-        np.ascontiguousarray(mesh.faces, np.int32),
-        graph.normals,
-        texel_size,
-    )
+    surface = SurfaceArrays.of(mesh.vertices, mesh.faces, graph.normals, texel_size)
     if len(samples) == 1:
         return surface, samples[0], raster
     parts = []
@@ -244,11 +216,8 @@ def validate_for_texturing(mesh: SurfaceMesh) -> None:
         raise MeshingError("A face of the mesh refers to a vertex that does not exist.", hint)
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
-        first = int(np.flatnonzero(~finite)[0])
-        raise MeshingError(
-            f"{int((~finite).sum())} vertices of the mesh are not finite, the first is {first}.",
-            hint,
-        )
+        text = f"{int((~finite).sum())} vertices of the mesh are not finite, the first is "
+        raise MeshingError(f"{text}{int(np.argmin(finite))}.", hint)
     cross = area_vectors(vertices.astype(np.float64), faces)
     if not (np.abs(cross).max() > 0 and np.isfinite(cross).all()):
         raise MeshingError("No face of the mesh has an area.", hint)
