@@ -8,7 +8,7 @@ import json
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +110,7 @@ def write_viewer_ply(path: Path, gaussians: OrientedGaussians) -> None:
     MeshingError
         If a Gaussian is not finite in single precision: viewers would show nothing, or crash.
     """
-    wide = OrientedGaussians(**{n: t.detach().cpu().double() for n, t in gaussians.tensors()})
+    wide = gaussians.mapped(lambda value: value.detach().cpu().double())
     log_opacity = wide.log_opacities()
     # logit = log(a / (1 - a)), from log a without losing a close to 1
     logit = log_opacity - torch.log(-torch.expm1(log_opacity.clamp_max(-1e-12)))
@@ -132,29 +132,20 @@ def write_viewer_ply(path: Path, gaussians: OrientedGaussians) -> None:
 
 def standard_names(coefficients: int) -> list[str]:
     """Return the properties of the original code's files, in their order."""
-    rest = 3 * (coefficients - 1)
     return [
-        *("x", "y", "z", "nx", "ny", "nz"),
-        *(f"f_dc_{i}" for i in range(3)),
-        *(f"f_rest_{i}" for i in range(rest)),
-        "opacity",
-        *(f"scale_{i}" for i in range(3)),
-        *(f"rot_{i}" for i in range(4)),
-    ]
+        "x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))), "opacity",
+        *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)),
+    ]  # fmt: skip
 
 
 def _standard_columns(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
-    count = len(arrays["means"])
-    sh = arrays["sh"]
+    count, sh = len(arrays["means"]), arrays["sh"]
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, -1)  # all of red, then green, then blue
     return [
-        arrays["means"],
-        np.zeros((count, 3)),
-        sh[:, 0],
-        sh[:, 1:].transpose(0, 2, 1).reshape(count, -1),  # all of red, then green, then blue
-        arrays["opacity_logits"][:, None],
-        arrays["log_scales"],
-        arrays["quats"],
-    ]
+        arrays["means"], np.zeros((count, 3)), sh[:, 0], rest, arrays["opacity_logits"][:, None],
+        arrays["log_scales"], arrays["quats"],
+    ]  # fmt: skip
 
 
 def _write(path: Path, names: list[str], columns: list[np.ndarray], comments: list[str]) -> None:
@@ -285,8 +276,8 @@ class ForeignSplat:
     """Whether the file has orientations."""
     dropped: int
     """Gaussians dropped because of non-finite or invalid values."""
-    warnings: tuple[ReportWarning, ...] = ()
-    facts: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[ReportWarning, ...]
+    facts: dict[str, Any]
 
 
 def read_foreign_splat(path: Path) -> ForeignSplat:
@@ -334,12 +325,10 @@ def read_foreign_splat(path: Path) -> ForeignSplat:
     _normalise(arrays, header.axes)
     tensors = {k: torch.from_numpy(np.ascontiguousarray(v, dtype)) for k, v in arrays.items()}
     facts = {
-        "splat_gaussians": int(valid.sum()),
-        "splat_dropped": dropped,
-        "splat_degree": header.degree,
-        "splat_surfels": header.axes == 2,
+        "splat_gaussians": int(valid.sum()), "splat_dropped": dropped,
+        "splat_degree": header.degree, "splat_surfels": header.axes == 2,
         "splat_oriented": oriented,
-    }
+    }  # fmt: skip
     for warning in warnings:
         _logger.warning("%s: %s", path.name, warning.text)
     return ForeignSplat(OrientedGaussians(**tensors), oriented, dropped, tuple(warnings), facts)
@@ -401,8 +390,7 @@ def _normalise(arrays: dict[str, np.ndarray], axes: int) -> None:
         log_scales = np.concatenate([log_scales, third.astype(log_scales.dtype)], axis=1)
     least = log_scales.max(axis=1, keepdims=True) + math.log(THINNEST_AXIS)
     arrays["log_scales"] = np.maximum(log_scales, least.astype(log_scales.dtype))
-    limit = MAX_OPACITY_LOGIT
-    arrays["opacity_logits"] = np.clip(arrays["opacity_logits"], -limit, limit)
+    arrays["opacity_logits"] = arrays["opacity_logits"].clip(-MAX_OPACITY_LOGIT, MAX_OPACITY_LOGIT)
     quats = arrays["quats"]
     largest = np.abs(quats).max(axis=1, keepdims=True)  # (n, 1)
     extreme = (largest < 1e-6) | (largest > 1e6)  # their squares leave float32
