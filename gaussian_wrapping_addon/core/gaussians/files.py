@@ -53,10 +53,9 @@ def load_gaussians(path: Path) -> OrientedGaussians:
     loaded = read_arrays(path, (*_SHAPES, "sh"), hint=hint)
     count = loaded["means"].shape[:1]
     for name, array in loaded.items():
-        good = array.dtype.kind == "f" and (
-            array.shape[1:] == _SHAPES[name] if name != "sh" else array.ndim == 3
-        )
-        if not good or array.shape[:1] != count or not np.isfinite(array).all():
+        good = array.dtype.kind == "f" and array.shape[:1] == count and np.isfinite(array).all()
+        fits = array.ndim == 3 if name == "sh" else array.shape[1:] == _SHAPES[name]
+        if not (good and fits):
             raise ParseError(path, name, "wrong shape or non-finite values.", hint)
     return OrientedGaussians(**{name: torch.from_numpy(array) for name, array in loaded.items()})
 
@@ -72,11 +71,9 @@ _logger = logging.getLogger(__name__)
 
 MAX_LOG_SCALE = 40.0
 """Gaussians with scales beyond e^40, which are implausible, are dropped."""
-
 MAX_OPACITY_LOGIT = 30.0
 """Opacity logits in viewer files are clamped to this and its negative: sigmoid is 1 or 0 to 13
 digits."""
-
 _FRAME_COMMENT = "world_from_scene"
 _HINT = "Write the file again with this program."
 
@@ -123,10 +120,8 @@ def write_viewer_ply(path: Path, gaussians: OrientedGaussians) -> None:
             single = arrays[name].reshape(len(valid), -1).astype(np.float32)
         valid &= np.isfinite(single).all(axis=1)
     if not valid.all():
-        raise MeshingError(
-            f"Gaussian {int(np.argmin(valid))} of the splat to write is not finite.",
-            "Train the scene again.",
-        )
+        text = f"Gaussian {int(np.argmin(valid))} of the splat to write is not finite."
+        raise MeshingError(text, "Train the scene again.")
     _write(path, standard_names(arrays["sh"].shape[1]), _standard_columns(arrays), [])
 
 
@@ -172,9 +167,8 @@ def read_splat_ply(path: Path) -> SplatFile:
     """
     header = read_ply_header(path, _HINT)
     if header.encoding != "<":
-        raise ParseError(
-            path, "header", "not binary little endian.", "Save it as binary little endian."
-        )
+        hint = "Save it as binary little endian."
+        raise ParseError(path, "header", "not binary little endian.", hint)
     if [element.name for element in header.elements] != ["vertex"]:
         raise ParseError(
             path, "header", "only one element, named vertex, is expected.",
@@ -253,14 +247,11 @@ def _frame_in(path: Path, comments: Sequence[str]) -> Similarity | None:
 
 MAX_DEGREE = 3
 """Higher degrees of the harmonics are dropped: the renderer does not support them."""
-
 SURFEL_THICKNESS = 0.02
 """Thickness given to surfels, relative to their shorter axis: visually flat, and far from the discs
 of 1e8 : 1 that float32 cannot render."""
-
 THINNEST_AXIS = 1e-5
 """Minimum length of an axis relative to the longest one."""
-
 _ACTIVATED_SHARE = 0.999
 """If this share of opacities and scales could be activated values, the file likely has them."""
 

@@ -151,7 +151,6 @@ FILTER_VARIANCE_PX = TrainingSettings.filter_variance
 (docs/method.md, section 1.5) was found to reduce the opacity of thin parts: a Gaussian as narrow as
 0.4 pixels in two directions keeps 44 % of it, and spokes of three pixels stay half transparent;
 with this value it keeps 76 %."""
-
 IMAGE_MARGIN = 0.15
 """Share by which the image is enlarged on each side in the visibility test of Gaussians."""
 
@@ -225,20 +224,15 @@ PhotoLoader = Callable[[int], tuple[Camera, np.ndarray, np.ndarray | None]]
 INITIAL_OPACITY = 0.1
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
-
 MIN_START_POINTS = 5000
 """With fewer sparse points, more are added until there are this many."""
-
 MIN_SPACING_SQ = 1e-7
 """Squared distances between neighbours are clamped to this (docs/method.md, section 1.3)."""
-
 MAX_SPACING_SHARE = 0.1
 """Largest size of an initial Gaussian relative to its distance to the nearest camera."""
-
 _DEPTH_NEIGHBOURS = 4
 _DEPTH_JITTER = 0.05
 """Relative standard deviation of added points around the depth of the nearest sparse points."""
-
 _DEPTH_TRIALS = 8
 
 

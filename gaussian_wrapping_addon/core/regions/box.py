@@ -26,15 +26,12 @@ def check_volume(vertices: np.ndarray, name: str) -> None:
         Fewer than four corners, too many, not finite, or all in one plane.
     """
     if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < 4:
-        raise MeshingError(
-            f"Region {name!r} needs at least four corners.", "Draw a box around the object."
-        )
+        text = f"Region {name!r} needs at least four corners."
+        raise MeshingError(text, "Draw a box around the object.")
     if len(vertices) > limits.MAX_REGION_VERTICES:
-        raise MeshingError(
-            f"Region {name!r} has {len(vertices)} corners; the limit is "
-            f"{limits.MAX_REGION_VERTICES}.",
-            "Use a simpler body, such as a box.",
-        )
+        text = f"Region {name!r} has {len(vertices)} corners; the limit is "
+        text += f"{limits.MAX_REGION_VERTICES}."
+        raise MeshingError(text, "Use a simpler body, such as a box.")
     if not np.isfinite(vertices).all():
         raise MeshingError(f"Region {name!r} has a corner that is not finite.", "Draw it again.")
     if not _is_thick(vertices):

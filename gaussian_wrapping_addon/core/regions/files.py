@@ -27,7 +27,6 @@ from .box import CUBE_CORNERS, CUBE_TRIANGLES, box_matrix, check_volume
 
 SUFFIXES: Final = (".rsbox", ".rcbox")
 """Of RealityScan, and of RealityCapture before it."""
-
 MAX_BYTES: Final = 64 * 1024
 """Files of the programs have about 600 bytes; what is larger holds something else."""
 MAX_COORDINATE: Final = 1e12
@@ -36,7 +35,6 @@ GIMBAL_SINE: Final = 1.0 - 1e-12
 """Of the middle angle; beyond it, the two others turn about the same axis, and one is set to 0."""
 RESIDUAL_TOLERANCE: Final = 1e-9
 """Of a residual transform's numbers from those of the identity; the programs write whole ones."""
-
 _ROOT: Final = "ReconstructionRegion"
 _AGAIN: Final = "Export the reconstruction region again."
 _IDENTITY: Final = {
@@ -50,28 +48,18 @@ def is_rsbox(path: Path) -> bool:
 
 
 def read_rsbox(path: Path) -> np.ndarray:
-    """Read a reconstruction region.
+    """Read a reconstruction region: (8, 3) corners in the coordinates of its project.
 
-    Returns
-    -------
-    vertices : (8, 3) float64
-        Corners of the box in the coordinates of its project, in the order of
-        :data:`~.box.CUBE_CORNERS` along the box's own axes.
+    They are in the order of :data:`~.box.CUBE_CORNERS` along the box's own axes.
 
     Raises
     ------
-    DatasetError
+    OSError
         The file cannot be read.
     ParseError
         Names the file, the entry and what to do; no values are guessed.
     """
-    try:
-        data = read_bounded(path, MAX_BYTES, follow_links=True)
-    except OSError as error:
-        raise DatasetError(
-            f"Region file {path} cannot be read: {error.strerror}.", "Check its permissions."
-        ) from None
-    root = _root(path, data)
+    root = _root(path, read_bounded(path, MAX_BYTES, follow_links=True))
     _check_frame(path, root)
     size = _numbers(path, root, "widthHeightDepth", 3)
     if min(size) <= 0.0:
@@ -91,10 +79,8 @@ def write_rsbox(path: Path, vertices: np.ndarray, name: str = "region") -> None:
     """
     matrix = box_matrix(np.asarray(vertices, np.float64))
     if matrix is None:
-        raise UsageError(
-            f"Region {name!r} is no box, and {path.suffix} files hold only boxes.",
-            "Export it as .json.",
-        )
+        text = f"Region {name!r} is no box, and {path.suffix} files hold only boxes."
+        raise UsageError(text, "Export it as .json.")
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)  # (3,), half of each side
     root = ElementTree.Element(
         _ROOT, globalCoordinateSystem="NONE", globalCoordinateSystemWkt="NONE",
@@ -115,10 +101,8 @@ def rotation_of(yaw: float, pitch: float, roll: float) -> np.ndarray:
 
     A box is turned about x by -pitch, then about y by -yaw, then about z by -roll.
     """
-    (cx, sx), (cy, sy), (cz, sz) = (
-        (math.cos(math.radians(-angle)), math.sin(math.radians(-angle)))
-        for angle in (pitch, yaw, roll)
-    )
+    turns = [math.radians(-angle) for angle in (pitch, yaw, roll)]
+    (cx, sx), (cy, sy), (cz, sz) = ((math.cos(turn), math.sin(turn)) for turn in turns)
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
     about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
     about_z = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
@@ -143,9 +127,9 @@ def _root(path: Path, data: bytes) -> ElementTree.Element:
     except UnicodeDecodeError as error:
         raise ParseError(path, f"byte {error.start}", "not UTF-8 text.", _AGAIN) from None
     # Entities could grow without bound; regions have neither them nor a document type.
-    for word in ("<!DOCTYPE", "<!ENTITY"):
-        if word in text:
-            raise ParseError(path, "whole file", f"{word[2:]} is not allowed.", _AGAIN)
+    for word in ("DOCTYPE", "ENTITY"):
+        if f"<!{word}" in text:
+            raise ParseError(path, "whole file", f"{word} is not allowed.", _AGAIN)
     try:
         root = ElementTree.fromstring(text)  # noqa: S314 - small, without entities
     except ElementTree.ParseError as error:
@@ -251,9 +235,9 @@ def read_region_body(path: Path) -> Any:
         raise DatasetError(f"{path} is a folder, not a region file.", "Give a file in it.")
     if not path.is_file():
         raise DatasetError(f"Region file {path} does not exist.", "Check the path.")
-    if is_rsbox(path):
-        return region_to_json(path.stem, read_rsbox(path), CUBE_TRIANGLES)
     try:
+        if is_rsbox(path):
+            return region_to_json(path.stem, read_rsbox(path), CUBE_TRIANGLES)
         return read_json(path, follow_links=True)
     except OSError as error:
         raise DatasetError(

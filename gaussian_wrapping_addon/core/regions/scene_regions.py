@@ -27,7 +27,6 @@ from .shapes import Region
 ON_PLANE_SHARE = 1e-9
 """Tolerance for a vertex on a face's plane, in diagonals of the region: caps are made on the planes
 up to rounding."""
-
 MAX_PLANES = 3
 
 
@@ -70,7 +69,6 @@ def cap_planes(vertices: np.ndarray, region: Region | None) -> CapPlanes:
 STEP_BITS = 20
 """The step is at most this many halvings of the body's diagonal (one millionth of it), and at most
 that of camera centres."""
-
 _TIE_STEP = 2.0**-12
 """Distances that differ by less, as a share of the largest, count as equal: corners of a box can be
 equally far from its diagonal, up to rounding."""
@@ -127,39 +125,28 @@ _logger = logging.getLogger(__name__)
 
 MIN_POINTS = 24
 """Least number of weighted points from which an extent is estimated."""
-
 WEIGHT_THAT_COUNTS = 1e-3
-
 WELL_SEEN_SHARE = 0.6
 """Points in fewer than this share of the most-seen point's views have little weight."""
-
 VOXEL_SHARE = 0.06
 """Side, in frame sizes, of the voxels that balance the density of keypoints."""
-
 TAIL_SHARE = 0.01
 """Share of the weight trimmed at each end of each axis."""
-
 PADDING_SHARE = 0.08
 """Margin around the points: keypoints lie on the surface, but seldom at its extremes."""
-
 HEADROOM = 0.15
 HEAD_TAIL_DIVISOR = 5.0
 """At the top of the box: extra share of the height, and divisor of the trimmed tail."""
-
 ROTATED_GAIN = 0.9
 """A rotated box is preferred only below this share of the axis-aligned box's footprint."""
-
 APART_SHARE = 0.4
 """Photos look at no one thing if the middles of half of them pass their common point by more than
 this share of the cameras' spread: 0.02 to 0.22 around things, 0.6 and more inside rooms, along
 streets, and in parallel rows."""
-
 SURROUNDINGS_REACH = 3.0
 """Reach of what such photos show, in median distances of points from the nearest camera."""
-
 SURROUNDINGS_MIN_VIEWS = 3
 """Photos that must show a point of theirs; all, where there are fewer."""
-
 WHOLE_TAIL_SHARE = 0.005
 WHOLE_MIN_ALPHA = 0.1
 WHOLE_MIN_VIEWS = 2

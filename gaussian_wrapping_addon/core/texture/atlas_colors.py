@@ -170,8 +170,5 @@ def fill_harmonically(atlases: list[AtlasColors], surface: SurfaceArrays) -> Har
         for atlas in atlases:
             yield from atlas.unseen(surface)
 
-    return HarmonicFill(
-        np.concatenate([a.known for a in atlases]),
-        np.concatenate([a.known_colors for a in atlases]),
-        queries,
-    )
+    known = np.concatenate([atlas.known for atlas in atlases])
+    return HarmonicFill(known, np.concatenate([a.known_colors for a in atlases]), queries)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -365,17 +366,15 @@ def prepare_photos(
         colors[:, index] = one[:, 0]
         image_positions[:, index] = full.project(positions)[0] / [full.width, full.height]
     gains, gain_spread = solve_gains(colors, valid)
-    low_frequency, low_frequency_spread = solve_low_frequency_correction(
-        colors, valid, image_positions, gains
-    )
+    fields, spread = solve_low_frequency_correction(colors, valid, image_positions, gains)
     statistics = {
         "photos_used": len(used_photos),
         "exposure_spread": gain_spread,
         "exposure_corrected": bool((gains != 1.0).any()),
-        "brightness_spread_within_photos": low_frequency_spread,
-        "brightness_evened_within_photos": bool((low_frequency != 1.0).any()),
+        "brightness_spread_within_photos": spread,
+        "brightness_evened_within_photos": bool((fields != 1.0).any()),
     }
-    return PhotoPreparation(used_photos, gains[:, None, None] * low_frequency, statistics)
+    return PhotoPreparation(used_photos, gains[:, None, None] * fields, statistics)
 
 
 def _blend_block(
@@ -487,46 +486,40 @@ class CoverageStatistics:
     """Counts of texels and faces over the atlases of a mesh with a number of ``faces``."""
 
     def __init__(self, faces: int) -> None:
-        self._with_texel = np.zeros(faces, np.bool_)
-        self._face_seen = np.zeros(faces, np.bool_)
-        self._used = self._seen = self._silhouettes = self._unreliable = self._overlaps = 0
-        self._views = self._rejected = 0
+        self._with_texel, self._face_seen = np.zeros(faces, np.bool_), np.zeros(faces, np.bool_)
+        self._counts: Counter[str] = Counter()
 
     def add(self, points: SurfacePoints, baked: BakedColors, overlaps: int) -> None:
         """Add one atlas, in which ``overlaps`` texels are used twice."""
         seen = baked.views > 0
         self._with_texel[points.face] = True
         self._face_seen[points.face[seen]] = True
-        self._used += len(points)
-        self._seen += int(seen.sum())
-        self._silhouettes += int((baked.reliable & ~baked.clear).sum())
-        self._unreliable += int((seen & ~baked.reliable).sum())
-        self._overlaps += overlaps
-        self._views += int(baked.views.sum(dtype=np.int64))
-        self._rejected += baked.rejected
+        self._counts.update(
+            used=len(points), seen=int(seen.sum()), overlaps=overlaps, rejected=baked.rejected,
+            outlines=int((baked.reliable & ~baked.clear).sum()),
+            badly=int((seen & ~baked.reliable).sum()),
+            views=int(baked.views.sum(dtype=np.int64)),
+        )  # fmt: skip
 
     def statistics(
         self, size_px: int, settings: TextureSettings, unwrapped: Unwrap, areas: np.ndarray
     ) -> dict[str, Any]:
         """Return plain JSON values over all atlases, for the (f,) areas of the faces."""
         with_texel, face_seen = self._with_texel, self._face_seen
-        used, seen = self._used, self._seen
+        counts = self._counts
+        used, seen, views, rejected = (counts[n] for n in ("used", "seen", "views", "rejected"))
         area_with_texel = float(areas[with_texel].sum())
         return {
-            "size_px": size_px,
-            "size_automatic": settings.size_px == 0,
+            "size_px": size_px, "size_automatic": settings.size_px == 0,
             "atlases": unwrapped.atlases,
-            "unwrap": unwrapped.method,
-            "unwrap_fallback_reason": unwrapped.reason,
+            "unwrap": unwrapped.method, "unwrap_fallback_reason": unwrapped.reason,
             "charts": int(unwrapped.charts.max()) + 1,
             "gutter_px": round(unwrapped.gutter_px, 2),
             "utilisation": used / (unwrapped.atlases * size_px**2),
-            "texels_used": used,
-            "texels_seen": seen,
-            "texels_filled": used - seen,
-            "texels_seen_at_outlines_only": self._silhouettes,
-            "texels_seen_badly": self._unreliable,
-            "texels_overlapping": self._overlaps,
+            "texels_used": used, "texels_seen": seen, "texels_filled": used - seen,
+            "texels_seen_at_outlines_only": counts["outlines"],
+            "texels_seen_badly": counts["badly"],
+            "texels_overlapping": counts["overlaps"],
             "coverage": seen / max(used, 1),
             "faces_seen_share": float(face_seen.sum()) / max(int(with_texel.sum()), 1),
             # Over faces with a texel: visibility of the others is unknown.
@@ -535,9 +528,9 @@ class CoverageStatistics:
             ),
             "area_without_texel_share": float(areas[~with_texel].sum() / areas.sum()),
             "faces_without_texel": int((~with_texel).sum()),
-            "views_per_seen_texel": self._views / seen if seen else 0.0,
-            "views_rejected_share": self._rejected / max(self._views + self._rejected, 1),
-        }
+            "views_per_seen_texel": views / seen if seen else 0.0,
+            "views_rejected_share": rejected / max(views + rejected, 1),
+        }  # fmt: skip
 
 
 # -- Texels of one atlas that belong to a face, as surface points ---------------------------------

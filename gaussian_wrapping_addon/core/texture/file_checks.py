@@ -18,10 +18,8 @@ from ..limits import MAX_ATLASES
 
 ROUGHNESS = 0.9
 """Photos contain their lighting: added gloss would look wrong from most directions."""
-
 SPECULAR_LEVEL = 0.1
 """Blender's scale: 0.5 is a reflectance of 4 %, which corresponds to glTF's factor 1."""
-
 OBJ_SHININESS = 1000.0 * (1.0 - ROUGHNESS) ** 2
 """``Ns`` of OBJ as Blender maps it to roughness; other programs use it as Phong exponent."""
 
@@ -46,7 +44,7 @@ def atlas_file(name: str, atlas: int, udims: Sequence[int] = ()) -> str:
 
 
 def validate_face_atlas(face_atlas: np.ndarray, faces: int) -> np.ndarray:
-    """Validate the atlas indices of faces read from a file; return them as (f,) uint8.
+    """Return the atlas indices of faces read from a file as (f,) uint8.
 
     Raises
     ------
@@ -73,26 +71,20 @@ def validate_for_export(
     MeshingError
         States the first invalid element.
     """
-    subject = name[:1].upper() + name[1:]
+    subject, again = name[:1].upper() + name[1:], "Mesh the region again."
     if len(faces) == 0 or len(vertices) == 0:
         raise MeshingError(f"{subject} has no faces.", "Choose a region with a surface.")
     bad = ~(np.abs(vertices) <= SINGLE_MAX).all(axis=1)
     if bad.any():
-        raise MeshingError(
-            f"Vertex {int(np.argmax(bad))} of {name} is not finite.", "Mesh the region again."
-        )
+        raise MeshingError(f"Vertex {int(np.argmax(bad))} of {name} is not finite.", again)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshingError(
-            f"A face of {name} refers to a vertex that does not exist.", "Mesh the region again."
-        )
+        raise MeshingError(f"A face of {name} refers to a vertex that does not exist.", again)
     if corner_uvs is None:
         return
     bad = ~(np.abs(corner_uvs) <= SINGLE_MAX).reshape(len(faces), -1).all(axis=1)
     if bad.any():
-        raise MeshingError(
-            f"Face {int(np.argmax(bad))} of {name} has UVs that are not finite.",
-            "Texture the region again.",
-        )
+        text = f"Face {int(np.argmax(bad))} of {name} has UVs that are not finite."
+        raise MeshingError(text, "Texture the region again.")
 
 
 @contextlib.contextmanager

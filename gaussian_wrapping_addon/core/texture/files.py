@@ -140,9 +140,8 @@ class _Parts:
     def add_array(self, array: np.ndarray, component: int, kind: str, target: int) -> int:
         """Append an array; return the index of its accessor."""
         view = self.add(array.tobytes(), target)
-        self.accessors.append(
-            {"bufferView": view, "componentType": component, "count": len(array), "type": kind}
-        )
+        accessor = {"bufferView": view, "componentType": component, "count": len(array)}
+        self.accessors.append({**accessor, "type": kind})
         return len(self.accessors) - 1
 
 

@@ -94,7 +94,6 @@ TEXELS_PER_DETAIL_POINT = 2
 """With one texel per vertex of the dense mesh, a normal map would lose half of its bends."""
 FULL_GUTTER_SIDE_PX = 4096
 MIN_GUTTER_PX = 2
-
 MAX_AUTOMATIC_SIZE_PX = 4096
 EXPECTED_UTILISATION = 0.5
 """Share of texels covered by charts; 0.4 to 0.65 were measured on ordinary meshes."""

@@ -114,10 +114,8 @@ def split_overlaps(corner_uvs: np.ndarray, charts: np.ndarray, graph: FaceGraph)
     starts = np.searchsorted(both[:, 0], np.arange(len(charts) + 1))
     neighbours = (graph.opposite // 3).astype(np.int64)  # -1 without one
     centres = np.asarray(corner_uvs, np.float64).mean(axis=1)
-    middle = (
-        np.stack([np.bincount(charts, centres[:, axis], count) for axis in range(2)], axis=1)
-        / np.maximum(np.bincount(charts, minlength=count), 1)[:, None]
-    )
+    sums = np.stack([np.bincount(charts, centres[:, axis], count) for axis in range(2)], axis=1)
+    middle = sums / np.maximum(np.bincount(charts, minlength=count), 1)[:, None]
     distance = np.linalg.norm(centres - middle[charts], axis=1)
     faces = np.flatnonzero(broken[charts])
     faces = faces[np.lexsort((distance[faces], charts[faces]))]

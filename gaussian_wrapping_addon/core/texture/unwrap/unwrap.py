@@ -386,28 +386,22 @@ def own_uvs(mesh: SurfaceMesh, corner_uvs: np.ndarray) -> OwnUvs:
     flat = np.abs(signed_areas(uvs)) <= FLAT_UV_AREA
     share = float(graph.areas[flat].sum() / max(graph.areas.sum(), 1e-300))
     if share > MAX_FLAT_SHARE:
-        raise MeshingError(
-            f"The UVs of {100 * share:.0f} % of the surface have no area: nothing can be painted "
-            "there.",
-            _NEW_UVS,
-        )
+        text = f"The UVs of {100 * share:.0f} % of the surface have no area: nothing can be "
+        raise MeshingError(text + "painted there.", _NEW_UVS)
     middle = uvs.mean(axis=1)
     # A collapsed face on the far edge of a tile must not open the next one.
     collapsed = np.maximum(np.ceil(middle) - 1.0, 0.0)
     tile = np.where(flat[:, None], collapsed, np.floor(middle)).astype(np.int64)  # (f, 2)
     inside = uvs - tile[:, None]
     off = np.maximum(-inside, inside - 1.0).max(axis=(1, 2))
-    _refuse(
-        ((tile < 0) | (tile >= [TILE_COLUMNS, TILE_ROWS])).any(axis=1),
-        "has UVs outside of the UDIM tiles (from 0 to 10 and from 0 to 100)",
-    )
+    outside = ((tile < 0) | (tile >= [TILE_COLUMNS, TILE_ROWS])).any(axis=1)
+    _refuse(outside, "has UVs outside of the UDIM tiles (from 0 to 10 and from 0 to 100)")
     _refuse(off > EDGE_TOLERANCE, "has UVs that cross the edge of a tile, as repeated textures do")
     number = tile[:, 0] + TILE_COLUMNS * tile[:, 1]
     tiles, face_atlas = np.unique(number, return_inverse=True)
     if len(tiles) > limits.MAX_ATLASES:
-        raise MeshingError(
-            f"The UVs lie in {len(tiles)} UDIM tiles; the limit is {limits.MAX_ATLASES}.", _NEW_UVS
-        )
+        text = f"The UVs lie in {len(tiles)} UDIM tiles; the limit is {limits.MAX_ATLASES}."
+        raise MeshingError(text, _NEW_UVS)
     inside = inside.clip(0.0, 1.0).astype(np.float32)
     apart = inside + 2.0 * face_atlas.reshape(-1, 1, 1)
     charts = uv_charts(graph, mesh.faces, apart)
