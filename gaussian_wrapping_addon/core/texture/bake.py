@@ -322,7 +322,7 @@ def _view(
     return PhotoView(
         camera, photos.camera(index, 1).fx, pyramid(photos.photo(index, divisor)),
         np.ones((1, 1), np.bool_) if mask is None else mask,
-        photo_visibility(surface.vertices, surface.faces, camera, threads),
+        *photo_visibility(surface.vertices, surface.faces, camera, threads),
     )  # fmt: skip
 
 
@@ -351,7 +351,7 @@ def prepare_photos(
         coarse = max(1, math.ceil(max(full.width, full.height) / COARSE_LONG_SIDE_PX))
         coarse = min(coarse, full.width, full.height)
         view = _view(photos, index, coarse, surface, threads)
-        hit = view.visibility.depth[np.isfinite(view.visibility.depth)]
+        hit = view.depth[np.isfinite(view.depth)]
         if len(hit) == 0:
             continue
         # At this level, a texel near the camera still has one pixel.

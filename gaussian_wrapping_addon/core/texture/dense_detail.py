@@ -134,8 +134,16 @@ class DenseSurface:
         face = np.full(len(points), -1, np.int64)
         weights = np.zeros((len(points), 3))
         for shift in (0.0, RETRY_OFFSET_SHARE * self.size):
-            left = np.flatnonzero(face < 0)
-            self._by_rays(points + shift * RETRY_DIRECTION, normals, reach, left, face, weights)
+            left, origins = np.flatnonzero(face < 0), points + shift * RETRY_DIRECTION
+            best = np.full(len(points), np.inf)
+            for sign in (1.0, -1.0):
+                hits = self.first_hits(origins[left], sign * normals[left], reach)
+                rows, part = left[hits.face >= 0], hits.part(hits.face >= 0)
+                away = np.linalg.norm(self.points(part) - origins[rows], axis=1)
+                agrees = (self.face_normals[part.face] * normals[rows]).sum(axis=1) > 0.0
+                better = agrees & (away < best[rows])
+                rows, part = rows[better], part.part(better)
+                best[rows], face[rows], weights[rows] = away[better], part.face, part.weights
         method = np.where(face >= 0, BY_RAY, NO_HIT).astype(np.uint8)
         left = np.flatnonzero(face < 0)
         if len(left):
@@ -145,22 +153,6 @@ class DenseSurface:
             face[rows], weights[rows] = matches.face[agrees], matches.weights[agrees]
             method[rows] = BY_NEAREST
         return SurfaceCorrespondences(face, weights, method)
-
-    def _by_rays(
-        self, points: np.ndarray, normals: np.ndarray, reach: float, wanted: np.ndarray,
-        face: np.ndarray, weights: np.ndarray,
-    ) -> None:  # fmt: skip
-        """Set the nearer accepted hit of the ``wanted`` points."""
-        best = np.full(len(points), np.inf)
-        for sign in (1.0, -1.0):
-            hits = self.first_hits(points[wanted], sign * normals[wanted], reach)
-            rows, part = wanted[hits.face >= 0], hits.part(hits.face >= 0)
-            away = np.linalg.norm(self.points(part) - points[rows], axis=1)
-            agrees = (self.face_normals[part.face] * normals[rows]).sum(axis=1) > 0.0
-            better = agrees & (away < best[rows])
-            rows = rows[better]
-            best[rows] = away[better]
-            face[rows], weights[rows] = part.face[better], part.weights[better]
 
 
 def cage_distance(light: SurfaceMesh, dense: DenseSurface) -> float:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,6 +27,7 @@ from .dense_detail import (
     MAX_SIDE_PX,
     NO_HIT,
     DenseSurface,
+    DetailMap,
     bake_normal_map,
     bake_occlusion,
     cage_distance,
@@ -139,15 +140,8 @@ def _halved(
 # -- Detail maps of a mesh from its dense version: normal map, ambient occlusion ------------------
 
 
-@dataclass(frozen=True)
-class DetailMaps:
-    """Maps in addition to the colours; ``None`` if not requested."""
-
-    normal_map: np.ndarray | None = None
-    """(h, w, 3) uint8."""
-    occlusion: np.ndarray | None = None
-    """(k, k) uint8."""
-    statistics: dict[str, Any] = field(default_factory=dict)
+DetailMaps = dict[str, DetailMap]
+"""Maps in addition to the colours by the name of their statistics, as far as requested."""
 
 
 def wants_normal_map(settings: TextureSettings, *, is_decimated: bool) -> bool:
@@ -167,34 +161,40 @@ def bake_detail(
     with_normals = wants_normal_map(settings, is_decimated=dense is not None)
     with_occlusion = settings.ambient_occlusion == "on"
     if not (with_normals or with_occlusion):
-        return DetailMaps()
+        return {}
+    maps: DetailMaps = {}
     surface = DenseSurface(mesh if dense is None else dense)
     size_px = raster.face.shape[0]
-    normal_map = occlusion = None
-    statistics = {}
     if with_normals:
         gutter_px = gutter_for(size_px, settings.gutter_px)
         span = progress.span(0.0, 0.5 if with_occlusion else 1.0)
-        baked = bake_normal_map(mesh, unwrapped.corner_uvs, raster, surface, gutter_px, span)
-        normal_map, statistics["normal_map"] = baked.image, baked.statistics
+        maps["normal_map"] = bake_normal_map(
+            mesh, unwrapped.corner_uvs, raster, surface, gutter_px, span
+        )
     if with_occlusion:
         side_px = min(size_px, MAX_SIDE_PX)
         coarse = raster if side_px == size_px else unwrapped.raster(side_px, threads, atlas)
         gutter_px = gutter_for(side_px, settings.gutter_px)
         span = progress.span(0.5 if with_normals else 0.0, 1.0)
-        open_sky = bake_occlusion(mesh, coarse, surface, gutter_px, span)
-        occlusion, statistics["ambient_occlusion"] = open_sky.image, open_sky.statistics
-    return DetailMaps(normal_map, occlusion, statistics)
+        maps["ambient_occlusion"] = bake_occlusion(mesh, coarse, surface, gutter_px, span)
+    return maps
+
+
+def images_of(maps: DetailMaps) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return normal map and occlusion, ``None`` where not requested."""
+    found = (maps.get(name) for name in ("normal_map", "ambient_occlusion"))
+    normal_map, occlusion = (None if one is None else one.image for one in found)
+    return normal_map, occlusion
 
 
 def merged_statistics(details: Sequence[DetailMaps]) -> dict[str, Any]:
     """Merge the statistics of the atlases of one mesh; shares are averaged."""
     merged: dict[str, Any] = {}
-    for name, first in details[0].statistics.items():
-        each = [detail.statistics[name] for detail in details]
+    for name, first in details[0].items():
+        each = [detail[name].statistics for detail in details]
         merged[name] = {
             key: float(np.mean([one[key] for one in each])) if key.endswith("_share") else value
-            for key, value in first.items()
+            for key, value in first.statistics.items()
         }
     return merged
 
@@ -309,7 +309,7 @@ def _level(
             threads=threads, atlas=number,
         )  # fmt: skip
         details.append(detail)
-        maps.append(AtlasMaps(albedo, detail.normal_map, detail.occlusion))
+        maps.append(AtlasMaps(albedo, *images_of(detail)))
     statistics = {
         "faces": len(mesh.faces), "size_px": size_px, "atlases": unwrapped.atlases,
         "unwrap": unwrapped.method, "texels_overlapping": overlaps, **merged_statistics(details),

@@ -31,22 +31,12 @@ JUMP_PX = 12.0
 MAX_CLEARANCE_PX = 16
 
 
-@dataclass(frozen=True)
-class PhotoVisibility:
-    """Depth of the mesh in a photo and distances to silhouettes."""
-
-    depth: np.ndarray
-    """(h, w) float32 z-depth of the first hit, infinite without a hit."""
-    clearance: np.ndarray
-    """(h, w) uint8 distance to the nearest silhouette, pixels, up to :data:`MAX_CLEARANCE_PX`."""
-
-
 def photo_visibility(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera, threads: int
-) -> PhotoVisibility:
-    """Rasterise the mesh and compute the distance of each pixel to silhouettes."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return depth and clearance of each pixel, as in :class:`PhotoView`."""
     depth = depth_buffer(vertices, faces, camera, threads=threads).depth
-    return PhotoVisibility(depth, _clearance(depth, JUMP_PX / min(camera.fx, camera.fy)))
+    return depth, _clearance(depth, JUMP_PX / min(camera.fx, camera.fy))
 
 
 @kernel(fast=False)
@@ -206,7 +196,10 @@ class PhotoView:
     image: Pyramid
     mask: np.ndarray
     """(h, w) bool; (1, 1) true without a mask."""
-    visibility: PhotoVisibility
+    depth: np.ndarray
+    """(h, w) float32 z-depth of the mesh, infinite where it is not hit."""
+    clearance: np.ndarray
+    """(h, w) uint8 distance to the nearest silhouette, pixels, up to :data:`MAX_CLEARANCE_PX`."""
 
 
 def sample_photo(
@@ -234,7 +227,7 @@ def sample_photo(
         _sample(
             points.face, points.bary, begin, end, surface.vertices, surface.faces,
             surface.face_normals, surface.vertex_normals, surface.texel_size, pose, intrinsics,
-            view.focal_px, view.visibility.depth, view.visibility.clearance, view.mask,
+            view.focal_px, view.depth, view.clearance, view.mask,
             view.image.pixels, view.image.levels, factors, weights, colors, best_clearance,
         )  # fmt: skip
 

@@ -27,7 +27,7 @@ from .bake import (
     correction_sample_count,
     prepare_photos,
 )
-from .levels_of_detail import bake_detail, merged_statistics, wants_normal_map
+from .levels_of_detail import bake_detail, images_of, merged_statistics, wants_normal_map
 from .photo_samples import SurfaceArrays, SurfacePoints
 from .size import EXPECTED_UTILISATION, fit_into_memory, gutter_for, plan_textures, required_side
 from .unwrap.charts import texture_stretch
@@ -136,7 +136,7 @@ def texture_mesh(
         _logger.warning("no photo sees the mesh: its texture is plain grey")
     progress.update(1.0, f"texture: {100 * statistics['coverage']:.1f} % seen by photos")
     maps = [
-        AtlasMaps(image, detail.normal_map, detail.occlusion, shown)
+        AtlasMaps(image, *images_of(detail), shown)
         for image, detail, shown in zip(images, details, views, strict=True)
     ]
     return TexturedMesh.of(mesh, unwrapped.corner_uvs, unwrapped.face_atlas, maps, statistics)

@@ -133,15 +133,20 @@ def smooth_vertices(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def _restore_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Restore the vertices of faces that lost most of their area, so that thin tubes stay open."""
-    before = np.linalg.norm(area_vectors(start, faces), axis=1)
+    least = MIN_AREA_SHARE * np.linalg.norm(area_vectors(start, faces), axis=1)
     points = points.copy()
     while True:
-        crushed = np.linalg.norm(area_vectors(points, faces), axis=1) < MIN_AREA_SHARE * before
-        back = np.unique(faces[crushed])
-        back = back[(points[back] != start[back]).any(axis=1)]
-        if len(back) == 0:
+        crushed = np.linalg.norm(area_vectors(points, faces), axis=1) < least
+        if not _moved_back(points, start, faces[crushed]):
             return points
-        points[back] = start[back]
+
+
+def _moved_back(points: np.ndarray, start: np.ndarray, rows: np.ndarray) -> bool:
+    """Move some of the points back to the start, in place; return whether any were elsewhere."""
+    back = np.unique(rows)
+    back = back[(points[back] != start[back]).any(axis=1)]
+    points[back] = start[back]
+    return len(back) > 0
 
 
 def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -249,11 +254,8 @@ def _restore_folded_faces(
         pairs = pairs[folded[charts[pairs[:, 0]]] == 0]
         bad = was_up & (signed_areas(now) <= 0.0)
         bad[pairs] = True
-        back = np.unique(corners[bad])
-        back = back[(points[back] != start[back]).any(axis=1)]
-        if len(back) == 0:
+        if not _moved_back(points, start, corners[bad]):
             return now
-        points[back] = start[back]
     still_folded = np.bincount(charts, bad, count) > 0
     return np.where(still_folded[charts][:, None, None], before, points[corners])
 
