@@ -83,10 +83,8 @@ class SplatFile:
     """Content of a native file."""
 
     gaussians: OrientedGaussians
-    world_from_scene: Similarity | None
-    """Frame of the input, if the header has it."""
-    dropped: int
-    """Gaussians dropped because of non-finite or invalid values."""
+    world_from_scene: Similarity | None  # Frame of the input, if the header has it
+    dropped: int  # Gaussians dropped because of non-finite or invalid values
 
 
 def write_splat_ply(path: Path, gaussians: OrientedGaussians, world_from_scene: Similarity) -> None:

@@ -202,10 +202,8 @@ VERSION = 1
 class RegionFile:
     """Contents of a region file; the region is the convex hull of its vertices."""
 
-    name: str
-    """Not empty, encodable, within :data:`limits.MAX_NAME_BYTES`."""
-    vertices: np.ndarray
-    """(n, 3) float64, world frame, finite, enclosing a volume."""
+    name: str  # Not empty, encodable, within :data:`limits.MAX_NAME_BYTES`
+    vertices: np.ndarray  # (n, 3) float64, world frame, finite, enclosing a volume
 
 
 def read_region_file(path: Path) -> RegionFile:

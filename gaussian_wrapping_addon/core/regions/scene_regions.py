@@ -34,14 +34,10 @@ MAX_PLANES = 3
 class CapPlanes:
     """Planes of a region's boundary, in the caller's coordinates, and the vertices on them."""
 
-    normals: np.ndarray
-    """(k, 3) float64, outward."""
-    offsets: np.ndarray
-    """(k,) float64: inside is ``normals @ x <= offsets``."""
-    planes: np.ndarray
-    """(v, 3) int64: planes that each vertex lies on, -1 for none."""
-    fixed: np.ndarray
-    """(v,) bool: vertices on more than three planes, which cannot move."""
+    normals: np.ndarray  # (k, 3) float64, outward
+    offsets: np.ndarray  # (k,) float64: inside is ``normals @ x <= offsets``
+    planes: np.ndarray  # (v, 3) int64: planes that each vertex lies on, -1 for none
+    fixed: np.ndarray  # (v,) bool: vertices on more than three planes, which cannot move
 
 
 def cap_planes(vertices: np.ndarray, region: Region | None) -> CapPlanes:

@@ -123,8 +123,7 @@ class Region:
     """
 
     name: str
-    vertices: np.ndarray
-    """(v, 3) float64; their convex hull is the body."""
+    vertices: np.ndarray  # (v, 3) float64; their convex hull is the body
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, np.float64)
@@ -171,11 +170,6 @@ class Region:
         """Length of the diagonal of the bounds."""
         low, high = self.bounds
         return float(np.linalg.norm(high - low))
-
-    @cached_property
-    def volume(self) -> float:
-        """Volume of the convex hull."""
-        return float(self._hull.volume) * self.diagonal**3
 
     @cached_property
     def area(self) -> float:

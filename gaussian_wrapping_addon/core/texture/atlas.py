@@ -168,16 +168,11 @@ def _raster_touched(
 class TexelPoints:
     """Surface points of texels."""
 
-    face: np.ndarray
-    """(n,) int32."""
-    weights: np.ndarray
-    """(n, 3) float64 barycentric weights of the face's corners."""
-    points: np.ndarray
-    """(n, 3) float64 positions."""
-    raw_normals: np.ndarray
-    """(n, 3) float64 interpolated vertex normals, not of unit length."""
-    normals: np.ndarray
-    """(n, 3) float64 the same, normalised."""
+    face: np.ndarray  # (n,) int32
+    weights: np.ndarray  # (n, 3) float64 barycentric weights of the face's corners
+    points: np.ndarray  # (n, 3) float64 positions
+    raw_normals: np.ndarray  # (n, 3) float64 interpolated vertex normals, not of unit length
+    normals: np.ndarray  # (n, 3) float64 the same, normalised
 
 
 def texel_points(

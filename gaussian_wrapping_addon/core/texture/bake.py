@@ -544,11 +544,9 @@ BLOCK_TEXELS = 4_000_000
 class AtlasPoints:
     """Texels with a face, in order."""
 
-    texels: np.ndarray
-    """(n,) int32 flat indices."""
+    texels: np.ndarray  # (n,) int32 flat indices
     points: SurfacePoints
-    chart: np.ndarray
-    """(size, size) int32 chart of each texel, -1 between charts."""
+    chart: np.ndarray  # (size, size) int32 chart of each texel, -1 between charts
 
 
 def atlas_points(raster: AtlasRaster, charts: np.ndarray) -> AtlasPoints:

@@ -45,12 +45,9 @@ NO_HIT, BY_RAY, BY_NEAREST = 0, 1, 2
 class SurfaceCorrespondences:
     """Corresponding points on the dense mesh."""
 
-    face: np.ndarray
-    """(n,) int64, -1 without a correspondence."""
-    weights: np.ndarray
-    """(n, 3) float64 barycentric weights of the face's corners."""
-    method: np.ndarray
-    """(n,) uint8: ``NO_HIT``, ``BY_RAY`` or ``BY_NEAREST``."""
+    face: np.ndarray  # (n,) int64, -1 without a correspondence
+    weights: np.ndarray  # (n, 3) float64 barycentric weights of the face's corners
+    method: np.ndarray  # (n,) uint8: ``NO_HIT``, ``BY_RAY`` or ``BY_NEAREST``
 
     def part(self, rows: np.ndarray) -> SurfaceCorrespondences:
         """Return some of them."""

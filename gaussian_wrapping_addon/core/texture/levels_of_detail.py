@@ -220,10 +220,8 @@ class ColorSource(NamedTuple):
     """Source of the colours of a level."""
 
     textured: TexturedMesh
-    surface: DenseSurface
-    """Surface of the textured mesh."""
-    pyramids: list[ChartPyramid]
-    """Pyramids of its texture, one for each atlas."""
+    surface: DenseSurface  # Surface of the textured mesh
+    pyramids: list[ChartPyramid]  # Pyramids of its texture, one for each atlas
 
 
 def levels_of_detail(

@@ -148,10 +148,8 @@ MAX_USEFUL_PX = 1.5
 class SurfacePoints:
     """Points on faces of a mesh."""
 
-    face: np.ndarray
-    """(n,) int32."""
-    bary: np.ndarray
-    """(n, 2) float32 weights of the first two corners."""
+    face: np.ndarray  # (n,) int32
+    bary: np.ndarray  # (n, 2) float32 weights of the first two corners
 
     def __len__(self) -> int:
         return len(self.face)
@@ -165,16 +163,11 @@ class SurfacePoints:
 class SurfaceArrays:
     """Arrays of a mesh for the kernels."""
 
-    vertices: np.ndarray
-    """(v, 3) float64."""
-    faces: np.ndarray
-    """(f, 3) int32."""
-    face_normals: np.ndarray
-    """(f, 3) float64."""
-    vertex_normals: np.ndarray
-    """(v, 3) float64."""
-    texel_size: float
-    """Side of a texel on the surface, scene units."""
+    vertices: np.ndarray  # (v, 3) float64
+    faces: np.ndarray  # (f, 3) int32
+    face_normals: np.ndarray  # (f, 3) float64
+    vertex_normals: np.ndarray  # (v, 3) float64
+    texel_size: float  # Side of a texel on the surface, scene units
 
     @classmethod
     def of(

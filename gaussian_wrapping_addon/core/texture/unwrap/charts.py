@@ -44,12 +44,9 @@ class Stretch:
     Root mean square over directions of the distance on the surface per unit step in the texture.
     """
 
-    mean: float
-    """Mean over the surface."""
-    p95: float
-    """95th percentile over the surface."""
-    collapsed_share: float
-    """Share of the surface that has no area in the texture."""
+    mean: float  # Mean over the surface
+    p95: float  # 95th percentile over the surface
+    collapsed_share: float  # Share of the surface that has no area in the texture
 
 
 def texture_stretch(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray) -> Stretch:

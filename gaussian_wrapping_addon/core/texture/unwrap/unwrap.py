@@ -362,10 +362,8 @@ _NEW_UVS = "Unwrap the mesh, or have new UVs made (--uvs new; in the panel, UVs:
 class OwnUvs:
     """UVs of a mesh, ready for baking."""
 
-    unwrapped: Unwrap
-    """UVs within their tile; one atlas for each tile in use."""
-    udims: tuple[int, ...]
-    """UDIM number of each atlas; ``(1001,)`` for ordinary UVs."""
+    unwrapped: Unwrap  # UVs within their tile; one atlas for each tile in use
+    udims: tuple[int, ...]  # UDIM number of each atlas; ``(1001,)`` for ordinary UVs
     warnings: tuple[ReportWarning, ...]
 
 
