@@ -227,11 +227,11 @@ def _frame_in(path: Path, comments: Sequence[str]) -> Similarity | None:
             continue
         try:
             frame = Similarity.from_json(json.loads(text))
+            numbers = np.concatenate([[frame.scale], frame.rotation.ravel(), frame.translation])
+            if not (np.isfinite(numbers).all() and frame.scale > 0):
+                raise ValueError("not a similarity")
         except (ValueError, KeyError, TypeError, RecursionError):
             raise ParseError(path, "header", f"the {_FRAME_COMMENT} comment.", _HINT) from None
-        numbers = np.concatenate([[frame.scale], frame.rotation.ravel(), frame.translation])
-        if not (np.isfinite(numbers).all() and frame.scale > 0):
-            raise ParseError(path, "header", f"the {_FRAME_COMMENT} comment.", _HINT)
         return frame
     return None
 
