@@ -172,6 +172,11 @@ class Region:
         return float(np.linalg.norm(high - low))
 
     @cached_property
+    def volume(self) -> float:
+        """Volume of the convex hull."""
+        return float(self._hull.volume) * self.diagonal**3
+
+    @cached_property
     def area(self) -> float:
         """Area of the convex hull."""
         return float(self._hull.area) * self.diagonal**2

@@ -57,5 +57,5 @@ def test_what_a_region_file_passes_is_a_region(tmp_path: Path) -> None:
         except ParseError:
             refused += 1
         else:
-            assert parse_region(body, tmp_path / "x.json").area > 0.0
+            assert parse_region(body, tmp_path / "x.json").volume > 0.0
     assert 5 < refused < 290
