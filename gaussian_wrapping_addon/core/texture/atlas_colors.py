@@ -45,7 +45,8 @@ class GaussianPhotos:
     def __init__(self, gaussians: OrientedGaussians, photos: PhotoSource, *, threads: int) -> None:
         self._gaussians, self._photos = gaussians, photos
         self._options = RenderOptions(depth=False, sh_degree=0, threads=threads)
-        self._last_key, self._last = (-1, 0), (np.empty(0), np.empty(0))
+        self._last_key = (-1, 0)
+        self._last: tuple[np.ndarray, np.ndarray] = (np.empty(0), np.empty(0))
 
     def camera(self, index: int, divisor: int = 1) -> Camera:
         """Return the camera of a photo at a level."""
