@@ -8,7 +8,7 @@ import json
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +53,9 @@ def load_gaussians(path: Path) -> OrientedGaussians:
     loaded = read_arrays(path, (*_SHAPES, "sh"), hint=hint)
     count = loaded["means"].shape[:1]
     for name, array in loaded.items():
-        good = array.dtype.kind == "f" and (
-            array.shape[1:] == _SHAPES[name] if name != "sh" else array.ndim == 3
-        )
-        if not good or array.shape[:1] != count or not np.isfinite(array).all():
+        good = array.dtype.kind == "f" and array.shape[:1] == count and np.isfinite(array).all()
+        fits = array.ndim == 3 if name == "sh" else array.shape[1:] == _SHAPES[name]
+        if not (good and fits):
             raise ParseError(path, name, "wrong shape or non-finite values.", hint)
     return OrientedGaussians(**{name: torch.from_numpy(array) for name, array in loaded.items()})
 
@@ -72,11 +71,9 @@ _logger = logging.getLogger(__name__)
 
 MAX_LOG_SCALE = 40.0
 """Gaussians with scales beyond e^40, which are implausible, are dropped."""
-
 MAX_OPACITY_LOGIT = 30.0
 """Opacity logits in viewer files are clamped to this and its negative: sigmoid is 1 or 0 to 13
 digits."""
-
 _FRAME_COMMENT = "world_from_scene"
 _HINT = "Write the file again with this program."
 
@@ -86,10 +83,8 @@ class SplatFile:
     """Content of a native file."""
 
     gaussians: OrientedGaussians
-    world_from_scene: Similarity | None
-    """Frame of the input, if the header has it."""
-    dropped: int
-    """Gaussians dropped because of non-finite or invalid values."""
+    world_from_scene: Similarity | None  # Frame of the input, if the header has it
+    dropped: int  # Gaussians dropped because of non-finite or invalid values
 
 
 def write_splat_ply(path: Path, gaussians: OrientedGaussians, world_from_scene: Similarity) -> None:
@@ -110,7 +105,7 @@ def write_viewer_ply(path: Path, gaussians: OrientedGaussians) -> None:
     MeshingError
         If a Gaussian is not finite in single precision: viewers would show nothing, or crash.
     """
-    wide = OrientedGaussians(**{n: t.detach().cpu().double() for n, t in gaussians.tensors()})
+    wide = gaussians.mapped(lambda value: value.detach().cpu().double())
     log_opacity = wide.log_opacities()
     # logit = log(a / (1 - a)), from log a without losing a close to 1
     logit = log_opacity - torch.log(-torch.expm1(log_opacity.clamp_max(-1e-12)))
@@ -123,38 +118,27 @@ def write_viewer_ply(path: Path, gaussians: OrientedGaussians) -> None:
             single = arrays[name].reshape(len(valid), -1).astype(np.float32)
         valid &= np.isfinite(single).all(axis=1)
     if not valid.all():
-        raise MeshingError(
-            f"Gaussian {int(np.argmin(valid))} of the splat to write is not finite.",
-            "Train the scene again.",
-        )
+        text = f"Gaussian {int(np.argmin(valid))} of the splat to write is not finite."
+        raise MeshingError(text, "Train the scene again.")
     _write(path, standard_names(arrays["sh"].shape[1]), _standard_columns(arrays), [])
 
 
 def standard_names(coefficients: int) -> list[str]:
     """Return the properties of the original code's files, in their order."""
-    rest = 3 * (coefficients - 1)
     return [
-        *("x", "y", "z", "nx", "ny", "nz"),
-        *(f"f_dc_{i}" for i in range(3)),
-        *(f"f_rest_{i}" for i in range(rest)),
-        "opacity",
-        *(f"scale_{i}" for i in range(3)),
-        *(f"rot_{i}" for i in range(4)),
-    ]
+        "x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))), "opacity",
+        *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)),
+    ]  # fmt: skip
 
 
 def _standard_columns(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
-    count = len(arrays["means"])
-    sh = arrays["sh"]
+    count, sh = len(arrays["means"]), arrays["sh"]
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, -1)  # all of red, then green, then blue
     return [
-        arrays["means"],
-        np.zeros((count, 3)),
-        sh[:, 0],
-        sh[:, 1:].transpose(0, 2, 1).reshape(count, -1),  # all of red, then green, then blue
-        arrays["opacity_logits"][:, None],
-        arrays["log_scales"],
-        arrays["quats"],
-    ]
+        arrays["means"], np.zeros((count, 3)), sh[:, 0], rest, arrays["opacity_logits"][:, None],
+        arrays["log_scales"], arrays["quats"],
+    ]  # fmt: skip
 
 
 def _write(path: Path, names: list[str], columns: list[np.ndarray], comments: list[str]) -> None:
@@ -181,9 +165,8 @@ def read_splat_ply(path: Path) -> SplatFile:
     """
     header = read_ply_header(path, _HINT)
     if header.encoding != "<":
-        raise ParseError(
-            path, "header", "not binary little endian.", "Save it as binary little endian."
-        )
+        hint = "Save it as binary little endian."
+        raise ParseError(path, "header", "not binary little endian.", hint)
     if [element.name for element in header.elements] != ["vertex"]:
         raise ParseError(
             path, "header", "only one element, named vertex, is expected.",
@@ -244,11 +227,11 @@ def _frame_in(path: Path, comments: Sequence[str]) -> Similarity | None:
             continue
         try:
             frame = Similarity.from_json(json.loads(text))
+            numbers = np.concatenate([[frame.scale], frame.rotation.ravel(), frame.translation])
+            if not (np.isfinite(numbers).all() and frame.scale > 0):
+                raise ValueError("not a similarity")
         except (ValueError, KeyError, TypeError, RecursionError):
             raise ParseError(path, "header", f"the {_FRAME_COMMENT} comment.", _HINT) from None
-        numbers = np.concatenate([[frame.scale], frame.rotation.ravel(), frame.translation])
-        if not (np.isfinite(numbers).all() and frame.scale > 0):
-            raise ParseError(path, "header", f"the {_FRAME_COMMENT} comment.", _HINT)
         return frame
     return None
 
@@ -262,14 +245,11 @@ def _frame_in(path: Path, comments: Sequence[str]) -> Similarity | None:
 
 MAX_DEGREE = 3
 """Higher degrees of the harmonics are dropped: the renderer does not support them."""
-
 SURFEL_THICKNESS = 0.02
 """Thickness given to surfels, relative to their shorter axis: visually flat, and far from the discs
 of 1e8 : 1 that float32 cannot render."""
-
 THINNEST_AXIS = 1e-5
 """Minimum length of an axis relative to the longest one."""
-
 _ACTIVATED_SHARE = 0.999
 """If this share of opacities and scales could be activated values, the file likely has them."""
 
@@ -285,8 +265,8 @@ class ForeignSplat:
     """Whether the file has orientations."""
     dropped: int
     """Gaussians dropped because of non-finite or invalid values."""
-    warnings: tuple[ReportWarning, ...] = ()
-    facts: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[ReportWarning, ...]
+    facts: dict[str, Any]
 
 
 def read_foreign_splat(path: Path) -> ForeignSplat:
@@ -334,12 +314,10 @@ def read_foreign_splat(path: Path) -> ForeignSplat:
     _normalise(arrays, header.axes)
     tensors = {k: torch.from_numpy(np.ascontiguousarray(v, dtype)) for k, v in arrays.items()}
     facts = {
-        "splat_gaussians": int(valid.sum()),
-        "splat_dropped": dropped,
-        "splat_degree": header.degree,
-        "splat_surfels": header.axes == 2,
+        "splat_gaussians": int(valid.sum()), "splat_dropped": dropped,
+        "splat_degree": header.degree, "splat_surfels": header.axes == 2,
         "splat_oriented": oriented,
-    }
+    }  # fmt: skip
     for warning in warnings:
         _logger.warning("%s: %s", path.name, warning.text)
     return ForeignSplat(OrientedGaussians(**tensors), oriented, dropped, tuple(warnings), facts)
@@ -401,8 +379,7 @@ def _normalise(arrays: dict[str, np.ndarray], axes: int) -> None:
         log_scales = np.concatenate([log_scales, third.astype(log_scales.dtype)], axis=1)
     least = log_scales.max(axis=1, keepdims=True) + math.log(THINNEST_AXIS)
     arrays["log_scales"] = np.maximum(log_scales, least.astype(log_scales.dtype))
-    limit = MAX_OPACITY_LOGIT
-    arrays["opacity_logits"] = np.clip(arrays["opacity_logits"], -limit, limit)
+    arrays["opacity_logits"] = arrays["opacity_logits"].clip(-MAX_OPACITY_LOGIT, MAX_OPACITY_LOGIT)
     quats = arrays["quats"]
     largest = np.abs(quats).max(axis=1, keepdims=True)  # (n, 1)
     extreme = (largest < 1e-6) | (largest > 1e6)  # their squares leave float32

@@ -82,9 +82,13 @@ class OrientedGaussians:
         """Return a copy with some tensors replaced."""
         return replace(self, **tensors)
 
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> OrientedGaussians:
+        """Return a copy with each tensor changed by a function."""
+        return OrientedGaussians(**{name: change(value) for name, value in self.tensors()})
+
     def select(self, index: Tensor) -> OrientedGaussians:
         """Return the Gaussians selected by an index or mask tensor."""
-        return OrientedGaussians(**{name: value[index] for name, value in self.tensors()})
+        return self.mapped(lambda value: value[index])
 
     def joined(self, others: OrientedGaussians) -> OrientedGaussians:
         """Return these Gaussians, then others with as many harmonics."""
@@ -93,7 +97,7 @@ class OrientedGaussians:
 
     def detached(self) -> OrientedGaussians:
         """Return a copy that shares memory and carries no gradient."""
-        return OrientedGaussians(**{name: value.detach() for name, value in self.tensors()})
+        return self.mapped(Tensor.detach)
 
     # -- activations ------------------------------------------------------------------------------
 
@@ -131,17 +135,12 @@ class OrientedGaussians:
     def arrays(self) -> GaussianArrays:
         """Return the activated arrays; activation is done in float64."""
         with torch.no_grad():
-            wide = OrientedGaussians(
-                **{name: value.detach().cpu().double() for name, value in self.tensors()}
-            )
-            return GaussianArrays(
-                np.ascontiguousarray(wide.means.numpy()),
-                np.ascontiguousarray(wide.scales().numpy()),
-                np.ascontiguousarray(wide.rotations().numpy()),
-                np.ascontiguousarray(wide.log_opacities().numpy()),
-                np.ascontiguousarray(wide.normals().numpy()),
-                np.ascontiguousarray(self.sh.detach().cpu().float().numpy()),
-            )
+            wide = self.mapped(lambda value: value.detach().cpu().double())
+            activated = (
+                wide.means, wide.scales(), wide.rotations(), wide.log_opacities(), wide.normals(),
+                self.sh.detach().cpu().float(),
+            )  # fmt: skip
+            return GaussianArrays(*(np.ascontiguousarray(tensor.numpy()) for tensor in activated))
 
 
 # -- The 3D smoothing filter: no Gaussian is smaller than the closest camera can resolve ----------
@@ -152,7 +151,6 @@ FILTER_VARIANCE_PX = TrainingSettings.filter_variance
 (docs/method.md, section 1.5) was found to reduce the opacity of thin parts: a Gaussian as narrow as
 0.4 pixels in two directions keeps 44 % of it, and spokes of three pixels stay half transparent;
 with this value it keeps 76 %."""
-
 IMAGE_MARGIN = 0.15
 """Share by which the image is enlarged on each side in the visibility test of Gaussians."""
 
@@ -176,33 +174,16 @@ def _nearest_depth_rows(begin, end, means, cameras, near_z, out):  # type: ignor
 
 
 def mip_filter(
-    means: np.ndarray,
-    cameras: Sequence[Camera],
-    *,
-    variance_px: float = FILTER_VARIANCE_PX,
-    near_z: float = limits.NEAR_Z,
+    means: np.ndarray, cameras: Sequence[Camera], *, variance_px: float = FILTER_VARIANCE_PX,
     threads: int = 0,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return the filter's standard deviation of each Gaussian (docs/method.md, section 1.5).
 
-    ``f = z_min / focal_max * sqrt(variance_px)``, with ``z_min`` the smallest z-depth over
-    the cameras whose image, enlarged by 15 % on each side, contains the mean.
-
-    Parameters
-    ----------
-    means : (n, 3)
-        Scene units.
-    cameras : sequence of Camera
-        Training cameras at the training resolution, scene frame.
-    variance_px : float
-        Variance of the filter, squared pixels of the closest camera.
-    near_z : float
-        Smaller z-depths are ignored, scene units.
-
-    Returns
-    -------
-    (n,) float64
-        Scene units. Gaussians that no camera sees get the largest value of the others.
+    ``f = z_min / focal_max * sqrt(variance_px)``, with ``z_min`` the smallest z-depth, from
+    ``limits.NEAR_Z`` on, over the training cameras (at the training resolution) whose image,
+    enlarged by 15 % on each side, contains the mean; the variance is in squared pixels of the
+    closest camera. Means (n, 3), result (n,) float64, scene units. Gaussians that no camera sees
+    get the largest value of the others.
     """
     if len(cameras) == 0 or len(means) == 0:
         return np.zeros(len(means))
@@ -212,11 +193,11 @@ def mip_filter(
     threads = threads or default_threads()
 
     def run(begin: int, end: int) -> None:
-        _nearest_depth_rows(begin, end, points, packed, near_z, depth)
+        _nearest_depth_rows(begin, end, points, packed, limits.NEAR_Z, depth)
 
     run_chunks(run, even_bounds(len(points), threads), threads)
     seen = np.isfinite(depth)
-    depth[~seen] = depth[seen].max() if seen.any() else near_z
+    depth[~seen] = depth[seen].max() if seen.any() else limits.NEAR_Z
     focal_px = max(max(camera.fx, camera.fy) for camera in cameras)
     return depth / focal_px * math.sqrt(variance_px)
 
@@ -243,56 +224,36 @@ PhotoLoader = Callable[[int], tuple[Camera, np.ndarray, np.ndarray | None]]
 INITIAL_OPACITY = 0.1
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
-
 MIN_START_POINTS = 5000
 """With fewer sparse points, more are added until there are this many."""
-
 MIN_SPACING_SQ = 1e-7
 """Squared distances between neighbours are clamped to this (docs/method.md, section 1.3)."""
-
 MAX_SPACING_SHARE = 0.1
 """Largest size of an initial Gaussian relative to its distance to the nearest camera."""
-
 _DEPTH_NEIGHBOURS = 4
 _DEPTH_JITTER = 0.05
 """Relative standard deviation of added points around the depth of the nearest sparse points."""
-
 _DEPTH_TRIALS = 8
 
 
 def initial_gaussians(
-    scene: Scene,
-    view_indices: list[int],
-    load_photo: PhotoLoader,
-    *,
-    max_gaussians: int,
-    sh_degree: int,
-    seed: int,
-) -> OrientedGaussians:
+    scene: Scene, view_indices: list[int], load_photo: PhotoLoader, *, max_gaussians: int,
+    sh_degree: int, seed: int,
+) -> OrientedGaussians:  # fmt: skip
     """Return the Gaussians that training starts from (docs/method.md, section 1.3).
 
     One per sparse point within ``limits.POINT_REACH``: round, as large as the mean distance to
     its three nearest neighbours, opacity 0.1, orientation zero. Where there are fewer than
     :data:`MIN_START_POINTS`, random pixels are lifted to the depth of the nearest sparse points;
-    where there are none, to a random depth, keeping the positions that most cameras see.
+    where there are none, to a random depth, keeping the positions that most cameras see. Of more
+    points than ``max_gaussians``, a random subset is used. float32, with ``filter_3d`` zero.
 
     Parameters
     ----------
-    scene : Scene
     view_indices : list of int
         Views to use (without held-out ones).
     load_photo : callable
-        Returns camera, photo and mask of a view; only called if points are few.
-    max_gaussians : int
-        Upper bound; a random subset of the points is used if there are more.
-    sh_degree : int
-        Degree of the harmonics to allocate.
-    seed : int
-
-    Returns
-    -------
-    OrientedGaussians
-        float32, with ``filter_3d`` zero.
+        Only called if points are few.
 
     Raises
     ------
@@ -317,11 +278,8 @@ def initial_gaussians(
         points, colors = points[chosen], colors[chosen]
     wanted = min(MIN_START_POINTS, max_gaussians) - len(points)
     if wanted > 0:
-        more_points, more_colors = _points_along_rays(
-            points, wanted, view_indices, load_photo, random
-        )
-        points = np.concatenate([points, more_points])
-        colors = np.concatenate([colors, more_colors])
+        more, more_colors = _points_along_rays(points, wanted, view_indices, load_photo, random)
+        points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
     return gaussians_at(points, colors, point_spacing(points, cameras), sh_degree)
 
 
@@ -340,53 +298,27 @@ def point_spacing(points: np.ndarray, cameras: list[Camera]) -> np.ndarray:
 
 
 def gaussians_at(
-    points: np.ndarray,
-    colors: np.ndarray,
-    sizes: np.ndarray,
-    sh_degree: int,
-    *,
-    normals: np.ndarray | None = None,
-    flatness: np.ndarray | float = 1.0,
+    points: np.ndarray, colors: np.ndarray, sizes: np.ndarray, sh_degree: int, *,
+    normals: np.ndarray | None = None, flatness: np.ndarray | float = 1.0,
     opacities: np.ndarray | float = INITIAL_OPACITY,
-) -> OrientedGaussians:
+) -> OrientedGaussians:  # fmt: skip
     """Return Gaussians at points, round or flat across normals, without orientation.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    colors : (n, 3)
-        In [0, 1].
-    sizes : (n,)
-        Standard deviations along the surface.
-    sh_degree : int
-    normals : (n, 3), optional
-        Unit; the third axis of a Gaussian points along it.
-    flatness : (n,) or float
-        Standard deviation along the third axis, as a share of the size.
-    opacities : (n,) or float
+    Colours are (n, 3) in [0, 1], sizes (n,) standard deviations along the surface. The third axis
+    points along the unit normal; the standard deviation there is ``flatness`` times the size.
     """
     count = len(points)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (colors - 0.5) / SH_C0
-    quats = np.zeros((count, 4), np.float32)
-    quats[:, 0] = 1.0
-    if normals is not None:
-        quats = _turning_z_to(normals)
+    quats = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)) if normals is None else _turning_z_to(normals)
     log_scales = np.repeat(np.log(sizes)[:, None], 3, axis=1)  # (n, 3)
     log_scales[:, 2] += np.log(flatness)
     opacities = np.broadcast_to(opacities, count)
-    arrays = {
-        "means": points,
-        "log_scales": log_scales,
-        "quats": quats,
-        "opacity_logits": np.log(opacities / (1.0 - opacities)),
-        "sh": sh,
-        "orientation": np.zeros((count, 4)),
-        "filter_3d": np.zeros(count),
-    }
-    return OrientedGaussians(
-        **{name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}
-    )
+    arrays = (
+        points, log_scales, quats, np.log(opacities / (1.0 - opacities)), sh, np.zeros((count, 4)),
+        np.zeros(count),
+    )  # fmt: skip
+    return OrientedGaussians(*(torch.from_numpy(array.astype(np.float32)) for array in arrays))
 
 
 def _turning_z_to(normals: np.ndarray) -> np.ndarray:
@@ -400,12 +332,9 @@ def _turning_z_to(normals: np.ndarray) -> np.ndarray:
 
 
 def _points_along_rays(
-    points: np.ndarray,
-    wanted: int,
-    view_indices: list[int],
-    load_photo: PhotoLoader,
+    points: np.ndarray, wanted: int, view_indices: list[int], load_photo: PhotoLoader,
     random: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return ``wanted`` additional points with colours in [0, 1], from pixels of the photos."""
     views, cameras = [], []
     for index in view_indices:  # twice, as hundreds of photos do not fit into memory
@@ -422,9 +351,8 @@ def _points_along_rays(
         if count == 0:
             continue
         camera, photo, mask = load_photo(index)
-        allowed = np.arange(photo.shape[0] * photo.shape[1])
-        if mask is not None:
-            allowed = np.nonzero(mask.reshape(-1))[0]
+        pixel_count = photo.shape[0] * photo.shape[1]
+        allowed = np.arange(pixel_count) if mask is None else np.flatnonzero(mask)
         row, column = np.divmod(random.choice(allowed, count), photo.shape[1])  # (count,)
         pixels = np.stack([column, row], axis=1) + random.uniform(size=(count, 2))
         depth = _depth_near_points(points, camera, pixels, random)
@@ -442,17 +370,21 @@ def _depth_near_points(
     """(m,) depth of one of the sparse points nearest in the image; ``None`` without points."""
     if len(points) == 0:
         return None
-    where, depth = camera.project(points)
-    inside = (depth > limits.NEAR_Z) & (where >= 0).all(axis=1)
-    inside &= (where[:, 0] < camera.width) & (where[:, 1] < camera.height)
+    where, depth, inside = _seen_by(camera, points)
     if inside.sum() < _DEPTH_NEIGHBOURS:
         return None
     _, nearest = cKDTree(where[inside]).query(pixels, k=_DEPTH_NEIGHBOURS)
     pick = random.integers(0, _DEPTH_NEIGHBOURS, len(pixels))
     chosen = depth[inside][nearest[np.arange(len(pixels)), pick]]
-    return np.maximum(
-        chosen * (1.0 + _DEPTH_JITTER * random.normal(size=len(pixels))), limits.NEAR_Z
-    )
+    jitter = 1.0 + _DEPTH_JITTER * random.normal(size=len(pixels))
+    return np.maximum(chosen * jitter, limits.NEAR_Z)
+
+
+def _seen_by(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return pixels (n, 2), depths (n,), and which points lie in the frame, (n,) bool."""
+    where, depth = camera.project(points)
+    inside = (depth > limits.NEAR_Z) & (where >= 0).all(axis=1)
+    return where, depth, inside & (where[:, 0] < camera.width) & (where[:, 1] < camera.height)
 
 
 def _most_seen_depth(
@@ -469,13 +401,7 @@ def _most_seen_depth(
         positions = (rays * depth[:, None]) @ camera.rotation + camera.center
         seen = np.zeros(len(pixels), int)
         for other in cameras:
-            where, z = other.project(positions)
-            seen += (
-                (z > limits.NEAR_Z)
-                & (where >= 0).all(axis=1)
-                & (where[:, 0] < other.width)
-                & (where[:, 1] < other.height)
-            )
+            seen += _seen_by(other, positions)[2]
         better = seen > most
         best[better], most[better] = depth[better], seen[better]
     return best

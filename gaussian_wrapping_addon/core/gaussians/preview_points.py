@@ -26,19 +26,9 @@ _SH_C0: Final = 0.5 / math.sqrt(math.pi)
 
 
 def preview_points(means: np.ndarray, opacity_logits: np.ndarray, sh: np.ndarray) -> np.ndarray:
-    """Return at most :data:`MOST_POINTS` points, evenly chosen among the visible Gaussians.
+    """Return at most :data:`MOST_POINTS` of type :data:`POINT`, evenly chosen of visible Gaussians.
 
-    Parameters
-    ----------
-    means : (n, 3) float
-        Scene frame.
-    opacity_logits : (n,) float
-    sh : (n, k, 3) float
-        Coefficients of the spherical harmonics; the constant ones are the colours.
-
-    Returns
-    -------
-    (m,) array of :data:`POINT`
+    Means are (n, 3), scene frame; the constant ones of the (n, k, 3) harmonics are the colours.
     """
     logit = math.log(VISIBLE_OPACITY / (1.0 - VISIBLE_OPACITY))
     seen = np.flatnonzero((opacity_logits > logit) & np.isfinite(means).all(1))

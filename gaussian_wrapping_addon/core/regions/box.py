@@ -18,13 +18,7 @@ FLAT_SHARE = 1e-6
 
 
 def check_volume(vertices: np.ndarray, name: str) -> None:
-    """Raise an error for corners that enclose no volume.
-
-    Parameters
-    ----------
-    vertices : (n, 3) float64
-    name : str
-        Name of the region, for messages.
+    """Raise an error for (n, 3) corners of the region of that name that enclose no volume.
 
     Raises
     ------
@@ -32,15 +26,12 @@ def check_volume(vertices: np.ndarray, name: str) -> None:
         Fewer than four corners, too many, not finite, or all in one plane.
     """
     if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < 4:
-        raise MeshingError(
-            f"Region {name!r} needs at least four corners.", "Draw a box around the object."
-        )
+        text = f"Region {name!r} needs at least four corners."
+        raise MeshingError(text, "Draw a box around the object.")
     if len(vertices) > limits.MAX_REGION_VERTICES:
-        raise MeshingError(
-            f"Region {name!r} has {len(vertices)} corners; the limit is "
-            f"{limits.MAX_REGION_VERTICES}.",
-            "Use a simpler body, such as a box.",
-        )
+        text = f"Region {name!r} has {len(vertices)} corners; the limit is "
+        text += f"{limits.MAX_REGION_VERTICES}."
+        raise MeshingError(text, "Use a simpler body, such as a box.")
     if not np.isfinite(vertices).all():
         raise MeshingError(f"Region {name!r} has a corner that is not finite.", "Draw it again.")
     if not _is_thick(vertices):
@@ -80,17 +71,7 @@ BOX_TOLERANCE = 1e-5
 
 
 def hull_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the visible edges of a convex hull: those not within its flat faces.
-
-    Parameters
-    ----------
-    vertices : (n, 3) float64
-    triangles : (m, 3) int
-
-    Returns
-    -------
-    edges : (k, 2) int
-    """
+    """Return the (k, 2) visible edges of a convex hull of triangles, not within flat faces."""
     corners = vertices[triangles]  # (m, 3, 3)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # (m, 3)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -108,29 +89,21 @@ def hull_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def box_matrix(vertices: np.ndarray) -> np.ndarray | None:
-    """Return the matrix that maps :data:`CUBE_CORNERS` onto a box, or None if it is no box.
+    """Return the matrix that maps :data:`CUBE_CORNERS` onto (n, 3) corners, or None for no box.
 
-    Parameters
-    ----------
-    vertices : (n, 3) float64
-
-    Returns
-    -------
-    matrix : (4, 4) float64 or None
-        Rotation, positive scale and translation, with axes as close to x, y, z as possible.
+    It is (4, 4): rotation, positive scale and translation, with axes as close to x, y, z as
+    possible.
     """
     if vertices.shape != (8, 3):
         return None
-    diagonal = float(np.linalg.norm(np.ptp(vertices, 0)))
-    tolerance = BOX_TOLERANCE * diagonal
+    tolerance = BOX_TOLERANCE * float(np.linalg.norm(np.ptp(vertices, 0)))
     offsets = vertices[1:] - vertices[0]  # (7, 3)
     for indices in itertools.combinations(range(7), 3):
         edges = offsets[list(indices)]  # (3, 3), one edge a row
         lengths = np.linalg.norm(edges, axis=1)
         gram = edges @ edges.T
-        if lengths.min() <= tolerance or np.abs(gram - np.diag(np.diag(gram))).max() > (
-            tolerance * lengths.max()
-        ):
+        skew = np.abs(gram - np.diag(np.diag(gram))).max()
+        if lengths.min() <= tolerance or skew > tolerance * lengths.max():
             continue
         corners = vertices[0] + 0.5 * (CUBE_CORNERS + 1.0) @ edges  # (8, 3)
         distances = np.linalg.norm(corners[:, None] - vertices[None], axis=2)  # (8, 8)
@@ -146,8 +119,7 @@ def _nearest_axes(center: np.ndarray, edges: np.ndarray, lengths: np.ndarray) ->
         rotation = (edges / lengths[:, None])[list(order)].T  # (3, 3), one axis a column
         rotation = rotation * np.where(np.diag(rotation) < 0.0, -1.0, 1.0)
         if np.linalg.det(rotation) < 0.0:
-            weakest = int(np.argmin(np.diag(rotation)))
-            rotation[:, weakest] *= -1.0
+            rotation[:, int(np.argmin(np.diag(rotation)))] *= -1.0
         if np.trace(rotation) > best_trace + 1e-9:
             best_trace = float(np.trace(rotation))
             best = np.eye(4)

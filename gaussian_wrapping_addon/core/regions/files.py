@@ -27,23 +27,19 @@ from .box import CUBE_CORNERS, CUBE_TRIANGLES, box_matrix, check_volume
 
 SUFFIXES: Final = (".rsbox", ".rcbox")
 """Of RealityScan, and of RealityCapture before it."""
-
 MAX_BYTES: Final = 64 * 1024
 """Files of the programs have about 600 bytes; what is larger holds something else."""
 MAX_COORDINATE: Final = 1e12
-"""As in region files (``files.py``)."""
+"""Beyond this, float64 leaves less than a tenth of a millimetre."""
 GIMBAL_SINE: Final = 1.0 - 1e-12
 """Of the middle angle; beyond it, the two others turn about the same axis, and one is set to 0."""
 RESIDUAL_TOLERANCE: Final = 1e-9
 """Of a residual transform's numbers from those of the identity; the programs write whole ones."""
-
 _ROOT: Final = "ReconstructionRegion"
 _AGAIN: Final = "Export the reconstruction region again."
 _IDENTITY: Final = {
-    "R": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
-    "t": (0.0,) * 3,
-    "s": (1.0,),
-}
+    "R": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), "t": (0.0,) * 3, "s": (1.0,),
+}  # fmt: skip
 
 
 def is_rsbox(path: Path) -> bool:
@@ -52,28 +48,18 @@ def is_rsbox(path: Path) -> bool:
 
 
 def read_rsbox(path: Path) -> np.ndarray:
-    """Read a reconstruction region.
+    """Read a reconstruction region: (8, 3) corners in the coordinates of its project.
 
-    Returns
-    -------
-    vertices : (8, 3) float64
-        Corners of the box in the coordinates of its project, in the order of
-        :data:`~.box.CUBE_CORNERS` along the box's own axes.
+    They are in the order of :data:`~.box.CUBE_CORNERS` along the box's own axes.
 
     Raises
     ------
-    DatasetError
+    OSError
         The file cannot be read.
     ParseError
         Names the file, the entry and what to do; no values are guessed.
     """
-    try:
-        data = read_bounded(path, MAX_BYTES, follow_links=True)
-    except OSError as error:
-        raise DatasetError(
-            f"Region file {path} cannot be read: {error.strerror}.", "Check its permissions."
-        ) from None
-    root = _root(path, data)
+    root = _root(path, read_bounded(path, MAX_BYTES, follow_links=True))
     _check_frame(path, root)
     size = _numbers(path, root, "widthHeightDepth", 3)
     if min(size) <= 0.0:
@@ -84,14 +70,7 @@ def read_rsbox(path: Path) -> np.ndarray:
 
 
 def write_rsbox(path: Path, vertices: np.ndarray, name: str = "region") -> None:
-    """Write a box as a reconstruction region, atomically.
-
-    Parameters
-    ----------
-    vertices : (8, 3) float64
-        Corners in any order, world frame.
-    name : str
-        Of the region, for messages.
+    """Write a box, (8, 3) world corners in any order, as a reconstruction region, atomically.
 
     Raises
     ------
@@ -100,21 +79,15 @@ def write_rsbox(path: Path, vertices: np.ndarray, name: str = "region") -> None:
     """
     matrix = box_matrix(np.asarray(vertices, np.float64))
     if matrix is None:
-        raise UsageError(
-            f"Region {name!r} is no box, and {path.suffix} files hold only boxes.",
-            "Export it as .json.",
-        )
+        text = f"Region {name!r} is no box, and {path.suffix} files hold only boxes."
+        raise UsageError(text, "Export it as .json.")
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)  # (3,), half of each side
     root = ElementTree.Element(
-        _ROOT,
-        globalCoordinateSystem="NONE",
-        globalCoordinateSystemWkt="NONE",
-        globalCoordinateSystemName="NONE",
-        isGeoreferenced="0",
-        isLatLon="0",
+        _ROOT, globalCoordinateSystem="NONE", globalCoordinateSystemWkt="NONE",
+        globalCoordinateSystemName="NONE", isGeoreferenced="0", isLatLon="0",
         yawPitchRoll=_text(angles_of(matrix[:3, :3] / lengths)),
         widthHeightDepth=_text(2.0 * lengths),
-    )
+    )  # fmt: skip
     ElementTree.SubElement(root, "Header", magic="5395016", version="2")
     centre = ElementTree.SubElement(ElementTree.SubElement(root, "CentreEuclid"), "centre")
     centre.text = _text(matrix[:3, 3])
@@ -128,10 +101,8 @@ def rotation_of(yaw: float, pitch: float, roll: float) -> np.ndarray:
 
     A box is turned about x by -pitch, then about y by -yaw, then about z by -roll.
     """
-    (cx, sx), (cy, sy), (cz, sz) = (
-        (math.cos(math.radians(-angle)), math.sin(math.radians(-angle)))
-        for angle in (pitch, yaw, roll)
-    )
+    turns = [math.radians(-angle) for angle in (pitch, yaw, roll)]
+    (cx, sx), (cy, sy), (cz, sz) = ((math.cos(turn), math.sin(turn)) for turn in turns)
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
     about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
     about_z = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
@@ -156,9 +127,9 @@ def _root(path: Path, data: bytes) -> ElementTree.Element:
     except UnicodeDecodeError as error:
         raise ParseError(path, f"byte {error.start}", "not UTF-8 text.", _AGAIN) from None
     # Entities could grow without bound; regions have neither them nor a document type.
-    for word in ("<!DOCTYPE", "<!ENTITY"):
-        if word in text:
-            raise ParseError(path, "whole file", f"{word[2:]} is not allowed.", _AGAIN)
+    for word in ("DOCTYPE", "ENTITY"):
+        if f"<!{word}" in text:
+            raise ParseError(path, "whole file", f"{word} is not allowed.", _AGAIN)
     try:
         root = ElementTree.fromstring(text)  # noqa: S314 - small, without entities
     except ElementTree.ParseError as error:
@@ -166,9 +137,8 @@ def _root(path: Path, data: bytes) -> ElementTree.Element:
     except (ValueError, LookupError):  # NUL characters, an encoding that does not exist
         raise ParseError(path, "whole file", "not XML.", _AGAIN) from None
     if root.tag != _ROOT:
-        raise ParseError(
-            path, "root", f"is {root.tag[:40]!r}, not {_ROOT!r}.", "Choose a region file."
-        )
+        text = f"is {root.tag[:40]!r}, not {_ROOT!r}."
+        raise ParseError(path, "root", text, "Choose a region file.")
     return root
 
 
@@ -177,12 +147,10 @@ def _check_frame(path: Path, root: ElementTree.Element) -> None:
     local = name == "NONE" or name.startswith("local:")
     if root.get("isLatLon", "0") != "0" or not local:
         raise ParseError(
-            path,
-            "globalCoordinateSystemName",
-            f"{name[:60]!r} is not a local Euclidean frame.",
+            path, "globalCoordinateSystemName", f"{name[:60]!r} is not a local Euclidean frame.",
             "Set the project's output coordinate system to local Euclidean, and export the region "
             "and the cameras again.",
-        )
+        )  # fmt: skip
     residual = root.find("Residual")
     if residual is None:
         return
@@ -223,25 +191,19 @@ def _text(numbers: Any) -> str:
     return " ".join(f"{float(number) + 0.0:.15g}" for number in numbers)
 
 
-# -- Read and write region files (docs/file-formats.md): bounding-volume JSON, version 1, and the
-#
-# reconstruction regions of RealityScan.
+# -- Region files (docs/file-formats.md): bounding-volume JSON, version 1, and those of RealityScan
 
 
 CLASS_NAME = "GaussianWrappingBoundingVolume"
 VERSION = 1
-REGION_FILE_MAX_COORDINATE = 1e12
-"""Beyond this, float64 leaves less than a tenth of a millimetre."""
 
 
 @dataclass(frozen=True)
 class RegionFile:
     """Contents of a region file; the region is the convex hull of its vertices."""
 
-    name: str
-    """Not empty, encodable, within :data:`limits.MAX_NAME_BYTES`."""
-    vertices: np.ndarray
-    """(n, 3) float64, world frame, finite, enclosing a volume."""
+    name: str  # Not empty, encodable, within :data:`limits.MAX_NAME_BYTES`
+    vertices: np.ndarray  # (n, 3) float64, world frame, finite, enclosing a volume
 
 
 def read_region_file(path: Path) -> RegionFile:
@@ -271,9 +233,9 @@ def read_region_body(path: Path) -> Any:
         raise DatasetError(f"{path} is a folder, not a region file.", "Give a file in it.")
     if not path.is_file():
         raise DatasetError(f"Region file {path} does not exist.", "Check the path.")
-    if is_rsbox(path):
-        return region_to_json(path.stem, read_rsbox(path), CUBE_TRIANGLES)
     try:
+        if is_rsbox(path):
+            return region_to_json(path.stem, read_rsbox(path), CUBE_TRIANGLES)
         return read_json(path, follow_links=True)
     except OSError as error:
         raise DatasetError(
@@ -297,28 +259,24 @@ def parse_region_file(values: Any, path: Path) -> RegionFile:
         raise ParseError(path, "class_name", f"is not {CLASS_NAME!r}.", "Choose a region file.")
     version = values.get("version")
     if isinstance(version, bool) or version != VERSION:
-        raise ParseError(
-            path, "version", f"{str(version)[:20]!r} is not known; {VERSION} is.", again
-        )
+        text = f"{str(version)[:20]!r} is not known; {VERSION} is."
+        raise ParseError(path, "version", text, again)
     name = printable_name(values.get("blender_object_name")) or printable_name(path.stem)
+    name = name or "region"
     vertices = _parse_vertices(values.get("vertices"), path, again)
     try:
-        check_volume(vertices, name or "region")
+        check_volume(vertices, name)
     except MeshingError as error:
         raise ParseError(path, "vertices", error.message, error.hint) from None
-    return RegionFile(name or "region", vertices)
+    return RegionFile(name, vertices)
 
 
 def _parse_vertices(rows: Any, path: Path, hint: str) -> np.ndarray:
     if not isinstance(rows, list):
         raise ParseError(path, "vertices", "is missing or not a list.", hint)
     if len(rows) > limits.MAX_REGION_VERTICES:
-        raise ParseError(
-            path,
-            "vertices",
-            f"holds {len(rows)} corners; the limit is {limits.MAX_REGION_VERTICES}.",
-            "Use a simpler body, such as a box.",
-        )
+        text = f"holds {len(rows)} corners; the limit is {limits.MAX_REGION_VERTICES}."
+        raise ParseError(path, "vertices", text, "Use a simpler body, such as a box.")
     for index, row in enumerate(rows):
         if not isinstance(row, list) or len(row) != 3 or not all(map(_is_coordinate, row)):
             raise ParseError(path, f"vertices[{index}]", "is not three finite numbers.", hint)
@@ -328,28 +286,18 @@ def _parse_vertices(rows: Any, path: Path, hint: str) -> np.ndarray:
 def _is_coordinate(value: Any) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
-    return abs(value) <= REGION_FILE_MAX_COORDINATE  # false for NaN as well
+    return abs(value) <= MAX_COORDINATE  # false for NaN as well
 
 
 def region_to_json(
     name: str, vertices: np.ndarray, simplices: Iterable[Iterable[int]] | None = None
 ) -> dict[str, Any]:
-    """Return the JSON values of a region file.
-
-    Parameters
-    ----------
-    vertices : (n, 3) float64
-        World frame.
-    simplices : iterable of index triples, optional
-        Triangles of the hull.
-    """
+    """Return the JSON values of a region file: (n, 3) world vertices, triangles of the hull."""
     return {
-        "class_name": CLASS_NAME,
-        "version": VERSION,
-        "blender_object_name": name,
+        "class_name": CLASS_NAME, "version": VERSION, "blender_object_name": name,
         "vertices": np.asarray(vertices, np.float64).tolist(),
         "hull_simplices": None if simplices is None else [list(map(int, s)) for s in simplices],
-    }
+    }  # fmt: skip
 
 
 def write_region_file(

@@ -18,7 +18,7 @@ from ..gaussians.model import GaussianArrays
 from ..scene.camera import Camera, Similarity
 from ..scene.frames import CENTER_STEP, snapped
 from ..scene.scene import Scene
-from .files import RegionFile, parse_region_file, read_region_body, write_region_file
+from .files import parse_region_file, read_region_body, write_region_file
 from .shapes import Region
 
 # -- Find the vertices on the boundary planes of a region, so that later steps keep them there ----
@@ -27,7 +27,6 @@ from .shapes import Region
 ON_PLANE_SHARE = 1e-9
 """Tolerance for a vertex on a face's plane, in diagonals of the region: caps are made on the planes
 up to rounding."""
-
 MAX_PLANES = 3
 
 
@@ -35,14 +34,10 @@ MAX_PLANES = 3
 class CapPlanes:
     """Planes of a region's boundary, in the caller's coordinates, and the vertices on them."""
 
-    normals: np.ndarray
-    """(k, 3) float64, outward."""
-    offsets: np.ndarray
-    """(k,) float64: inside is ``normals @ x <= offsets``."""
-    planes: np.ndarray
-    """(v, 3) int64: planes that each vertex lies on, -1 for none."""
-    fixed: np.ndarray
-    """(v,) bool: vertices on more than three planes, which cannot move."""
+    normals: np.ndarray  # (k, 3) float64, outward
+    offsets: np.ndarray  # (k,) float64: inside is ``normals @ x <= offsets``
+    planes: np.ndarray  # (v, 3) int64: planes that each vertex lies on, -1 for none
+    fixed: np.ndarray  # (v,) bool: vertices on more than three planes, which cannot move
 
 
 def cap_planes(vertices: np.ndarray, region: Region | None) -> CapPlanes:
@@ -70,7 +65,6 @@ def cap_planes(vertices: np.ndarray, region: Region | None) -> CapPlanes:
 STEP_BITS = 20
 """The step is at most this many halvings of the body's diagonal (one millionth of it), and at most
 that of camera centres."""
-
 _TIE_STEP = 2.0**-12
 """Distances that differ by less, as a share of the largest, count as equal: corners of a box can be
 equally far from its diagonal, up to rounding."""
@@ -127,39 +121,28 @@ _logger = logging.getLogger(__name__)
 
 MIN_POINTS = 24
 """Least number of weighted points from which an extent is estimated."""
-
 WEIGHT_THAT_COUNTS = 1e-3
-
 WELL_SEEN_SHARE = 0.6
 """Points in fewer than this share of the most-seen point's views have little weight."""
-
 VOXEL_SHARE = 0.06
 """Side, in frame sizes, of the voxels that balance the density of keypoints."""
-
 TAIL_SHARE = 0.01
 """Share of the weight trimmed at each end of each axis."""
-
 PADDING_SHARE = 0.08
 """Margin around the points: keypoints lie on the surface, but seldom at its extremes."""
-
 HEADROOM = 0.15
 HEAD_TAIL_DIVISOR = 5.0
 """At the top of the box: extra share of the height, and divisor of the trimmed tail."""
-
 ROTATED_GAIN = 0.9
 """A rotated box is preferred only below this share of the axis-aligned box's footprint."""
-
 APART_SHARE = 0.4
 """Photos look at no one thing if the middles of half of them pass their common point by more than
 this share of the cameras' spread: 0.02 to 0.22 around things, 0.6 and more inside rooms, along
 streets, and in parallel rows."""
-
 SURROUNDINGS_REACH = 3.0
 """Reach of what such photos show, in median distances of points from the nearest camera."""
-
 SURROUNDINGS_MIN_VIEWS = 3
 """Photos that must show a point of theirs; all, where there are fewer."""
-
 WHOLE_TAIL_SHARE = 0.005
 WHOLE_MIN_ALPHA = 0.1
 WHOLE_MIN_VIEWS = 2
@@ -174,17 +157,8 @@ def automatic_region(scene: Scene) -> Region:
     closeness to the point where the middles of the photos converge, in units of the frame size
     there; the box spans robust quantiles of the weight. Outlying cameras and points have no weight.
     Photos that look at no one thing, as inside a room or in a row, get a box around all near points
-    that several of them show.
-
-    Parameters
-    ----------
-    scene : Scene
-        In the scene frame; its points may be few or none.
-
-    Returns
-    -------
-    Region
-        In the scene frame, named ``"auto"``.
+    that several of them show. The region is in the scene frame, named ``"auto"``; points may be few
+    or none.
 
     Raises
     ------
@@ -193,17 +167,22 @@ def automatic_region(scene: Scene) -> Region:
     """
     cameras = _usable_cameras(scene.cameras)
     focus, distance = _focus(cameras, scene.points)
-    frame_size = distance * _half_frame(cameras)  # half of the frame's short side at the focus
+    # Half of the frame's short side at the focus: from the median of the narrower field of view.
+    narrow = [min(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]
+    frame_size = distance * float(np.median(narrow))
     points = scene.points[np.isfinite(scene.points).all(1)] if len(scene.points) else scene.points
     if not _look_at_one_thing(cameras, focus):
         near = _surroundings(points, cameras)
         if len(near) >= MIN_POINTS:
             weight = _thinned(near, VOXEL_SHARE * frame_size)
             if (weight > WEIGHT_THAT_COUNTS).sum() >= MIN_POINTS:
-                return _box_around("auto", near, weight, TAIL_SHARE, PADDING_SHARE)
+                return _box_around("auto", near, weight, TAIL_SHARE)
     if len(points) >= MIN_POINTS:
         seen = _views_of(points, cameras) / len(cameras)  # (n,) share of views
-        support = _ramp(seen / max(seen.max(), 1e-12)) * _thinned(points, VOXEL_SHARE * frame_size)
+        share = seen / max(seen.max(), 1e-12)
+        # From 0 at half of the share to 1.
+        ramp = np.clip(2.0 * share / WELL_SEEN_SHARE - 1.0, 0.0, 1.0)
+        support = ramp * _thinned(points, VOXEL_SHARE * frame_size)
         for _ in range(3):
             offset = np.linalg.norm(points - focus, axis=1) / frame_size  # (n,)
             weight = np.exp(-2.0 * offset**2) * support
@@ -211,20 +190,14 @@ def automatic_region(scene: Scene) -> Region:
                 break
             focus = _weighted_quantiles(points, weight, np.array([0.5]))[0]
         if (weight > WEIGHT_THAT_COUNTS).sum() >= MIN_POINTS:
-            return _box_around("auto", points, weight, TAIL_SHARE, PADDING_SHARE)
+            return _box_around("auto", points, weight, TAIL_SHARE)
     _logger.warning("Too few sparse points for an automatic region: using only the cameras")
     half = np.full(3, 0.6 * frame_size)
     return Region.box("auto", focus - half, focus + half)
 
 
 def whole_region(scene: Scene, arrays: GaussianArrays) -> Region:
-    """Return a robust bounding box of all that at least two photos see.
-
-    Parameters
-    ----------
-    scene : Scene
-    arrays : GaussianArrays
-        Trained Gaussians, scene frame; faint ones are ignored.
+    """Return a robust bounding box of all trained Gaussians but faint ones that two photos see.
 
     Raises
     ------
@@ -235,15 +208,12 @@ def whole_region(scene: Scene, arrays: GaussianArrays) -> Region:
     focus, distance = _focus(cameras, scene.points)
     solid = arrays.log_opacities > np.log(WHOLE_MIN_ALPHA)
     points = arrays.means[solid & np.isfinite(arrays.means).all(1)]
-    near = np.linalg.norm(points - focus, axis=1) < WHOLE_REACH * distance
-    points = points[near]
-    seen = _views_of(points, cameras)
-    points = points[seen >= min(WHOLE_MIN_VIEWS, len(cameras))]
+    points = points[np.linalg.norm(points - focus, axis=1) < WHOLE_REACH * distance]
+    points = points[_views_of(points, cameras) >= min(WHOLE_MIN_VIEWS, len(cameras))]
     if len(points) < 4:
-        raise MeshingError(
-            "No Gaussian is seen by two photos.", "Train longer, or draw a region by hand."
-        )
-    return _box_around("all", points, np.ones(len(points)), WHOLE_TAIL_SHARE, PADDING_SHARE)
+        hint = "Train longer, or draw a region by hand."
+        raise MeshingError("No Gaussian is seen by two photos.", hint)
+    return _box_around("all", points, np.ones(len(points)), WHOLE_TAIL_SHARE)
 
 
 def _usable_cameras(cameras: Sequence[Camera]) -> list[Camera]:
@@ -255,11 +225,6 @@ def _usable_cameras(cameras: Sequence[Camera]) -> list[Camera]:
     away = np.linalg.norm(centers - np.median(centers, 0), axis=1)
     limit = 10.0 * np.median(away)
     return [c for c, a in zip(good, away, strict=True) if a <= limit] or good
-
-
-def _half_frame(cameras: Sequence[Camera]) -> float:
-    """Return the median tangent of half the narrower field of view."""
-    return float(np.median([min(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]))
 
 
 def _focus(cameras: Sequence[Camera], points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -351,11 +316,6 @@ def _thinned(points: np.ndarray, side: float) -> np.ndarray:
     return np.where(own > 1, own**-0.75, 0.0)
 
 
-def _ramp(share: np.ndarray) -> np.ndarray:
-    """Return a linear ramp: 0 below half of :data:`WELL_SEEN_SHARE`, 1 above it."""
-    return np.clip(2.0 * share / WELL_SEEN_SHARE - 1.0, 0.0, 1.0)
-
-
 def _weighted_quantiles(values: np.ndarray, weight: np.ndarray, shares: np.ndarray) -> np.ndarray:
     """Return weighted quantiles of each column of (n, k) values, (len(shares), k).
 
@@ -370,9 +330,7 @@ def _weighted_quantiles(values: np.ndarray, weight: np.ndarray, shares: np.ndarr
     return result
 
 
-def _box_around(
-    name: str, points: np.ndarray, weight: np.ndarray, tail: float, padding: float
-) -> Region:
+def _box_around(name: str, points: np.ndarray, weight: np.ndarray, tail: float) -> Region:
     """Return the smallest robust Z-up box over yaw angles."""
     shares = np.array([tail, 1.0 - tail])
     best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
@@ -387,24 +345,15 @@ def _box_around(
     assert best is not None
     _, rotation, low, high = best
     size = high - low
-    pad = padding * size + 0.25 * padding * size.max()  # flat scenes need a margin as well
+    # Flat scenes need a margin as well.
+    pad = PADDING_SHARE * size + 0.25 * PADDING_SHARE * size.max()
     # Empty space above costs nothing, and tips (a stem, a finial) have few keypoints.
     head = _weighted_quantiles(points[:, 2:], weight, np.array([1.0 - tail / HEAD_TAIL_DIVISOR]))
     high[2] = max(high[2], float(head[0, 0])) + HEADROOM * size[2]
     return Region.box(name, low - pad, high + pad, rotation)
 
 
-# -- Read and write regions; re-exports the region class and the automatic regions ----------------
-
-
-__all__ = [
-    "Region",
-    "automatic_region",
-    "parse_region",
-    "read_region",
-    "whole_region",
-    "write_region",
-]
+# -- Read and write regions -----------------------------------------------------------------------
 
 
 def read_region(path: Path) -> Region:
@@ -432,17 +381,13 @@ def parse_region(values: Any, path: Path) -> Region:
         region = Region(file.name, file.vertices)
     except MeshingError as error:
         raise ParseError(path, "vertices", error.message, error.hint) from None
-    _warn_about_inner_corners(region, file, path)
-    return region
-
-
-def _warn_about_inner_corners(region: Region, file: RegionFile, path: Path) -> None:
-    used = len(np.unique(region.simplices))
-    if used < len(file.vertices):
+    used, count = len(np.unique(region.simplices)), len(file.vertices)
+    if used < count:
         _logger.warning(
             "%s: %d of %d corners lie inside the convex hull; the hull is used",
-            path.name, len(file.vertices) - used, len(file.vertices),
+            path.name, count - used, count,
         )  # fmt: skip
+    return region
 
 
 def write_region(path: Path, region: Region) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from ..scene.camera import Similarity
-from .box import check_volume, flat_region_error
+from .box import CUBE_CORNERS, check_volume, flat_region_error
 
 # -- Partition space into boxes that hold about the same weight each ------------------------------
 
@@ -63,30 +63,18 @@ class Tiling:
     @classmethod
     def from_json(cls, values: Sequence[Sequence[float]]) -> Tiling:
         """Build from JSON values."""
-        return cls(
-            tuple((int(tile), int(axis), float(coordinate)) for tile, axis, coordinate in values)
-        )
+        return cls(tuple((int(tile), int(axis), float(at)) for tile, axis, at in values))
 
 
 def split_evenly(
-    centers: np.ndarray,
-    weights: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray],
+    centers: np.ndarray, weights: np.ndarray, bounds: tuple[np.ndarray, np.ndarray],
     enough: Callable[[int, float], bool],
-) -> Tiling:
+) -> Tiling:  # fmt: skip
     """Split the heaviest tile in two until there are enough.
 
     A tile is split at the median of its weight, along the longest side of the bounding box of its
-    contents.
-
-    Parameters
-    ----------
-    centers : (n, 3) float64
-    weights : (n,) float64
-    bounds : pair of (3,)
-        Bounds of the whole; where nothing has weight, tiles are halved.
-    enough : callable
-        Maps the number of tiles and the greatest weight to whether to stop.
+    contents; where nothing has weight, it is halved within the bounds of the whole. ``enough`` maps
+    the number of tiles and the greatest weight to whether to stop.
     """
     owner = np.zeros(len(centers), np.int64)
     tile_weights, splits = [float(weights.sum())], []
@@ -123,10 +111,6 @@ def split_evenly(
 COPLANAR_COSINE = 1.0 - 1e-9
 """Hull triangles whose normals have at least this cosine belong to one face."""
 
-_UNIT_CORNERS = np.array(
-    [[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
-)  # (8, 3)
-
 
 @dataclass(frozen=True)
 class Region:
@@ -139,46 +123,36 @@ class Region:
     """
 
     name: str
-    vertices: np.ndarray
-    """(v, 3) float64; their convex hull is the body."""
+    vertices: np.ndarray  # (v, 3) float64; their convex hull is the body
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, np.float64)
         check_volume(vertices, self.name)
         vertices.setflags(write=False)
         object.__setattr__(self, "vertices", vertices)
-        if not self._has_hull():
-            raise flat_region_error(self.name)
-
-    def _has_hull(self) -> bool:
         try:
-            return bool(self._hull.volume > 0.0)
+            if self._hull.volume > 0.0:
+                return
         except QhullError:
-            return False
+            pass
+        raise flat_region_error(self.name)
 
     @classmethod
     def box(
         cls, name: str, low: np.ndarray, high: np.ndarray, rotation: np.ndarray | None = None
     ) -> Region:
-        """Return the box from corner ``low`` to ``high`` in a rotated frame.
+        """Return the box from corner ``low`` to ``high`` of its own frame, (3,) each.
 
-        Parameters
-        ----------
-        low, high : (3,) array
-            Corners in the box's own frame.
-        rotation : (3, 3) array or None
-            Maps the box's own frame into the caller's: ``x = rotation @ local``.
+        The rotation maps that into the caller's: ``x = rotation @ local``.
         """
         low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-        corners = (low + high) / 2 + _UNIT_CORNERS * (high - low) / 2  # (8, 3)
+        corners = (low + high) / 2 + CUBE_CORNERS * (high - low) / 2  # (8, 3)
         return cls(name, corners if rotation is None else corners @ np.asarray(rotation).T)
 
     @cached_property
     def _hull(self) -> ConvexHull:
         # Centred and scaled: a 1 m body at UTM coordinates would lose seven digits.
-        low, high = self.bounds
-        diagonal = np.linalg.norm(high - low)
-        return ConvexHull((self.vertices - (low + high) / 2) / diagonal)
+        return ConvexHull((self.vertices - self.center) / self.diagonal)
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:

@@ -45,23 +45,12 @@ def texel_corners(corner_uvs: np.ndarray, size_px: int) -> np.ndarray:
 
 
 def raster_atlas(
-    corner_uvs: np.ndarray,
-    size_px: int,
-    threads: int,
-    faces: np.ndarray | None = None,
+    corner_uvs: np.ndarray, size_px: int, threads: int, faces: np.ndarray | None = None
 ) -> AtlasRaster:
     """Rasterise UV triangles: exact at centres, plus one ring of texels that are only touched.
 
-    Parameters
-    ----------
-    corner_uvs : (f, 3, 2) float32
-        UVs in [0, 1], v upwards.
-    size_px : int
-        Side of the atlas.
-    threads : int
-        Threads to use; the result does not depend on it.
-    faces : (f,) bool, optional
-        Faces in this atlas; all by default.
+    UVs are (f, 3, 2) in [0, 1], v upwards; ``faces``, (f,) bool, chooses those in this atlas. The
+    result does not depend on the number of threads.
     """
     corners = texel_corners(corner_uvs, size_px)
     if faces is not None:
@@ -179,32 +168,19 @@ def _raster_touched(
 class TexelPoints:
     """Surface points of texels."""
 
-    face: np.ndarray
-    """(n,) int32."""
-    weights: np.ndarray
-    """(n, 3) float64 barycentric weights of the face's corners."""
-    points: np.ndarray
-    """(n, 3) float64 positions."""
-    raw_normals: np.ndarray
-    """(n, 3) float64 interpolated vertex normals, not of unit length."""
-    normals: np.ndarray
-    """(n, 3) float64 the same, normalised."""
+    face: np.ndarray  # (n,) int32
+    weights: np.ndarray  # (n, 3) float64 barycentric weights of the face's corners
+    points: np.ndarray  # (n, 3) float64 positions
+    raw_normals: np.ndarray  # (n, 3) float64 interpolated vertex normals, not of unit length
+    normals: np.ndarray  # (n, 3) float64 the same, normalised
 
 
 def texel_points(
     mesh: SurfaceMesh, raster: AtlasRaster, texels: np.ndarray, normals: np.ndarray
 ) -> TexelPoints:
-    """Return the surface points of some texels.
+    """Return the surface points of texels: (n,) flat indices into the raster of the mesh's UVs.
 
-    Parameters
-    ----------
-    mesh : SurfaceMesh
-    raster : AtlasRaster
-        Raster of its UVs.
-    texels : (n,) int64
-        Flat indices of texels with a face.
-    normals : (v, 3) float64
-        Vertex normals.
+    The texels have a face; ``normals`` are those of the vertices, (v, 3).
     """
     face = raster.face.ravel()[texels]
     bary = raster.bary.reshape(-1, 2)[texels].astype(np.float64)

@@ -14,7 +14,14 @@ from ..render.types import RenderOptions
 from ..scene.camera import Camera
 from ..scene.scene import PhotoSource
 from .bake import AtlasPoints, BakedColors, blocks_of
-from .fill import BLEND_TEXELS, HarmonicFill, dilate, fill_background, surface_positions
+from .fill import (
+    BLEND_TEXELS,
+    HarmonicFill,
+    dilate,
+    fill_background,
+    fill_gutters,
+    surface_positions,
+)
 from .photo_samples import SurfaceArrays
 
 # -- Renderings of the Gaussians as a replacement for photos in baking, rendered on demand --------
@@ -31,21 +38,15 @@ class GaussianPhotos:
     objects in single photos. The detail is that of the Gaussians. Only the last rendering is
     cached.
 
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        In the scene frame.
-    photos : PhotoStore
-        Source of cameras and masks.
-    threads : int
-        The result does not depend on it.
+    The Gaussians are in the scene frame; cameras and masks are those of ``photos``. The result does
+    not depend on the number of threads.
     """
 
     def __init__(self, gaussians: OrientedGaussians, photos: PhotoSource, *, threads: int) -> None:
-        self._gaussians = gaussians
-        self._photos = photos
+        self._gaussians, self._photos = gaussians, photos
         self._options = RenderOptions(depth=False, sh_degree=0, threads=threads)
-        self._last: tuple[tuple[int, int], np.ndarray, np.ndarray] | None = None
+        self._last_key = (-1, 0)
+        self._last: tuple[np.ndarray, np.ndarray] = (np.empty(0), np.empty(0))
 
     def camera(self, index: int, divisor: int = 1) -> Camera:
         """Return the camera of a photo at a level."""
@@ -62,23 +63,22 @@ class GaussianPhotos:
         return covered if mask is None else covered & mask
 
     def _rendered(self, index: int, divisor: int) -> tuple[np.ndarray, np.ndarray]:
-        wanted = (index, divisor)
-        if self._last is None or self._last[0] != wanted:
+        if self._last_key != (index, divisor):
             camera = self._photos.camera(index, divisor)
             with torch.no_grad():
                 image = render(self._gaussians, camera, self._options)
             alpha = image.alpha.numpy().reshape(camera.height, camera.width, 1)
             color = image.color.numpy() / np.maximum(alpha, MIN_ALPHA)
             pixels = np.rint(255.0 * color.clip(0.0, 1.0)).astype(np.uint8)
-            self._last = (wanted, pixels, alpha[..., 0] >= MIN_ALPHA)
-        return self._last[1], self._last[2]
+            self._last_key = (index, divisor)
+            self._last = pixels, alpha[..., 0] >= MIN_ALPHA
+        return self._last
 
 
 # -- Image of one atlas: baked colours, fill of unseen texels, gutters and background -------------
 #
 # An atlas is completed in two steps, because unseen texels are filled from the seen texels of all
-# atlases: :class:`AtlasColors` holds the baked colours and little else; its ``finish`` does the
-# rest.
+# atlases: :class:`AtlasColors` holds the baked colours and little else; ``finish`` does the rest.
 
 
 MAX_FILL_SOURCES = 1_000_000
@@ -93,14 +93,7 @@ surroundings, and not at all at twice this: on trained meshes, such views often 
 class AtlasColors:
     """Colours of one atlas, before the fill of unseen texels is known.
 
-    Parameters
-    ----------
-    atlas : AtlasPoints
-    baked : Baked
-        Colours of its points.
-    known_points : int
-        Maximum number of seen texels kept as sources of the fill.
-    surface : SurfaceArrays
+    At most ``known_points`` of the seen texels are kept as sources of the fill.
     """
 
     def __init__(
@@ -156,16 +149,11 @@ class AtlasColors:
             shown = self._unreliable_colors[rows]
             off = np.abs(shown - around).max(axis=1, initial=0.0)
             near_enough = (2.0 - off / UNRELIABLE_LEVELS).clip(0.0, 1.0)[:, None]
-            share = (
-                _fill_weight(self._unreliable_ring[rows]) * near_enough
-            )  # no step at the sure ones
+            # No step at the sure ones.
+            share = _fill_weight(self._unreliable_ring[rows]) * near_enough
             mixed = np.rint(around + share * (shown - around))
             pixels[self._unreliable[rows]] = mixed.astype(np.uint8)
-        ring = np.where(self._owned, np.int16(0), np.int16(-1))
-        chart = np.where(self._owned, np.int32(0), np.int32(-1))
-        dilate(self.image, ring, chart, gutter_px, inside=False)
-        del chart
-        fill_background(self.image, ring >= 0)
+        fill_background(self.image, fill_gutters(self.image, self._owned, gutter_px))
         return self.image
 
 
@@ -183,8 +171,5 @@ def fill_harmonically(atlases: list[AtlasColors], surface: SurfaceArrays) -> Har
         for atlas in atlases:
             yield from atlas.unseen(surface)
 
-    return HarmonicFill(
-        np.concatenate([a.known for a in atlases]),
-        np.concatenate([a.known_colors for a in atlases]),
-        queries,
-    )
+    known = np.concatenate([atlas.known for atlas in atlases])
+    return HarmonicFill(known, np.concatenate([a.known_colors for a in atlases]), queries)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -52,19 +53,9 @@ def solve_gains(colors: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, floa
     of most photos; with a mean of 0 and two groups of exposures, white in the darker photos would
     exceed 255.
 
-    Parameters
-    ----------
-    colors : (n, photos, 3) uint8
-        Colour of point i in photo p.
-    valid : (n, photos) bool
-        Whether the photo sees it.
-
-    Returns
-    -------
-    gains : (photos, 3) float64
-        Factors to multiply with; all 1 if exposures do not differ.
-    spread : float
-        Standard deviation of the fitted log gains.
+    Of the (n, photos, 3) uint8 colours of point i in photo p, and (n, photos) bool whether the
+    photo sees it: returns the (photos, 3) float64 factors to multiply with, all 1 if exposures do
+    not differ, and the standard deviation of the fitted log gains.
     """
     photos = valid.shape[1]
     gains = np.ones((photos, 3))
@@ -138,14 +129,10 @@ def solve_low_frequency_correction(
 
     Parameters
     ----------
-    colors : (n, photos, 3) uint8
-        Colour of point i in photo p.
-    valid : (n, photos) bool
-        Whether the photo sees it.
+    colors, valid, gains
+        Arguments and result of :func:`solve_gains`.
     image_positions : (n, photos, 2) float32
         Position in the photo, in shares of width and height.
-    gains : (photos, 3) float64
-        Gains of whole photos.
 
     Returns
     -------
@@ -161,9 +148,8 @@ def solve_low_frequency_correction(
         return ones, 0.0
     seen = [np.flatnonzero(valid[shared, p]) for p in range(photos)]
     bases = [_basis(image_positions[shared[rows], p]) for p, rows in enumerate(seen)]
-    stiffness = _stiffness()
+    stiffness, variances = _stiffness(), []
     logs = np.zeros((photos, GRID[0] * GRID[1], 3))
-    variances = []
     for channel in range(3):
         values = colors[shared, :, channel]
         usable = valid[shared] & (values >= DARKEST) & (values <= BRIGHTEST)
@@ -189,38 +175,26 @@ def _basis(image_positions: np.ndarray) -> csr_matrix:
     first = iy * columns + ix
     nodes = np.stack([first, first + 1, first + columns, first + columns + 1], axis=1)
     weights = np.stack([(1 - tx) * (1 - ty), tx * (1 - ty), (1 - tx) * ty, tx * ty], axis=1)
-    begins = np.arange(len(image_positions) + 1) * 4
-    return csr_matrix(
-        (weights.ravel(), nodes.ravel(), begins), (len(image_positions), rows * columns)
-    )
+    begins = np.arange(len(nodes) + 1) * 4
+    return csr_matrix((weights.ravel(), nodes.ravel(), begins), (len(nodes), rows * columns))
 
 
 def _stiffness() -> np.ndarray:
     """Return the (nodes, nodes) matrix of the smoothness term and the prior."""
     rows, columns = GRID
     number = np.arange(rows * columns).reshape(rows, columns)
-    pairs = np.concatenate(
-        [
-            np.stack([number[:, 1:].ravel(), number[:, :-1].ravel()], axis=1),
-            np.stack([number[1:].ravel(), number[:-1].ravel()], axis=1),
-        ]
-    )
     matrix = CORRECTION_PRIOR_POINTS * np.eye(rows * columns)
-    for one, other in pairs.tolist():
-        matrix[one, one] += SMOOTHNESS
-        matrix[other, other] += SMOOTHNESS
-        matrix[one, other] -= SMOOTHNESS
-        matrix[other, one] -= SMOOTHNESS
+    for ends, begins in ((number[:, 1:], number[:, :-1]), (number[1:], number[:-1])):
+        for one, other in zip(ends.ravel().tolist(), begins.ravel().tolist(), strict=True):
+            matrix[[one, other], [one, other]] += SMOOTHNESS
+            matrix[[one, other], [other, one]] -= SMOOTHNESS
     return matrix
 
 
 def _solve_correction(
-    values: np.ndarray,
-    usable: np.ndarray,
-    seen: list[np.ndarray],
-    bases: list[csr_matrix],
+    values: np.ndarray, usable: np.ndarray, seen: list[np.ndarray], bases: list[csr_matrix],
     stiffness: np.ndarray,
-) -> tuple[np.ndarray, float]:
+) -> tuple[np.ndarray, float]:  # fmt: skip
     """Return (photos, nodes) log factors and their mean square at the points."""
     correction = np.zeros_like(values)  # (n, photos)
     weight = usable.astype(np.float32)
@@ -285,14 +259,6 @@ class BakedColors:
     """(n,) bool: some view sees the point away from silhouettes, where two surfaces mix."""
     reliable: np.ndarray
     """(n,) bool: some view sees the point neither at a grazing angle nor partly occluded."""
-    photos_used: int
-    """Number of photos with at least one depth sample of the mesh."""
-    gain_spread: float
-    """Standard deviation of the log gains between photos."""
-    gains_applied: bool
-    low_frequency_spread: float
-    """Standard deviation of the log low-frequency corrections within photos."""
-    low_frequency_applied: bool
     rejected: int
     """Number of kept views rejected as outliers."""
 
@@ -301,58 +267,29 @@ class BakedColors:
 class PhotoPreparation:
     """Photos that show the mesh, and their colour correction."""
 
-    used_photos: list[_UsedPhoto]
-    """Photos that show the mesh, and the level at which each is read."""
-    correction: _ColorCorrection
-
-
-@dataclass(frozen=True)
-class _UsedPhoto:
-    index: int
-    divisor: int
-
-
-@dataclass(frozen=True)
-class _ColorCorrection:
+    used_photos: list[tuple[int, int]]
+    """Index of each photo that shows the mesh, and the divisor of the level at which it is read."""
     factors: np.ndarray
     """(photos, gh, gw, 3) float64 colour factors of each photo, on a grid over the photo."""
-    gain_spread: float
-    gains_applied: bool
-    low_frequency_spread: float
-    low_frequency_applied: bool
+    statistics: dict[str, Any]
+    """Plain JSON values: photos used, standard deviations of the log corrections, and whether these
+    are applied."""
 
 
 def bake(
-    points: SurfacePoints,
-    surface: SurfaceArrays,
-    photos: PhotoSource,
-    preparation: PhotoPreparation,
-    progress: Progress,
-    *,
-    threads: int,
-) -> BakedColors:
-    """Blend the best views of each point by a robust mean.
+    points: SurfacePoints, surface: SurfaceArrays, photos: PhotoSource,
+    preparation: PhotoPreparation, progress: Progress, *, threads: int,
+) -> BakedColors:  # fmt: skip
+    """Blend the best views of each point, in texture order, by a robust mean.
 
-    Parameters
-    ----------
-    points : SurfacePoints
-        Points in texture order.
-    photos : PhotoSource
-        Read one at a time, at the level that matches the texel size.
-    preparation : PhotoPreparation
-        Result of :func:`prepare_photos` for these photos.
-
-    Notes
-    -----
-    The weight of a view is (cosine x useful pixels per texel)^2, reduced near silhouettes and the
-    image border. The best ``KEPT_VIEWS`` are kept; with three or more, those far from their median
-    are rejected (docs/method.md, section 8.2).
+    Photos are read one at a time, at the level that matches the texel size. The weight of a view is
+    (cosine x useful pixels per texel)^2, reduced near silhouettes and the image border. The best
+    ``KEPT_VIEWS`` are kept; with three or more, those far from their median are rejected
+    (docs/method.md, section 8.2).
     """
-    used_photos, correction = preparation.used_photos, preparation.correction
+    used_photos = preparation.used_photos
     colors = np.zeros((len(points), 3), np.uint8)
-    views = np.zeros(len(points), np.uint8)
-    rejected = np.zeros(len(points), np.uint8)
-    clearance = np.zeros(len(points), np.uint8)
+    views, rejected, clearance = (np.zeros(len(points), np.uint8) for _ in range(3))
     reliable = np.zeros(len(points), np.bool_)
     blocks = max(1, math.ceil(len(points) / POINTS_PER_BLOCK))
     bounds = np.linspace(0, len(points), blocks + 1).astype(int).tolist()
@@ -361,37 +298,20 @@ def bake(
         block_points = points.part(slice(begin, end))
         weights = np.zeros((end - begin, KEPT_VIEWS), np.float32)
         kept = np.zeros((end - begin, KEPT_VIEWS, 3), np.uint8)
-        for step, used_photo in enumerate(used_photos):
+        for step, (index, divisor) in enumerate(used_photos):
             fraction = 0.95 * (block * len(used_photos) + step) / steps
             progress.update(fraction, f"texture: photo {step + 1} of {len(used_photos)}")
-            view = _view(photos, used_photo.index, used_photo.divisor, surface, threads)
             sample_photo(
-                block_points,
-                surface,
-                view,
-                correction.factors[used_photo.index],
-                weights,
-                kept,
-                clearance[begin:end],
-                threads,
-            )
+                block_points, surface, _view(photos, index, divisor, surface, threads),
+                preparation.factors[index], weights, kept, clearance[begin:end], threads,
+            )  # fmt: skip
         progress.update(0.95 * (block + 1) / blocks, "blending views")
         reliable[begin:end] = weights.max(axis=1) > LAST_RESORT_BELOW
         _blend_block(
             weights, kept, colors[begin:end], views[begin:end], rejected[begin:end], threads
         )
-    return BakedColors(
-        colors,
-        views,
-        clearance >= CLEAR_PX,
-        reliable,
-        len(used_photos),
-        correction.gain_spread,
-        correction.gains_applied,
-        correction.low_frequency_spread,
-        correction.low_frequency_applied,
-        int(rejected.sum(dtype=np.int64)),
-    )
+    outliers = int(rejected.sum(dtype=np.int64))
+    return BakedColors(colors, views, clearance >= CLEAR_PX, reliable, outliers)
 
 
 def _view(
@@ -400,12 +320,10 @@ def _view(
     camera = photos.camera(index, divisor)
     mask = photos.mask(index, divisor)
     return PhotoView(
-        camera,
-        photos.camera(index, 1).fx,
-        pyramid(photos.photo(index, divisor)),
+        camera, photos.camera(index, 1).fx, pyramid(photos.photo(index, divisor)),
         np.ones((1, 1), np.bool_) if mask is None else mask,
-        photo_visibility(surface.vertices, surface.faces, camera, threads),
-    )
+        *photo_visibility(surface.vertices, surface.faces, camera, threads),
+    )  # fmt: skip
 
 
 def correction_sample_count(count: int) -> int:
@@ -414,22 +332,12 @@ def correction_sample_count(count: int) -> int:
 
 
 def prepare_photos(
-    sample: SurfacePoints,
-    surface: SurfaceArrays,
-    photos: PhotoSource,
-    count: int,
-    progress: Progress,
-    *,
-    threads: int,
-) -> PhotoPreparation:
-    """Find the photos that show the mesh, their level, and their colour correction.
+    sample: SurfacePoints, surface: SurfaceArrays, photos: PhotoSource, count: int,
+    progress: Progress, *, threads: int,
+) -> PhotoPreparation:  # fmt: skip
+    """Find which of ``count`` photos show the mesh, their level, and their colour correction.
 
-    Parameters
-    ----------
-    sample : SurfacePoints
-        Evenly spread over the surface, :func:`correction_sample_count` of them.
-    count : int
-        Number of photos.
+    The sample is :func:`correction_sample_count` points spread evenly over the surface.
     """
     wanted = len(sample)
     colors = np.zeros((wanted, count, 3), np.uint8)
@@ -443,13 +351,13 @@ def prepare_photos(
         coarse = max(1, math.ceil(max(full.width, full.height) / COARSE_LONG_SIDE_PX))
         coarse = min(coarse, full.width, full.height)
         view = _view(photos, index, coarse, surface, threads)
-        hit = view.visibility.depth[np.isfinite(view.visibility.depth)]
+        hit = view.depth[np.isfinite(view.depth)]
         if len(hit) == 0:
             continue
         # At this level, a texel near the camera still has one pixel.
         near = float(np.percentile(hit, 2.0))
         divisor = max(1, int(full.fx * surface.texel_size / near))
-        used_photos.append(_UsedPhoto(index, min(divisor, full.width, full.height)))
+        used_photos.append((index, min(divisor, full.width, full.height)))
         weights = np.zeros((wanted, 1), np.float32)
         one = np.zeros((wanted, 1, 3), np.uint8)
         unused = np.zeros(wanted, np.uint8)
@@ -458,27 +366,21 @@ def prepare_photos(
         colors[:, index] = one[:, 0]
         image_positions[:, index] = full.project(positions)[0] / [full.width, full.height]
     gains, gain_spread = solve_gains(colors, valid)
-    low_frequency, low_frequency_spread = solve_low_frequency_correction(
-        colors, valid, image_positions, gains
-    )
-    correction = _ColorCorrection(
-        gains[:, None, None] * low_frequency,
-        gain_spread,
-        bool((gains != 1.0).any()),
-        low_frequency_spread,
-        bool((low_frequency != 1.0).any()),
-    )
-    return PhotoPreparation(used_photos, correction)
+    fields, spread = solve_low_frequency_correction(colors, valid, image_positions, gains)
+    statistics = {
+        "photos_used": len(used_photos),
+        "exposure_spread": gain_spread,
+        "exposure_corrected": bool((gains != 1.0).any()),
+        "brightness_spread_within_photos": spread,
+        "brightness_evened_within_photos": bool((fields != 1.0).any()),
+    }
+    return PhotoPreparation(used_photos, gains[:, None, None] * fields, statistics)
 
 
 def _blend_block(
-    weights: np.ndarray,
-    kept: np.ndarray,
-    colors: np.ndarray,
-    views: np.ndarray,
-    rejected: np.ndarray,
-    threads: int,
-) -> None:
+    weights: np.ndarray, kept: np.ndarray, colors: np.ndarray, views: np.ndarray,
+    rejected: np.ndarray, threads: int,
+) -> None:  # fmt: skip
     def chunk(begin: int, end: int) -> None:
         _blend(weights, kept, begin, end, colors, views, rejected)
 
@@ -581,85 +483,54 @@ def _weighted_median(values: Any, share: Any, count: int, ranked: Any, mass: Any
 
 
 class CoverageStatistics:
-    """Counts of texels and faces over the atlases of one mesh.
-
-    Parameters
-    ----------
-    faces : int
-        Number of faces of the mesh.
-    """
+    """Counts of texels and faces over the atlases of a mesh with a number of ``faces``."""
 
     def __init__(self, faces: int) -> None:
-        self._with_texel = np.zeros(faces, np.bool_)
-        self._face_seen = np.zeros(faces, np.bool_)
-        self._used = self._seen = self._silhouettes = self._unreliable = self._overlaps = 0
-        self._views = self._rejected = 0
-        self._baked: BakedColors | None = None
+        self._with_texel, self._face_seen = np.zeros(faces, np.bool_), np.zeros(faces, np.bool_)
+        self._counts: Counter[str] = Counter()
 
     def add(self, points: SurfacePoints, baked: BakedColors, overlaps: int) -> None:
         """Add one atlas, in which ``overlaps`` texels are used twice."""
         seen = baked.views > 0
         self._with_texel[points.face] = True
         self._face_seen[points.face[seen]] = True
-        self._used += len(points)
-        self._seen += int(seen.sum())
-        self._silhouettes += int((baked.reliable & ~baked.clear).sum())
-        self._unreliable += int((seen & ~baked.reliable).sum())
-        self._overlaps += overlaps
-        self._views += int(baked.views.sum(dtype=np.int64))
-        self._rejected += baked.rejected
-        self._baked = baked
+        self._counts.update(
+            used=len(points), seen=int(seen.sum()), overlaps=overlaps, rejected=baked.rejected,
+            outlines=int((baked.reliable & ~baked.clear).sum()),
+            badly=int((seen & ~baked.reliable).sum()),
+            views=int(baked.views.sum(dtype=np.int64)),
+        )  # fmt: skip
 
     def statistics(
         self, size_px: int, settings: TextureSettings, unwrapped: Unwrap, areas: np.ndarray
     ) -> dict[str, Any]:
-        """Return plain JSON values over all atlases.
-
-        Parameters
-        ----------
-        size_px : int
-            Side of each atlas.
-        settings : TextureSettings
-        unwrapped : Unwrap
-        areas : (f,) float64
-            Face areas.
-        """
-        baked = self._baked
-        assert baked is not None  # a mesh has at least one atlas
+        """Return plain JSON values over all atlases, for the (f,) areas of the faces."""
         with_texel, face_seen = self._with_texel, self._face_seen
-        used, seen = self._used, self._seen
+        counts = self._counts
+        used, seen, views, rejected = (counts[n] for n in ("used", "seen", "views", "rejected"))
         area_with_texel = float(areas[with_texel].sum())
         return {
-            "size_px": size_px,
-            "size_automatic": settings.size_px == 0,
+            "size_px": size_px, "size_automatic": settings.size_px == 0,
             "atlases": unwrapped.atlases,
-            "unwrap": unwrapped.method,
-            "unwrap_fallback_reason": unwrapped.reason,
+            "unwrap": unwrapped.method, "unwrap_fallback_reason": unwrapped.reason,
             "charts": int(unwrapped.charts.max()) + 1,
             "gutter_px": round(unwrapped.gutter_px, 2),
             "utilisation": used / (unwrapped.atlases * size_px**2),
-            "texels_used": used,
-            "texels_seen": seen,
-            "texels_filled": used - seen,
-            "texels_seen_at_outlines_only": self._silhouettes,
-            "texels_seen_badly": self._unreliable,
-            "texels_overlapping": self._overlaps,
+            "texels_used": used, "texels_seen": seen, "texels_filled": used - seen,
+            "texels_seen_at_outlines_only": counts["outlines"],
+            "texels_seen_badly": counts["badly"],
+            "texels_overlapping": counts["overlaps"],
             "coverage": seen / max(used, 1),
             "faces_seen_share": float(face_seen.sum()) / max(int(with_texel.sum()), 1),
             # Over faces with a texel: visibility of the others is unknown.
-            "area_seen_share": float(areas[face_seen].sum()) / area_with_texel
-            if area_with_texel
-            else 0.0,
+            "area_seen_share": (
+                float(areas[face_seen].sum()) / area_with_texel if area_with_texel else 0.0
+            ),
             "area_without_texel_share": float(areas[~with_texel].sum() / areas.sum()),
             "faces_without_texel": int((~with_texel).sum()),
-            "views_per_seen_texel": self._views / seen if seen else 0.0,
-            "views_rejected_share": self._rejected / max(self._views + self._rejected, 1),
-            "photos_used": baked.photos_used,
-            "exposure_spread": baked.gain_spread,
-            "exposure_corrected": baked.gains_applied,
-            "brightness_spread_within_photos": baked.low_frequency_spread,
-            "brightness_evened_within_photos": baked.low_frequency_applied,
-        }
+            "views_per_seen_texel": views / seen if seen else 0.0,
+            "views_rejected_share": rejected / max(views + rejected, 1),
+        }  # fmt: skip
 
 
 # -- Texels of one atlas that belong to a face, as surface points ---------------------------------
@@ -673,22 +544,13 @@ BLOCK_TEXELS = 4_000_000
 class AtlasPoints:
     """Texels with a face, in order."""
 
-    texels: np.ndarray
-    """(n,) int32 flat indices."""
+    texels: np.ndarray  # (n,) int32 flat indices
     points: SurfacePoints
-    chart: np.ndarray
-    """(size, size) int32 chart of each texel, -1 between charts."""
+    chart: np.ndarray  # (size, size) int32 chart of each texel, -1 between charts
 
 
 def atlas_points(raster: AtlasRaster, charts: np.ndarray) -> AtlasPoints:
-    """Extract the points of a raster; its face indices are replaced by charts in place.
-
-    Parameters
-    ----------
-    raster : AtlasRaster
-    charts : (f,) int32
-        Chart of each face.
-    """
+    """Extract the points of a raster; its face indices are replaced by (f,) charts in place."""
     flat, bary = raster.face.reshape(-1), raster.bary.reshape(-1, 2)
     count = int(np.count_nonzero(flat >= 0))
     texels, face = np.empty(count, np.int32), np.empty(count, np.int32)

@@ -39,28 +39,17 @@ class BakeChoices:
 
 
 def bake_onto(
-    given: FileMesh,
-    scene: Scene,
-    photos: PhotoSource,
-    settings: TextureSettings,
-    choices: BakeChoices,
-    work_folder: Path,
-    progress: Progress,
-    *,
-    threads: int,
-    dense: SurfaceMesh | None = None,
-    free_bytes: int = 0,
-) -> TexturedMesh:
+    given: FileMesh, scene: Scene, photos: PhotoSource, settings: TextureSettings,
+    choices: BakeChoices, work_folder: Path, progress: Progress, *, threads: int,
+    dense: SurfaceMesh | None = None, free_bytes: int = 0,
+) -> TexturedMesh:  # fmt: skip
     """Bake photos onto a mesh that was edited, retopologised or made elsewhere.
 
-    Parameters
-    ----------
+    Parameters are those of :func:`texture_mesh`, but:
+
     given : FileMesh
         Scene frame. Its faces, and their order, stay unless they are decimated. New UVs cut no
         polygon that they are parts of, where these are known.
-    scene, photos, settings, work_folder, threads, free_bytes
-        As for :func:`texture_mesh`.
-    choices : BakeChoices
     dense : SurfaceMesh, optional
         Mesh whose detail goes into the normal map, scene frame; by default the mesh itself before
         it is decimated.
@@ -76,7 +65,7 @@ def bake_onto(
     mesh = welded(given)
     validate_for_texturing(mesh)
     winding = _check_winding(mesh)
-    own: OwnUvs | None = None
+    own = None
     polygons = None if given.polygons is None else given.polygons.of_faces
     if choices.faces and len(mesh.faces) > choices.faces:
         dense = mesh if dense is None else dense
@@ -100,12 +89,11 @@ def bake_onto(
             "normals.",
         )
     side_px = side_in_photos(face_graph(mesh.vertices, mesh.faces), photos, len(scene.views))
-    udims = tuple(FIRST_UDIM + number for number in range(len(textured.atlases)))
+    udims = tuple(range(FIRST_UDIM, FIRST_UDIM + len(textured.atlases)))
     if own is not None:
         udims = own.udims
-    textured.statistics["warnings"] += [
-        warning.to_json() for warning in (*winding, *_warnings(textured.statistics, own, side_px))
-    ]
+    warnings = (*winding, *_warnings(textured.statistics, own, side_px))
+    textured.statistics["warnings"] += [warning.to_json() for warning in warnings]
     return replace(textured, udims=udims if udims != (FIRST_UDIM,) else ())
 
 

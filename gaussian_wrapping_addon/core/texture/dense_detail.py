@@ -14,8 +14,8 @@ import numpy as np
 from ..mesh.surface_mesh import SurfaceMesh, area_vectors
 from ..mesh.tangent_frame import TangentFrames, shading_normals, tangent_frames
 from ..progress import Progress
-from .atlas import AtlasRaster, texel_points
-from .fill import dilate
+from .atlas import AtlasRaster, TexelPoints, texel_points
+from .fill import fill_gutters
 
 # -- Ray and nearest-point queries on a dense mesh, to transfer its detail to a lighter one -------
 #
@@ -45,22 +45,17 @@ NO_HIT, BY_RAY, BY_NEAREST = 0, 1, 2
 class SurfaceCorrespondences:
     """Corresponding points on the dense mesh."""
 
-    face: np.ndarray
-    """(n,) int64, -1 without a correspondence."""
-    weights: np.ndarray
-    """(n, 3) float64 barycentric weights of the face's corners."""
-    method: np.ndarray
-    """(n,) uint8: ``NO_HIT``, ``BY_RAY`` or ``BY_NEAREST``."""
+    face: np.ndarray  # (n,) int64, -1 without a correspondence
+    weights: np.ndarray  # (n, 3) float64 barycentric weights of the face's corners
+    method: np.ndarray  # (n,) uint8: ``NO_HIT``, ``BY_RAY`` or ``BY_NEAREST``
+
+    def part(self, rows: np.ndarray) -> SurfaceCorrespondences:
+        """Return some of them."""
+        return SurfaceCorrespondences(self.face[rows], self.weights[rows], self.method[rows])
 
 
 class DenseSurface:
-    """A mesh prepared for ray and nearest-point queries, in the mesh's units.
-
-    Parameters
-    ----------
-    mesh : SurfaceMesh
-        Finite, with at least one face with area.
-    """
+    """A finite mesh, some of it with area, prepared for queries in the mesh's units."""
 
     def __init__(self, mesh: SurfaceMesh) -> None:
         vertices = np.asarray(mesh.vertices, np.float64)
@@ -91,41 +86,23 @@ class DenseSurface:
     def first_hits(
         self, points: np.ndarray, directions: np.ndarray, reach: float
     ) -> SurfaceCorrespondences:
-        """Return the first hit of each ray within ``reach``, on either side of a face.
-
-        Parameters
-        ----------
-        points, directions : (n, 3) float64
-            Unit directions.
-        reach : float
-        """
+        """Return the first hit of each ray, of (n, 3) unit directions, on either side of a face."""
         count = len(points)
         face = np.full(count, -1, np.int64)
         weights = np.zeros((count, 3))
         for begin, end in _blocks(count):
-            index, _, pair = self._cast(points[begin:end], directions[begin:end], reach)
+            index, _, pair = self._tree.intersect_ray_first(
+                self._local, self.faces, self._normalised(points[begin:end]),
+                np.ascontiguousarray(directions[begin:end], np.float64), reach / self.size,
+            )  # fmt: skip
             face[begin:end] = index
             weights[begin:end, 1:] = np.where(index[:, None] >= 0, pair, 0.0)
         weights[:, 0] = 1.0 - weights[:, 1] - weights[:, 2]
-        return SurfaceCorrespondences(
-            face, weights, np.where(face >= 0, BY_RAY, NO_HIT).astype(np.uint8)
-        )
+        method = np.where(face >= 0, BY_RAY, NO_HIT).astype(np.uint8)
+        return SurfaceCorrespondences(face, weights, method)
 
-    def is_hit(self, points: np.ndarray, directions: np.ndarray, reach: float) -> np.ndarray:
-        """Return whether each ray hits the mesh within ``reach``, (n,) bool."""
-        hit = np.zeros(len(points), np.bool_)
-        for begin, end in _blocks(len(points)):
-            hit[begin:end] = self._cast(points[begin:end], directions[begin:end], reach)[0] >= 0
-        return hit
-
-    def _cast(
-        self, points: np.ndarray, directions: np.ndarray, reach: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        local = np.ascontiguousarray((points - self._centre) / self.size)
-        rays = np.ascontiguousarray(directions, np.float64)
-        return self._tree.intersect_ray_first(
-            self._local, self.faces, local, rays, reach / self.size
-        )
+    def _normalised(self, points: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray((points - self._centre) / self.size)
 
     def nearest(self, points: np.ndarray) -> tuple[SurfaceCorrespondences, np.ndarray]:
         """Return the nearest point on the mesh for each point, and the (n,) float64 distances."""
@@ -133,7 +110,7 @@ class DenseSurface:
         face, distance = np.zeros(count, np.int64), np.zeros(count)
         weights = np.zeros((count, 3))
         for begin, end in _blocks(count):
-            local = np.ascontiguousarray((points[begin:end] - self._centre) / self.size)
+            local = self._normalised(points[begin:end])
             square, index, closest = self._tree.squared_distance(self._local, self.faces, local)
             face[begin:end] = index
             distance[begin:end] = np.sqrt(np.maximum(square, 0.0)) * self.size
@@ -148,20 +125,22 @@ class DenseSurface:
         Rays are cast in both directions along the normal. A first hit counts if the face normal
         agrees with the normal of the point; another sheet, such as the other side of a plate, is
         hit from the wrong side and does not count. Of two hits the nearer one is used; without a
-        hit, the nearest point, if its face normal agrees.
-
-        Parameters
-        ----------
-        points, normals : (n, 3) float64
-            Unit normals.
-        reach : float
-            Length of the rays: :func:`cage_distance`.
+        hit, the nearest point, if its face normal agrees. Points and unit normals are (n, 3), and
+        the ``reach`` of the rays is :func:`cage_distance`.
         """
         face = np.full(len(points), -1, np.int64)
         weights = np.zeros((len(points), 3))
         for shift in (0.0, RETRY_OFFSET_SHARE * self.size):
-            left = np.flatnonzero(face < 0)
-            self._by_rays(points + shift * RETRY_DIRECTION, normals, reach, left, face, weights)
+            left, origins = np.flatnonzero(face < 0), points + shift * RETRY_DIRECTION
+            best = np.full(len(points), np.inf)
+            for sign in (1.0, -1.0):
+                hits = self.first_hits(origins[left], sign * normals[left], reach)
+                rows, part = left[hits.face >= 0], hits.part(hits.face >= 0)
+                away = np.linalg.norm(self.points(part) - origins[rows], axis=1)
+                agrees = (self.face_normals[part.face] * normals[rows]).sum(axis=1) > 0.0
+                better = agrees & (away < best[rows])
+                rows, part = rows[better], part.part(better)
+                best[rows], face[rows], weights[rows] = away[better], part.face, part.weights
         method = np.where(face >= 0, BY_RAY, NO_HIT).astype(np.uint8)
         left = np.flatnonzero(face < 0)
         if len(left):
@@ -172,31 +151,8 @@ class DenseSurface:
             method[rows] = BY_NEAREST
         return SurfaceCorrespondences(face, weights, method)
 
-    def _by_rays(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray,
-        reach: float,
-        wanted: np.ndarray,
-        face: np.ndarray,
-        weights: np.ndarray,
-    ) -> None:
-        """Set the nearer accepted hit of the ``wanted`` points."""
-        best = np.full(len(points), np.inf)
-        for sign in (1.0, -1.0):
-            hits = self.first_hits(points[wanted], sign * normals[wanted], reach)
-            hit = hits.face >= 0
-            rows = wanted[hit]
-            part = SurfaceCorrespondences(hits.face[hit], hits.weights[hit], hits.method[hit])
-            away = np.linalg.norm(self.points(part) - points[rows], axis=1)
-            agrees = (self.face_normals[part.face] * normals[rows]).sum(axis=1) > 0.0
-            better = agrees & (away < best[rows])
-            rows = rows[better]
-            best[rows] = away[better]
-            face[rows], weights[rows] = part.face[better], part.weights[better]
 
-
-def cage_distance(light: SurfaceMesh, light_surface: DenseSurface, dense: DenseSurface) -> float:
+def cage_distance(light: SurfaceMesh, dense: DenseSurface) -> float:
     """Return the required length of rays from one mesh to the other: slightly over their distance.
 
     Measured in both directions at up to :data:`CAGE_SAMPLES` points of each mesh.
@@ -204,7 +160,7 @@ def cage_distance(light: SurfaceMesh, light_surface: DenseSurface, dense: DenseS
     middles = np.asarray(light.vertices, np.float64)[light.faces].mean(axis=1)
     one = dense.nearest(_spread(middles))[1].max()
     corners = dense.vertices[np.unique(dense.faces)]
-    other = light_surface.nearest(_spread(corners))[1].max()
+    other = DenseSurface(light).nearest(_spread(corners))[1].max()
     return max(CAGE_FACTOR * float(max(one, other)), MIN_CAGE_SHARE * dense.size)
 
 
@@ -239,41 +195,26 @@ FLAT = (128, 128, 255)
 
 
 @dataclass(frozen=True)
-class NormalMap:
-    """Normal map and its statistics."""
+class DetailMap:
+    """Normal map or occlusion map."""
 
     image: np.ndarray
-    """(h, w, 3) uint8, +Y (OpenGL, Blender, glTF), linear data, not sRGB."""
+    """(h, w, 3) uint8, +Y (OpenGL, Blender, glTF), linear data, not sRGB; or (h, w) uint8, 255 if
+    unoccluded."""
     statistics: dict[str, Any]
-    """Distance of the meshes; shares of texels found by rays, by nearest points, or not at all."""
+    """Size; distance of the meshes, shares of texels found by rays, by nearest points, or not at
+    all; or rays per texel, their reach in scene units, mean."""
 
 
 def bake_normal_map(
-    light: SurfaceMesh,
-    corner_uvs: np.ndarray,
-    raster: AtlasRaster,
-    dense: DenseSurface,
-    gutter_px: int,
-    progress: Progress,
-) -> NormalMap:
-    """Bake the dense mesh's normals in the tangent frames of the light mesh.
+    light: SurfaceMesh, corner_uvs: np.ndarray, raster: AtlasRaster, dense: DenseSurface,
+    gutter_px: int, progress: Progress,
+) -> DetailMap:  # fmt: skip
+    """Bake the dense mesh's normals in the tangent frames of the light, smooth shaded mesh.
 
-    Parameters
-    ----------
-    light : SurfaceMesh
-        The mesh that uses the map, smooth shaded.
-    corner_uvs : (f, 3, 2) float32
-    raster : AtlasRaster
-        Raster of these UVs; the map has its size.
-    dense : DenseSurface
-        The mesh with the detail, in the same units.
-    gutter_px : int
-        Width by which charts are dilated.
-    progress : Progress
-        Span of this step.
+    The meshes are in the same units; the map has the size of the raster of the (f, 3, 2) UVs, and
+    its charts are dilated by the gutter.
 
-    Notes
-    -----
     The three numbers of a texel solve ``x T + y B + z N = n`` with the interpolated tangent,
     bitangent and normal of the light mesh, so that a renderer recovers ``n`` for any lengths and
     angles of these. Normals that point below the light surface are clamped to it: z >= 0.
@@ -281,9 +222,8 @@ def bake_normal_map(
     size = raster.face.shape[0]
     frames = tangent_frames(light.vertices, light.faces, corner_uvs)
     progress.update(0.0, "normal map: measuring the distance of the meshes")
-    cage = cage_distance(light, DenseSurface(light), dense)
-    image = np.empty((size, size, 3), np.uint8)
-    image[:] = FLAT
+    cage = cage_distance(light, dense)
+    image = np.full((size, size, 3), FLAT, np.uint8)
     pixels = image.reshape(-1, 3)
     texels = np.flatnonzero(raster.face.ravel() >= 0)
     counts = np.zeros(3, np.int64)
@@ -295,67 +235,35 @@ def bake_normal_map(
         counts += np.bincount(matches.method, minlength=3)
         found = matches.method != NO_HIT
         wanted = at.normals.copy()
-        rows = SurfaceCorrespondences(
-            matches.face[found], matches.weights[found], matches.method[found]
-        )
-        wanted[found] = dense.normals(rows)
-        pixels[part] = encode_normals(
-            to_tangent_space(wanted, at.raw_normals, at.weights, at.face, frames)
-        )
-    ring = np.where(raster.face >= 0, 0, -1).astype(np.int16)
-    chart = np.where(raster.face >= 0, 0, -1).astype(np.int32)
-    dilate(image, ring, chart, gutter_px, inside=False)
+        wanted[found] = dense.normals(matches.part(found))
+        # From [-1, 1] to [0, 255].
+        encoded = (0.5 * to_tangent_space(wanted, at, frames) + 0.5) * 255.0
+        pixels[part] = np.rint(encoded).clip(0, 255).astype(np.uint8)
+    fill_gutters(image, raster.face >= 0, gutter_px)
     progress.update(1.0, "normal map: finished")
     total = max(len(texels), 1)
     statistics = {
-        "size_px": size,
-        "dense_faces": len(dense.faces),
-        "cage_scene": cage,
+        "size_px": size, "dense_faces": len(dense.faces), "cage_scene": cage,
         "by_ray_share": float(counts[BY_RAY] / total),
         "by_nearest_share": float(counts[BY_NEAREST] / total),
         "flat_share": float(counts[NO_HIT] / total),
-    }
-    return NormalMap(image, statistics)
+    }  # fmt: skip
+    return DetailMap(image, statistics)
 
 
-def to_tangent_space(
-    wanted: np.ndarray,
-    normal: np.ndarray,
-    weights: np.ndarray,
-    face: np.ndarray,
-    frames: TangentFrames,
-) -> np.ndarray:
-    """Transform unit vectors to the tangent frames of points on the light mesh.
-
-    Parameters
-    ----------
-    wanted : (n, 3) float64
-    normal : (n, 3) float64
-        Interpolated, not of unit length.
-    weights : (n, 3) float64
-        Barycentric weights of the corners of ``face`` (n,).
-
-    Returns
-    -------
-    (n, 3) float64
-        Unit length, z >= 0.
-    """
-    tangent = np.einsum("nc,ncx->nx", weights, frames.tangents[face])
-    bitangent = frames.signs[face][:, None] * np.cross(normal, tangent)
+def to_tangent_space(wanted: np.ndarray, at: TexelPoints, frames: TangentFrames) -> np.ndarray:
+    """Transform (n, 3) unit vectors to the tangent frames of points: unit length, z >= 0."""
+    normal = at.raw_normals
+    tangent = np.einsum("nc,ncx->nx", at.weights, frames.tangents[at.face])
+    bitangent = frames.signs[at.face][:, None] * np.cross(normal, tangent)
     axes = (np.cross(bitangent, normal), np.cross(normal, tangent), np.cross(tangent, bitangent))
     volume = (tangent * axes[0]).sum(axis=1)
-    components = np.stack(
-        [(wanted * axis).sum(axis=1) for axis in axes], axis=1
-    )  # times the volume
+    # Times the volume.
+    components = np.stack([(wanted * axis).sum(axis=1) for axis in axes], axis=1)
     components *= np.sign(volume)[:, None]
     components[:, 2] = np.maximum(components[:, 2], 0.0)
     length = np.linalg.norm(components, axis=1, keepdims=True)
     return np.where(length > 0.0, components / np.where(length > 0.0, length, 1.0), (0.0, 0.0, 1.0))
-
-
-def encode_normals(vectors: np.ndarray) -> np.ndarray:
-    """Encode (n, 3) unit vectors as (n, 3) uint8: [-1, 1] to [0, 255]."""
-    return np.rint((0.5 * vectors + 0.5) * 255.0).clip(0, 255).astype(np.uint8)
 
 
 # -- Ambient occlusion map of the dense mesh ------------------------------------------------------
@@ -381,38 +289,16 @@ GOLDEN = np.array([0.7548776662466927, 0.5698402909980532])
 """Steps of the R2 low-discrepancy sequence: powers of 1 / x with x^3 = x + 1."""
 
 
-@dataclass(frozen=True)
-class OcclusionMap:
-    """Occlusion map and its statistics."""
-
-    image: np.ndarray
-    """(k, k) uint8, 255 if unoccluded."""
-    statistics: dict[str, Any]
-    """Size, rays per texel, maximum distance in scene units, mean."""
-
-
 def bake_occlusion(
-    light: SurfaceMesh,
-    raster: AtlasRaster,
-    dense: DenseSurface,
-    gutter_px: int,
-    progress: Progress,
-) -> OcclusionMap:
+    light: SurfaceMesh, raster: AtlasRaster, dense: DenseSurface, gutter_px: int, progress: Progress
+) -> DetailMap:
     """Bake the occlusion of the dense mesh at points that correspond to texels of the light one.
 
-    Parameters
-    ----------
-    light : SurfaceMesh
-        The mesh that uses the map.
-    raster : AtlasRaster
-        Raster of its UVs at the size of the map (sensibly at most :data:`MAX_SIDE_PX`).
-    dense : DenseSurface
-        In the same units; the light mesh itself without another one.
-    gutter_px : int
-        Width by which charts are dilated.
+    The meshes are in the same units, and may be the same; the map has the size of the raster,
+    sensibly at most :data:`MAX_SIDE_PX`, and its charts are dilated by the gutter.
     """
     size = raster.face.shape[0]
-    cage = cage_distance(light, DenseSurface(light), dense)
+    cage = cage_distance(light, dense)
     reach = REACH_SHARE * dense.size
     normals = shading_normals(light.vertices, light.faces)
     texels = np.flatnonzero(raster.face.ravel() >= 0)
@@ -425,11 +311,8 @@ def bake_occlusion(
         at = texel_points(light, raster, part, normals)
         matches = dense.correspondences(at.points, at.normals, cage)
         found = matches.method != NO_HIT
-        rows = SurfaceCorrespondences(
-            matches.face[found], matches.weights[found], matches.method[found]
-        )
-        block_rows = begin + np.flatnonzero(found)
-        open_share[block_rows] = sky_visibility(dense, rows, reach, part[found])
+        rows = begin + np.flatnonzero(found)
+        open_share[rows] = sky_visibility(dense, matches.part(found), reach, part[found])
         points[begin : begin + block] = at.points
         directions[begin : begin + block] = at.normals
     progress.update(0.9, "ambient occlusion: removing noise")
@@ -437,13 +320,11 @@ def bake_occlusion(
     values = np.full((size, size), 255, np.uint8)
     values.ravel()[texels] = np.rint(255.0 * open_share).astype(np.uint8)
     image = np.repeat(values[..., None], 3, axis=2)
-    owned = raster.face >= 0
-    ring, chart = np.where(owned, 0, -1).astype(np.int16), np.where(owned, 0, -1).astype(np.int32)
-    dilate(image, ring, chart, gutter_px, inside=False)
+    fill_gutters(image, raster.face >= 0, gutter_px)
     progress.update(1.0, "ambient occlusion: finished")
     mean = float(values.ravel()[texels].mean() / 255.0) if len(texels) else 1.0
     statistics = {"size_px": size, "rays": RAYS, "reach_scene": reach, "open_share": mean}
-    return OcclusionMap(np.ascontiguousarray(image[..., 0]), statistics)
+    return DetailMap(np.ascontiguousarray(image[..., 0]), statistics)
 
 
 def smoothed(
@@ -451,17 +332,8 @@ def smoothed(
 ) -> np.ndarray:
     """Average the values of texels over their neighbours on the same piece of surface.
 
-    Parameters
-    ----------
-    values : (n,) float32
-    points, normals : (n, 3) float64
-        Surface points and unit normals of the texels.
-    texels : (n,) int64
-        Flat indices in an atlas of side ``size``, in ascending order.
-
-    Returns
-    -------
-    (n,) float32
+    Values (n,) float32, surface points and unit normals (n, 3) are those of the ``texels``: (n,)
+    flat indices in an atlas of side ``size``, in ascending order.
     """
     number = np.full((size + 2 * SMOOTHING_RADIUS,) * 2, -1, np.int64)
     inner = slice(SMOOTHING_RADIUS, SMOOTHING_RADIUS + size)
@@ -505,29 +377,14 @@ def _spacing(
 
 
 def sky_visibility(
-    surface: DenseSurface,
-    matches: SurfaceCorrespondences,
-    reach: float,
-    numbers: np.ndarray,
+    surface: DenseSurface, matches: SurfaceCorrespondences, reach: float, numbers: np.ndarray,
     rays: int = RAYS,
-) -> np.ndarray:
-    """Return the share of light from a uniform sky that reaches points of a mesh.
+) -> np.ndarray:  # fmt: skip
+    """Return the share of light from a uniform sky that reaches points, each on a face of a mesh.
 
-    Parameters
-    ----------
-    matches : SurfaceCorrespondences
-        Points, each on a face.
-    reach : float
-        Only surfaces nearer than this occlude the sky.
-    numbers : (n,) int64
-        Offset the fixed ray pattern of each point, so that errors of neighbours are uncorrelated.
-    rays : int
-        Rays from each point.
-
-    Returns
-    -------
-    (n,) float64
-        1 if unoccluded, weighted by the cosine to the face normal.
+    (n,) float64, 1 if nothing within ``reach`` occludes the sky, weighted by the cosine to the face
+    normal. The (n,) ``numbers`` offset the fixed ray pattern of each point, so that errors of
+    neighbours are uncorrelated.
     """
     normals = surface.face_normals[matches.face]
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -552,5 +409,5 @@ def sky_visibility(
     )  # (n, rays, 3)
     origins = surface.points(matches) + LIFT_SHARE * surface.size * normals
     origins = np.repeat(origins, rays, axis=0)
-    hit = surface.is_hit(origins, directions.reshape(-1, 3), reach)
+    hit = surface.first_hits(origins, directions.reshape(-1, 3), reach).face >= 0
     return 1.0 - hit.reshape(-1, rays).mean(axis=1)

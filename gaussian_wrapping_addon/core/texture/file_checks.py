@@ -18,10 +18,8 @@ from ..limits import MAX_ATLASES
 
 ROUGHNESS = 0.9
 """Photos contain their lighting: added gloss would look wrong from most directions."""
-
 SPECULAR_LEVEL = 0.1
 """Blender's scale: 0.5 is a reflectance of 4 %, which corresponds to glTF's factor 1."""
-
 OBJ_SHININESS = 1000.0 * (1.0 - ROUGHNESS) ** 2
 """``Ns`` of OBJ as Blender maps it to roughness; other programs use it as Phong exponent."""
 
@@ -36,18 +34,9 @@ SINGLE_MAX = float(np.finfo(np.float32).max)
 
 
 def atlas_file(name: str, atlas: int, udims: Sequence[int] = ()) -> str:
-    """Return the file name of a map: ``albedo.png``, then ``albedo-2.png`` and on.
+    """Return the file name of a map of an atlas (from 0): ``albedo.png``, then ``albedo-2.png``.
 
-    With UDIM tiles, ``albedo.1001.png`` and on.
-
-    Parameters
-    ----------
-    name : str
-        ``"albedo"``, ``"normal"`` or ``"occlusion"``.
-    atlas : int
-        From 0.
-    udims : sequence of int, optional
-        UDIM number of each atlas.
+    With UDIM numbers of the atlases, ``albedo.1001.png`` and on.
     """
     if udims:
         return f"{name}.{udims[atlas]}.png"
@@ -55,7 +44,7 @@ def atlas_file(name: str, atlas: int, udims: Sequence[int] = ()) -> str:
 
 
 def validate_face_atlas(face_atlas: np.ndarray, faces: int) -> np.ndarray:
-    """Validate the atlas indices of faces read from a file; return them as (f,) uint8.
+    """Return the atlas indices of faces read from a file as (f,) uint8.
 
     Raises
     ------
@@ -70,47 +59,32 @@ def validate_face_atlas(face_atlas: np.ndarray, faces: int) -> np.ndarray:
 
 
 def validate_for_export(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    corner_uvs: np.ndarray | None = None,
-    *,
+    vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray | None = None, *,
     name: str = "the mesh to write",
-) -> None:
+) -> None:  # fmt: skip
     """Raise if a mesh is empty, not finite (also in float32), or has indices out of range.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float
-    faces : (f, 3) int
-    corner_uvs : (f, 3, 2) float, optional
-    name : str
-        Name of the mesh in the error message.
+    UVs, if any, are (f, 3, 2); ``name`` is that of the mesh in the error message.
 
     Raises
     ------
     MeshingError
         States the first invalid element.
     """
-    subject = name[:1].upper() + name[1:]
+    subject, again = name[:1].upper() + name[1:], "Mesh the region again."
     if len(faces) == 0 or len(vertices) == 0:
         raise MeshingError(f"{subject} has no faces.", "Choose a region with a surface.")
     bad = ~(np.abs(vertices) <= SINGLE_MAX).all(axis=1)
     if bad.any():
-        raise MeshingError(
-            f"Vertex {int(np.argmax(bad))} of {name} is not finite.", "Mesh the region again."
-        )
+        raise MeshingError(f"Vertex {int(np.argmax(bad))} of {name} is not finite.", again)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshingError(
-            f"A face of {name} refers to a vertex that does not exist.", "Mesh the region again."
-        )
+        raise MeshingError(f"A face of {name} refers to a vertex that does not exist.", again)
     if corner_uvs is None:
         return
     bad = ~(np.abs(corner_uvs) <= SINGLE_MAX).reshape(len(faces), -1).all(axis=1)
     if bad.any():
-        raise MeshingError(
-            f"Face {int(np.argmax(bad))} of {name} has UVs that are not finite.",
-            "Texture the region again.",
-        )
+        text = f"Face {int(np.argmax(bad))} of {name} has UVs that are not finite."
+        raise MeshingError(text, "Texture the region again.")
 
 
 @contextlib.contextmanager
@@ -128,16 +102,9 @@ def write_errors(path: Path) -> Iterator[None]:
 def write_mesh_ply(
     path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None = None
 ) -> None:
-    """Write a binary little-endian PLY with double coordinates.
+    """Write a binary little-endian PLY with double coordinates into an existing folder.
 
-    Parameters
-    ----------
-    path : Path
-        Its folder must exist.
-    vertices : (v, 3) float64
-        World coordinates; stored losslessly.
-    faces : (f, 3) int32
-    colors : (v, 3) uint8 or None
+    Vertices are (v, 3), world frame, stored losslessly; faces (f, 3); colours (v, 3) uint8.
 
     Raises
     ------
@@ -148,49 +115,37 @@ def write_mesh_ply(
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     validate_for_export(vertices, faces)
-    fields = [(axis, "<f8") for axis in "xyz"]
-    names = ["property double x", "property double y", "property double z"]
+    columns = dict(zip("xyz", vertices.T, strict=True))
+    fields = [(axis, "<f8") for axis in columns]
+    names = [f"property double {axis}" for axis in columns]
     if colors is not None:
-        fields += [(channel, "u1") for channel in ("red", "green", "blue")]
-        names += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+        channels = dict(zip(("red", "green", "blue"), colors.T, strict=True))
+        fields += [(channel, "u1") for channel in channels]
+        names += [f"property uchar {channel}" for channel in channels]
+        columns |= channels
     rows = np.empty(len(vertices), np.dtype(fields))
-    for column, axis in enumerate("xyz"):
-        rows[axis] = vertices[:, column]
-    if colors is not None:
-        for column, channel in enumerate(("red", "green", "blue")):
-            rows[channel] = colors[:, column]
+    for name, values in columns.items():
+        rows[name] = values
     triangles = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", (3,))]))
     triangles["count"] = 3
     triangles["corners"] = faces
     header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
-        *names,
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-        "",
-    ]
+        "ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}", *names,
+        f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", "",
+    ]  # fmt: skip
     data = "\n".join(header).encode() + rows.tobytes() + triangles.tobytes()
     with write_errors(path):
         write_bytes(path, data)
 
 
 def vertex_colors(
-    count: int,
-    faces: np.ndarray,
-    corner_uvs: np.ndarray,
-    albedos: Sequence[np.ndarray],
+    count: int, faces: np.ndarray, corner_uvs: np.ndarray, albedos: Sequence[np.ndarray],
     face_atlas: np.ndarray | None = None,
-) -> np.ndarray:
-    """Return (v, 3) uint8 vertex colours: mean of the texture over the corners of each vertex.
+) -> np.ndarray:  # fmt: skip
+    """Return uint8 colours of ``count`` vertices: mean of the texture over the corners of each.
 
     Parameters
     ----------
-    count : int
-        Number of vertices.
-    faces : (f, 3) int
     corner_uvs : (f, 3, 2) float
         v upwards.
     albedos : sequence of (h, w, 3) uint8

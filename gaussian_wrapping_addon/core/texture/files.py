@@ -40,19 +40,13 @@ _FLOAT, _UINT32 = 5126, 5125
 _ARRAY_BUFFER, _INDEX_BUFFER = 34962, 34963
 
 
-def glb_bytes(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    corner_uvs: np.ndarray,
-    png: bytes | Sequence[bytes],
-    offset: np.ndarray,
-    *,
-    normal_png: bytes | Sequence[bytes] | None = None,
-    occlusion_png: bytes | Sequence[bytes] | None = None,
-    shading: str = "auto",
+def write_glb(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray,
+    png: Sequence[bytes], offset: np.ndarray, *, normal_png: Sequence[bytes] = (),
+    occlusion_png: Sequence[bytes] = (), shading: str = "auto",
     face_atlas: np.ndarray | None = None,
-) -> bytes:
-    """Return the content of the file.
+) -> None:  # fmt: skip
+    """Write a binary glTF 2.0 with the images inside.
 
     Photos contain their lighting, so the material is ``KHR_materials_unlit``, with an ordinary
     rough material for readers without that extension. With a normal map or occlusion it is lit:
@@ -67,8 +61,8 @@ def glb_bytes(
     faces : (f, 3) int32
     corner_uvs : (f, 3, 2) float32
         v upwards; glTF's v points down.
-    png : bytes or sequence of bytes
-        The texture, or one for each atlas.
+    png : sequence of bytes
+        The texture of each atlas.
     offset : (3,) float64
         Offset subtracted from the world coordinates; stored in the node's extras.
     normal_png, occlusion_png : the same, optional
@@ -78,33 +72,30 @@ def glb_bytes(
     face_atlas : (f,) int, optional
         Atlas of each face, if there are several.
     """
+    validate_for_export(vertices, faces, corner_uvs)
     if shading == "unlit":
-        normal_png = occlusion_png = None
+        normal_png = occlusion_png = ()
     corners = np.asarray(faces)
     whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
     atlas = np.zeros(len(corners), np.uint8) if face_atlas is None else np.asarray(face_atlas)
     faces, corner_uvs, atlas = corners[whole], np.asarray(corner_uvs)[whole], atlas[whole]
-    images = {
-        "albedo": _listed(png), "normal": _listed(normal_png), "occlusion": _listed(occlusion_png),
-    }  # fmt: skip
+    images = {"albedo": png, "normal": normal_png, "occlusion": occlusion_png}
     present = [name for name, several in images.items() if several]
     parts = _Parts()
-    tables = _vertex_tables(vertices, faces, corner_uvs, with_tangents="normal" in present)
+    tables = _Tables.of(vertices, faces, corner_uvs, with_tangents="normal" in present)
     is_unlit = shading == "unlit" or (shading == "auto" and present == ["albedo"])
-    primitives: list[dict[str, Any]] = []
-    materials: list[dict[str, Any]] = []
     used = np.unique(atlas).tolist()
-    for number in used:
-        attributes = _add_primitive(parts, tables, atlas == number)
-        primitives.append({**attributes, "material": len(materials)})
-        materials.append(_material(present, is_unlit, number, len(materials) * len(present)))
+    materials = [_material(present, is_unlit, n, k * len(present)) for k, n in enumerate(used)]
+    primitives = [
+        {**_add_primitive(parts, tables, atlas == number), "material": k}
+        for k, number in enumerate(used)
+    ]
     pictures = []
     for number in used:
         for name in present:
             view = parts.add(images[name][number])
             called = Path(atlas_file(name, number)).stem
             pictures.append({"name": called, "mimeType": "image/png", "bufferView": view})
-    binary = parts.binary
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "Gaussian Wrapping for Blender"},
         "extensionsUsed": list(materials[0]["extensions"]),
@@ -120,20 +111,15 @@ def glb_bytes(
         "images": pictures,
         "accessors": parts.accessors,
         "bufferViews": parts.views,
-        "buffers": [{"byteLength": len(binary)}],
+        "buffers": [{"byteLength": len(parts.binary)}],
     }
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    length = 12 + 8 + len(text) + 8 + len(binary)
-    return b"".join(
-        [
-            struct.pack("<III", _MAGIC, 2, length),
-            struct.pack("<II", len(text), _JSON_CHUNK),
-            text,
-            struct.pack("<II", len(binary), _BINARY_CHUNK),
-            bytes(binary),
-        ]
-    )
+    head = struct.pack("<III", _MAGIC, 2, 12 + 8 + len(text) + 8 + len(parts.binary))
+    head += struct.pack("<II", len(text), _JSON_CHUNK) + text
+    head += struct.pack("<II", len(parts.binary), _BINARY_CHUNK)
+    with write_errors(path):
+        write_bytes(path, head + bytes(parts.binary))
 
 
 class _Parts:
@@ -154,9 +140,8 @@ class _Parts:
     def add_array(self, array: np.ndarray, component: int, kind: str, target: int) -> int:
         """Append an array; return the index of its accessor."""
         view = self.add(array.tobytes(), target)
-        self.accessors.append(
-            {"bufferView": view, "componentType": component, "count": len(array), "type": kind}
-        )
+        accessor = {"bufferView": view, "componentType": component, "count": len(array)}
+        self.accessors.append({**accessor, "type": kind})
         return len(self.accessors) - 1
 
 
@@ -169,19 +154,19 @@ class _Tables(NamedTuple):
     normals: np.ndarray  # (v, 3)
     tangents: np.ndarray | None  # (3 f, 4) float32
 
-
-def _vertex_tables(
-    vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, *, with_tangents: bool
-) -> _Tables:
-    uvs = np.asarray(corner_uvs, np.float32).reshape(-1, 2)
-    tangents = None
-    if with_tangents:
-        frames = tangent_frames(vertices, faces, corner_uvs)
-        tangents = np.zeros((len(uvs), 4), "<f4")
-        tangents[:, :3] = _y_up(frames.tangents.reshape(-1, 3))
-        tangents[:, 3] = np.repeat(frames.signs, 3)
-    normals = _y_up(shading_normals(vertices, faces))
-    return _Tables(np.asarray(faces, np.int64), uvs, _y_up(vertices), normals, tangents)
+    @classmethod
+    def of(
+        cls, vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, *, with_tangents: bool
+    ) -> _Tables:
+        uvs = np.asarray(corner_uvs, np.float32).reshape(-1, 2)
+        tangents = None
+        if with_tangents:
+            frames = tangent_frames(vertices, faces, corner_uvs)
+            tangents = np.zeros((len(uvs), 4), "<f4")
+            tangents[:, :3] = _y_up(frames.tangents.reshape(-1, 3))
+            tangents[:, 3] = np.repeat(frames.signs, 3)
+        normals = _y_up(shading_normals(vertices, faces))
+        return cls(np.asarray(faces, np.int64), uvs, _y_up(vertices), normals, tangents)
 
 
 def _add_primitive(parts: _Parts, tables: _Tables, chosen: np.ndarray) -> dict[str, Any]:
@@ -193,7 +178,8 @@ def _add_primitive(parts: _Parts, tables: _Tables, chosen: np.ndarray) -> dict[s
     key["uv"] = np.ascontiguousarray(uvs).view(np.uint64)[:, 0]
     if tables.tangents is not None:
         key["tangent"] = tables.tangents[rows].view(np.uint64)
-    _, first, index = np.unique(_bytes_of(key), return_index=True, return_inverse=True)
+    rows_as_bytes = key.view(np.dtype((np.void, key.dtype.itemsize)))  # one sortable value each
+    _, first, index = np.unique(rows_as_bytes, return_index=True, return_inverse=True)
     owner = corner_vertex[first]
     positions = tables.positions[owner].astype("<f4")
     coordinates = np.stack([uvs[first, 0], 1.0 - uvs[first, 1]], axis=1).astype("<f4")
@@ -214,12 +200,6 @@ def _add_primitive(parts: _Parts, tables: _Tables, chosen: np.ndarray) -> dict[s
     return {"attributes": attributes, "indices": indices}
 
 
-def _listed(png: bytes | Sequence[bytes] | None) -> list[bytes]:
-    if png is None:
-        return []
-    return [png] if isinstance(png, bytes) else list(png)
-
-
 def _material(images: list[str], is_unlit: bool, atlas: int, first: int) -> dict[str, Any]:
     """Return the material of an atlas, whose textures start at index ``first``, in this order."""
     material: dict[str, Any] = {
@@ -236,11 +216,6 @@ def _material(images: list[str], is_unlit: bool, atlas: int, first: int) -> dict
     extensions: dict[str, Any] = {"KHR_materials_specular": {"specularFactor": 2 * SPECULAR_LEVEL}}
     material["extensions"] = {"KHR_materials_unlit": {}} if is_unlit else extensions
     return material
-
-
-def _bytes_of(rows: np.ndarray) -> np.ndarray:
-    """View each row of a structured array as one sortable value."""
-    return rows.view(np.dtype((np.void, rows.dtype.itemsize)))
 
 
 def _y_up(values: np.ndarray) -> np.ndarray:
@@ -261,15 +236,11 @@ def _y_up(values: np.ndarray) -> np.ndarray:
 
 
 def write_obj(
-    path: Path,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    corner_uvs: np.ndarray,
-    image_name: str | Sequence[str],
-    normal_name: str | Sequence[str] | None = None,
+    path: Path, vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray,
+    image_names: Sequence[str], normal_names: Sequence[str] = (),
     face_atlas: np.ndarray | None = None,
-) -> None:
-    """Write an OBJ and its ``.mtl``, which refers to an image in the same folder.
+) -> None:  # fmt: skip
+    """Write an OBJ and its ``.mtl``, which refers to images in the same folder.
 
     Parameters
     ----------
@@ -277,17 +248,15 @@ def write_obj(
     faces : (f, 3) int32
     corner_uvs : (f, 3, 2) float32
         v upwards, as in OBJ.
-    image_name : str or sequence of str
+    image_names : sequence of str
         One per atlas; without spaces, which OBJ readers handle differently.
-    normal_name : the same, optional
-        A normal map, written as ``map_Bump``, as Blender writes and reads it.
+    normal_names : the same, optional
+        Normal maps, written as ``map_Bump``, as Blender writes and reads them.
     face_atlas : (f,) int, optional
         Atlas of each face, if there are several; each has its own material.
     """
     validate_for_export(vertices, faces, corner_uvs)
-    names = [image_name] if isinstance(image_name, str) else list(image_name)
-    bumps = [normal_name] if isinstance(normal_name, str) else list(normal_name or ())
-    for name in names:
+    for name in image_names:
         if any(c.isspace() for c in name + path.name):
             raise UsageError(f"OBJ files cannot refer to {name!r}.", "Use a name without spaces.")
     uvs, corner = np.unique(corner_uvs.reshape(-1, 2), axis=0, return_inverse=True)
@@ -303,62 +272,32 @@ def write_obj(
     atlas = np.zeros(len(table), np.uint8) if face_atlas is None else face_atlas
     shine = " ".join([str(SPECULAR_LEVEL)] * 3)
     material = ""
-    for number, name in enumerate(names):
+    for number, name in enumerate(image_names):
         called = Path(atlas_file("albedo", number)).stem
         text.write(f"usemtl {called}\n")
         np.savetxt(text, table[atlas == number], fmt="f %d/%d/%d %d/%d/%d %d/%d/%d")
         material += f"newmtl {called}\nNs {OBJ_SHININESS:.6g}\nKa 1 1 1\nKd 1 1 1\nKs {shine}\n"
         material += f"Ni 1.5\nd 1\nillum 2\nmap_Kd {name}\n"
-        if bumps:
-            material += f"map_Bump -bm 1 {bumps[number]}\n"
+        if normal_names:
+            material += f"map_Bump -bm 1 {normal_names[number]}\n"
     with write_errors(path):
         write_bytes(path.with_suffix(".mtl"), material.encode())
         write_bytes(path, text.getvalue().encode())
 
 
-def write_glb(
-    path: Path,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    corner_uvs: np.ndarray,
-    png: bytes | Sequence[bytes],
-    offset: np.ndarray,
-    *,
-    normal_png: bytes | Sequence[bytes] | None = None,
-    occlusion_png: bytes | Sequence[bytes] | None = None,
-    shading: str = "auto",
-    face_atlas: np.ndarray | None = None,
-) -> None:
-    """Write a binary glTF with the images inside; see :func:`.files.glb_bytes`."""
-    validate_for_export(vertices, faces, corner_uvs)
-    with write_errors(path):
-        data = glb_bytes(
-            vertices, faces, corner_uvs, png, offset,
-            normal_png=normal_png, occlusion_png=occlusion_png, shading=shading,
-            face_atlas=face_atlas,
-        )  # fmt: skip
-        write_bytes(path, data)
-
-
 def write_textured(
-    textured: TexturedMesh,
-    folder: Path,
-    formats: tuple[str, ...],
-    world_from_scene: Similarity,
+    textured: TexturedMesh, folder: Path, formats: tuple[str, ...], world_from_scene: Similarity,
     offset: np.ndarray | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Write ``mesh.npz``, ``albedo.png``, ``mesh.ply``, ``transform.json`` and further formats.
 
     ``normal.png`` and ``occlusion.png`` are written if the mesh has these maps; further atlases
     are ``albedo-2.png`` and on, or ``albedo.1001.png`` and on if the mesh has UDIM tiles. Then the
-    UVs of the OBJ lie in their tiles; those of the other files lie in [0, 1].
+    UVs of the OBJ lie in their tiles; those of the other files lie in [0, 1]. The mesh is in the
+    scene frame.
 
     Parameters
     ----------
-    textured : TexturedMesh
-        Scene frame.
-    folder : Path
-        Created if missing.
     formats : tuple of str
         Elements of :data:`RESULT_FORMATS`; ``"ply"`` is always written.
     world_from_scene : Similarity
@@ -378,78 +317,64 @@ def write_textured(
     """
     unknown = sorted(set(formats) - set(RESULT_FORMATS))
     if unknown:
-        raise UsageError(
-            f"Unknown export format {unknown[0]!r}.", f"Use {', '.join(RESULT_FORMATS)}."
-        )
+        known = ", ".join(RESULT_FORMATS)
+        raise UsageError(f"Unknown export format {unknown[0]!r}.", f"Use {known}.")
     mesh = textured.mesh
     validate_for_export(mesh.vertices, mesh.faces, textured.corner_uvs)
+    corner_uvs, face_atlas, udims = textured.corner_uvs, textured.face_atlas, textured.udims
     world = world_from_scene.points(mesh.vertices)
     offset = file_offset(world) if offset is None else offset
-    atlases, face_atlas, udims = textured.atlases, textured.face_atlas, textured.udims
+    atlases = textured.atlases
     images = {
         "albedo": [a.albedo for a in atlases],
         "normal": [a.normal_map for a in atlases if a.normal_map is not None],
         "occlusion": [a.occlusion for a in atlases if a.occlusion is not None],
     }
     pngs = {name: [png_bytes(image) for image in several] for name, several in images.items()}
-    arrays = {} if face_atlas is None else {"face_atlas": np.asarray(face_atlas, np.uint8)}
+    names = {
+        name: [atlas_file(name, number, udims) for number in range(len(several))]
+        for name, several in images.items()
+    }
+    arrays = {
+        "vertices": np.asarray(mesh.vertices, np.float64),
+        "faces": np.asarray(mesh.faces, np.int32),
+        "corner_uvs": np.asarray(corner_uvs, np.float32),
+    }
+    if face_atlas is not None:
+        arrays["face_atlas"] = np.asarray(face_atlas, np.uint8)
     if udims:
         arrays["udims"] = np.asarray(udims, np.int32)
+    frames = {
+        "mesh.npz": "scene", "mesh.ply": "world", "mesh.obj": "world = file + offset",
+        "mesh.glb": "world = (x, -z, y) of the file + offset",
+    }  # fmt: skip
+    transform = {
+        "version": 1, "offset": offset.tolist(), "world_from_scene": world_from_scene.to_json(),
+        "frames": frames,
+    }  # fmt: skip
     with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         stream = io.BytesIO()
-        np.savez(
-            stream,
-            vertices=np.asarray(mesh.vertices, np.float64),
-            faces=np.asarray(mesh.faces, np.int32),
-            corner_uvs=np.asarray(textured.corner_uvs, np.float32),
-            **arrays,
-        )
+        np.savez(stream, **arrays)
         write_bytes(folder / "mesh.npz", stream.getvalue())
-        for name, several in pngs.items():
-            for number, data in enumerate(several):
-                write_bytes(folder / atlas_file(name, number, udims), data)
-        write_json(
-            folder / "transform.json",
-            {
-                "version": 1,
-                "offset": offset.tolist(),
-                "world_from_scene": world_from_scene.to_json(),
-                "frames": {
-                    "mesh.npz": "scene",
-                    "mesh.ply": "world",
-                    "mesh.obj": "world = file + offset",
-                    "mesh.glb": "world = (x, -z, y) of the file + offset",
-                },
-            },
-        )
-    colors = vertex_colors(
-        len(world), mesh.faces, textured.corner_uvs, images["albedo"], face_atlas
-    )
+        for kind, several in pngs.items():
+            for name, data in zip(names[kind], several, strict=True):
+                write_bytes(folder / name, data)
+        write_json(folder / "transform.json", transform)
+    colors = vertex_colors(len(world), mesh.faces, corner_uvs, images["albedo"], face_atlas)
     write_mesh_ply(folder / "mesh.ply", world, mesh.faces, colors)
     local = world - offset
     if "obj" in formats:
+        placed = udim_uvs(corner_uvs, face_atlas, udims) if udims else corner_uvs
         write_obj(
-            folder / "mesh.obj",
-            local,
-            mesh.faces,
-            udim_uvs(textured.corner_uvs, face_atlas, udims) if udims else textured.corner_uvs,
-            [atlas_file("albedo", number, udims) for number in range(len(atlases))],
-            [atlas_file("normal", number, udims) for number in range(len(images["normal"]))],
+            folder / "mesh.obj", local, mesh.faces, placed, names["albedo"], names["normal"],
             face_atlas,
-        )
+        )  # fmt: skip
     if "glb" in formats:
         write_glb(
-            folder / "mesh.glb",
-            local,
-            mesh.faces,
-            textured.corner_uvs,
-            pngs["albedo"],
-            offset,
-            normal_png=pngs["normal"] or None,
-            occlusion_png=pngs["occlusion"] or None,
-            face_atlas=face_atlas,
-        )
+            folder / "mesh.glb", local, mesh.faces, corner_uvs, pngs["albedo"], offset,
+            normal_png=pngs["normal"], occlusion_png=pngs["occlusion"], face_atlas=face_atlas,
+        )  # fmt: skip
 
 
 def png_bytes(image: np.ndarray) -> bytes:

@@ -43,19 +43,15 @@ class HarmonicFill:
 
     Parameters
     ----------
-    known : (n, 3) float64
-        Positions with colours; if empty, the result is mid grey.
-    colors : (n, 3) uint8
+    known, colors : (n, 3) float64, (n, 3) uint8
+        Positions and their colours; without any, the result is mid grey.
     queries : callable
         Each call yields again all positions to colour, in blocks of (m, 3) float64: there may be
         tens of millions of them.
     """
 
     def __init__(
-        self,
-        known: np.ndarray,
-        colors: np.ndarray,
-        queries: Callable[[], Iterable[np.ndarray]],
+        self, known: np.ndarray, colors: np.ndarray, queries: Callable[[], Iterable[np.ndarray]]
     ) -> None:
         self._keys = np.empty(0, np.int64)
         if len(known) == 0:
@@ -162,10 +158,8 @@ def dilate(
 
     Parameters
     ----------
-    image : (h, w, 3) uint8
-        Modified in place.
-    ring : (h, w) int16
-        0 if filled, -1 if not; modified in place to the ring that filled the texel.
+    image, ring : (h, w, 3) uint8, (h, w) int16
+        Modified in place. ``ring`` is 0 if filled, -1 if not, then the ring that filled the texel.
     chart : (h, w) int32
         Chart of each texel, -1 between charts.
     rings : int
@@ -179,6 +173,14 @@ def dilate(
         if len(frontier) == 0:
             return
         frontier = _dilate_ring(frontier, number, image, ring, chart, inside)
+
+
+def fill_gutters(image: np.ndarray, owned: np.ndarray, gutter_px: int) -> np.ndarray:
+    """Dilate the texels of charts into the space between, in place; return which are filled."""
+    ring = np.where(owned, np.int16(0), np.int16(-1))
+    chart = np.where(owned, np.int32(0), np.int32(-1))
+    dilate(image, ring, chart, gutter_px, inside=False)
+    return np.asarray(ring >= 0)
 
 
 @kernel(fast=False)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,11 +27,12 @@ from .dense_detail import (
     MAX_SIDE_PX,
     NO_HIT,
     DenseSurface,
+    DetailMap,
     bake_normal_map,
     bake_occlusion,
     cage_distance,
 )
-from .fill import dilate, fill_background
+from .fill import fill_background, fill_gutters
 from .size import gutter_for
 from .unwrap.unwrap import Unwrap, unwrap
 
@@ -57,16 +58,8 @@ class ChartPyramid:
         """Return (n, 3) uint8 colours at UVs.
 
         Bilinear among texels of the face's chart; if a level has too few of them, as in charts
-        narrower than its texels, the next finer one is used. The finest uses all four texels: the
-        gutter beyond a chart's border has its colours.
-
-        Parameters
-        ----------
-        uv : (n, 2) float64
-            v upwards.
-        face : (n,) int
-        level : int
-            0 for the texture itself.
+        narrower than its texels, the next finer one is used. The finest (0) uses all four texels:
+        the gutter beyond a chart's border has its colours. UVs are (n, 2), v upwards.
         """
         charts = self.face_charts[face]
         result = np.zeros((len(uv), 3), np.uint8)
@@ -105,20 +98,11 @@ class ChartPyramid:
 def chart_pyramid(
     textured: TexturedMesh, levels: int, threads: int, atlas: int = 0
 ) -> ChartPyramid:
-    """Return the pyramid of one atlas.
-
-    Parameters
-    ----------
-    textured : TexturedMesh
-    levels : int
-        Maximum number of levels in addition to the finest.
-    """
-    mesh = textured.mesh
-    corner_uvs = np.asarray(textured.corner_uvs)
+    """Return the pyramid of one atlas, with at most ``levels`` in addition to the finest."""
+    mesh, corner_uvs = textured.mesh, np.asarray(textured.corner_uvs)
     face_charts = uv_charts(face_graph(mesh.vertices, mesh.faces), mesh.faces, corner_uvs)
     albedo = textured.atlases[atlas].albedo
-    mine = textured.atlas_of_faces == atlas
-    raster = raster_atlas(corner_uvs, albedo.shape[0], threads, mine)
+    raster = raster_atlas(corner_uvs, len(albedo), threads, textured.atlas_of_faces == atlas)
     owner = np.where(raster.face >= 0, face_charts[raster.face], -1).astype(np.int32)
     colors, charts = [albedo], [owner]
     weight = (owner >= 0).astype(np.float32)
@@ -156,15 +140,8 @@ def _halved(
 # -- Detail maps of a mesh from its dense version: normal map, ambient occlusion ------------------
 
 
-@dataclass(frozen=True)
-class DetailMaps:
-    """Maps in addition to the colours; ``None`` if not requested."""
-
-    normal_map: np.ndarray | None = None
-    """(h, w, 3) uint8."""
-    occlusion: np.ndarray | None = None
-    """(k, k) uint8."""
-    statistics: dict[str, Any] = field(default_factory=dict)
+DetailMaps = dict[str, DetailMap]
+"""Maps in addition to the colours by the name of their statistics, as far as requested."""
 
 
 def wants_normal_map(settings: TextureSettings, *, is_decimated: bool) -> bool:
@@ -173,64 +150,51 @@ def wants_normal_map(settings: TextureSettings, *, is_decimated: bool) -> bool:
 
 
 def bake_detail(
-    mesh: SurfaceMesh,
-    unwrapped: Unwrap,
-    raster: AtlasRaster,
-    dense: SurfaceMesh | None,
-    settings: TextureSettings,
-    progress: Progress,
-    *,
-    threads: int,
-    atlas: int = 0,
-) -> DetailMaps:
-    """Bake the maps requested by the settings.
+    mesh: SurfaceMesh, unwrapped: Unwrap, raster: AtlasRaster, dense: SurfaceMesh | None,
+    settings: TextureSettings, progress: Progress, *, threads: int, atlas: int,
+) -> DetailMaps:  # fmt: skip
+    """Bake the maps of one atlas of a mesh that the settings request.
 
-    Parameters
-    ----------
-    mesh : SurfaceMesh
-        The mesh that uses the maps.
-    unwrapped : Unwrap
-    raster : AtlasRaster
-        Raster of the baked atlas; the normal map has its size.
-    dense : SurfaceMesh or None
-        The mesh before decimation; without one, the mesh itself is the dense mesh.
-    settings : TextureSettings
-    progress : Progress
-        Span of this step.
-    atlas : int
-        Number of the atlas.
+    The normal map has the size of the raster of the atlas. Without the ``dense`` mesh before
+    decimation, the mesh itself is the dense one.
     """
     with_normals = wants_normal_map(settings, is_decimated=dense is not None)
     with_occlusion = settings.ambient_occlusion == "on"
     if not (with_normals or with_occlusion):
-        return DetailMaps()
+        return {}
+    maps: DetailMaps = {}
     surface = DenseSurface(mesh if dense is None else dense)
     size_px = raster.face.shape[0]
-    normal_map = occlusion = None
-    statistics: dict[str, Any] = {}
     if with_normals:
         gutter_px = gutter_for(size_px, settings.gutter_px)
         span = progress.span(0.0, 0.5 if with_occlusion else 1.0)
-        baked = bake_normal_map(mesh, unwrapped.corner_uvs, raster, surface, gutter_px, span)
-        normal_map, statistics["normal_map"] = baked.image, baked.statistics
+        maps["normal_map"] = bake_normal_map(
+            mesh, unwrapped.corner_uvs, raster, surface, gutter_px, span
+        )
     if with_occlusion:
         side_px = min(size_px, MAX_SIDE_PX)
         coarse = raster if side_px == size_px else unwrapped.raster(side_px, threads, atlas)
         gutter_px = gutter_for(side_px, settings.gutter_px)
         span = progress.span(0.5 if with_normals else 0.0, 1.0)
-        open_sky = bake_occlusion(mesh, coarse, surface, gutter_px, span)
-        occlusion, statistics["ambient_occlusion"] = open_sky.image, open_sky.statistics
-    return DetailMaps(normal_map, occlusion, statistics)
+        maps["ambient_occlusion"] = bake_occlusion(mesh, coarse, surface, gutter_px, span)
+    return maps
+
+
+def images_of(maps: DetailMaps) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return normal map and occlusion, ``None`` where not requested."""
+    found = (maps.get(name) for name in ("normal_map", "ambient_occlusion"))
+    normal_map, occlusion = (None if one is None else one.image for one in found)
+    return normal_map, occlusion
 
 
 def merged_statistics(details: Sequence[DetailMaps]) -> dict[str, Any]:
     """Merge the statistics of the atlases of one mesh; shares are averaged."""
     merged: dict[str, Any] = {}
-    for name, first in details[0].statistics.items():
-        each = [detail.statistics[name] for detail in details]
+    for name, first in details[0].items():
+        each = [detail[name].statistics for detail in details]
         merged[name] = {
             key: float(np.mean([one[key] for one in each])) if key.endswith("_share") else value
-            for key, value in first.items()
+            for key, value in first.statistics.items()
         }
     return merged
 
@@ -256,28 +220,18 @@ class ColorSource(NamedTuple):
     """Source of the colours of a level."""
 
     textured: TexturedMesh
-    surface: DenseSurface
-    """Surface of the textured mesh."""
-    pyramids: list[ChartPyramid]
-    """Pyramids of its texture, one for each atlas."""
+    surface: DenseSurface  # Surface of the textured mesh
+    pyramids: list[ChartPyramid]  # Pyramids of its texture, one for each atlas
 
 
 def levels_of_detail(
-    textured: TexturedMesh,
-    dense: SurfaceMesh | None,
-    settings: TextureSettings,
-    work_folder: Path,
-    progress: Progress,
-    *,
-    threads: int,
-    region: Region | None = None,
-) -> list[TexturedMesh]:
-    """Make the coarser levels of a textured mesh.
+    textured: TexturedMesh, dense: SurfaceMesh | None, settings: TextureSettings,
+    work_folder: Path, progress: Progress, *, threads: int, region: Region | None = None,
+) -> list[TexturedMesh]:  # fmt: skip
+    """Make the coarser levels 1, 2, ... of a textured mesh, which is level 0.
 
     Parameters
     ----------
-    textured : TexturedMesh
-        Level 0.
     dense : SurfaceMesh or None
         Level 0 before decimation; without one, level 0 is the dense mesh of the others.
     settings : TextureSettings
@@ -288,11 +242,6 @@ def levels_of_detail(
         For temporary sub-folders.
     region : Region, optional
         Region of the mesh: its flat boundary stays flat.
-
-    Returns
-    -------
-    list of TexturedMesh
-        Levels 1, 2, ...
     """
     levels: list[TexturedMesh] = []
     if settings.lods == 0:
@@ -306,21 +255,15 @@ def levels_of_detail(
     current, size_px = textured.mesh, textured.albedo.shape[0]
     for number in range(1, settings.lods + 1):
         span = progress.span((number - 1) / settings.lods, number / settings.lods)
-        target = len(current.faces) // FACES_DIVISOR
-        if target < FLOOR_FACES:
-            _warn_fewer_levels(textured, settings, number, f"the next would have {target} faces")
+        coarser = _coarser(current, span.span(0.0, 0.2), region)
+        if isinstance(coarser, str):
+            text = f"{number - 1} of {settings.lods} levels of detail were made: {coarser}."
+            _logger.warning("%s", text)
+            hint = "Choose fewer with --set lods=N, or a mesh with more faces."
+            warning = ReportWarning("fewer-levels", text, hint)
+            textured.statistics.setdefault("warnings", []).append(warning.to_json())
             break
-        try:
-            fewer = decimate(
-                current.vertices, current.faces, target, span.span(0.0, 0.2), region=region
-            )
-        except MeshingError as error:
-            _warn_fewer_levels(textured, settings, number, error.message.rstrip("."))
-            break
-        if 2 * len(fewer.faces) > len(current.faces):
-            _warn_fewer_levels(textured, settings, number, "fewer faces would tear the mesh")
-            break
-        current = SurfaceMesh(fewer.vertices, fewer.faces.astype(np.int32))
+        current = coarser
         size_px = max(size_px // 2, min(size_px, MIN_SIDE_PX))
         levels.append(
             _level(current, colors, source, size_px, settings, work_folder, span, threads)
@@ -329,27 +272,24 @@ def levels_of_detail(
     return levels
 
 
-def _warn_fewer_levels(
-    textured: TexturedMesh, settings: TextureSettings, number: int, reason: str
-) -> None:
-    """Log and report why there is no further level."""
-    text = f"{number - 1} of {settings.lods} levels of detail were made: {reason}."
-    _logger.warning("%s", text)
-    hint = "Choose fewer with --set lods=N, or a mesh with more faces."
-    warning = ReportWarning("fewer-levels", text, hint)
-    textured.statistics.setdefault("warnings", []).append(warning.to_json())
+def _coarser(mesh: SurfaceMesh, progress: Progress, region: Region | None) -> SurfaceMesh | str:
+    """Return the decimated mesh of the next level, or why there is none."""
+    target = len(mesh.faces) // FACES_DIVISOR
+    if target < FLOOR_FACES:
+        return f"the next would have {target} faces"
+    try:
+        fewer = decimate(mesh.vertices, mesh.faces, target, progress, region=region)
+    except MeshingError as error:
+        return error.message.rstrip(".")
+    if 2 * len(fewer.faces) > len(mesh.faces):
+        return "fewer faces would tear the mesh"
+    return SurfaceMesh(fewer.vertices, fewer.faces.astype(np.int32))
 
 
 def _level(
-    mesh: SurfaceMesh,
-    colors: ColorSource,
-    source: SurfaceMesh,
-    size_px: int,
-    settings: TextureSettings,
-    work_folder: Path,
-    progress: Progress,
-    threads: int,
-) -> TexturedMesh:
+    mesh: SurfaceMesh, colors: ColorSource, source: SurfaceMesh, size_px: int,
+    settings: TextureSettings, work_folder: Path, progress: Progress, threads: int,
+) -> TexturedMesh:  # fmt: skip
     gutter_px = gutter_for(size_px, settings.gutter_px)
     unwrapped = unwrap(
         mesh, size_px, gutter_px, work_folder, progress.span(0.2, 0.5),
@@ -367,15 +307,11 @@ def _level(
             threads=threads, atlas=number,
         )  # fmt: skip
         details.append(detail)
-        maps.append(AtlasMaps(albedo, detail.normal_map, detail.occlusion))
+        maps.append(AtlasMaps(albedo, *images_of(detail)))
     statistics = {
-        "faces": len(mesh.faces),
-        "size_px": size_px,
-        "atlases": unwrapped.atlases,
-        "unwrap": unwrapped.method,
-        "texels_overlapping": overlaps,
-        **merged_statistics(details),
-    }
+        "faces": len(mesh.faces), "size_px": size_px, "atlases": unwrapped.atlases,
+        "unwrap": unwrapped.method, "texels_overlapping": overlaps, **merged_statistics(details),
+    }  # fmt: skip
     return TexturedMesh.of(mesh, unwrapped.corner_uvs, unwrapped.face_atlas, maps, statistics)
 
 
@@ -384,16 +320,11 @@ def transfer_colors(
 ) -> np.ndarray:
     """Return the (h, w, 3) uint8 texture of a mesh, sampled from another textured mesh.
 
-    Parameters
-    ----------
-    mesh : SurfaceMesh
-    raster : AtlasRaster
-        Raster of its UVs at the wanted size; the source is averaged to the same resolution,
-        within its charts.
-    gutter_px : int
+    The raster of its UVs has the wanted size; the source is averaged to the same resolution, within
+    its charts.
     """
     size = raster.face.shape[0]
-    cage = cage_distance(mesh, DenseSurface(mesh), colors.surface)
+    cage = cage_distance(mesh, colors.surface)
     level = max(0, round(math.log2(colors.textured.albedo.shape[0] / size)))
     atlas_of_faces = colors.textured.atlas_of_faces
     normals = shading_normals(mesh.vertices, mesh.faces)
@@ -415,9 +346,6 @@ def transfer_colors(
             mine = owner == number
             found = pyramid.sample_level(uv[mine], matches.face[mine], level)
             image.reshape(-1, 3)[part[mine]] = found
-    owned = raster.face >= 0
-    ring, chart = np.where(owned, 0, -1).astype(np.int16), np.where(owned, 0, -1).astype(np.int32)
-    dilate(image, ring, chart, gutter_px, inside=False)
-    fill_background(image, ring >= 0)
+    fill_background(image, fill_gutters(image, raster.face >= 0, gutter_px))
     progress.update(1.0, "level of detail: colours")
     return image

@@ -31,22 +31,12 @@ JUMP_PX = 12.0
 MAX_CLEARANCE_PX = 16
 
 
-@dataclass(frozen=True)
-class PhotoVisibility:
-    """Depth of the mesh in a photo and distances to silhouettes."""
-
-    depth: np.ndarray
-    """(h, w) float32 z-depth of the first hit, infinite without a hit."""
-    clearance: np.ndarray
-    """(h, w) uint8 distance to the nearest silhouette, pixels, up to :data:`MAX_CLEARANCE_PX`."""
-
-
 def photo_visibility(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera, threads: int
-) -> PhotoVisibility:
-    """Rasterise the mesh and compute the distance of each pixel to silhouettes."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return depth and clearance of each pixel, as in :class:`PhotoView`."""
     depth = depth_buffer(vertices, faces, camera, threads=threads).depth
-    return PhotoVisibility(depth, _clearance(depth, JUMP_PX / min(camera.fx, camera.fy)))
+    return depth, _clearance(depth, JUMP_PX / min(camera.fx, camera.fy))
 
 
 @kernel(fast=False)
@@ -99,29 +89,13 @@ def _clearance(depth: Any, jump: float) -> np.ndarray:
 
 @inline
 def hidden_pixels(
-    depth: Any,
-    x: float,
-    y: float,
-    intrinsics: Any,
-    nx: float,
-    ny: float,
-    nz: float,
-    plane: float,
-    z: float,
-) -> int:
+    depth: Any, x: float, y: float, intrinsics: Any,
+    nx: float, ny: float, nz: float, plane: float, z: float,
+) -> int:  # fmt: skip
     """Count the pixels around a position (0 to 4) at which the plane ``n . p = plane`` is occluded.
 
-    Parameters
-    ----------
-    depth : (h, w) float32
-    x, y : float
-        Projection of the point, pixels.
-    intrinsics : (4,) float64
-        fx, fy, cx, cy.
-    nx, ny, nz, plane : float
-        The face's plane in camera coordinates; the normal points towards the camera.
-    z : float
-        Depth of the point.
+    The plane is that of a face in camera coordinates, its normal points towards the camera; x, y
+    are pixels, z the depth of the point, and the intrinsics fx, fy, cx, cy.
     """
     height, width = depth.shape
     tolerance = z * (BIAS_RELATIVE + BIAS_PX / min(intrinsics[0], intrinsics[1]))
@@ -174,10 +148,8 @@ MAX_USEFUL_PX = 1.5
 class SurfacePoints:
     """Points on faces of a mesh."""
 
-    face: np.ndarray
-    """(n,) int32."""
-    bary: np.ndarray
-    """(n, 2) float32 weights of the first two corners."""
+    face: np.ndarray  # (n,) int32
+    bary: np.ndarray  # (n, 2) float32 weights of the first two corners
 
     def __len__(self) -> int:
         return len(self.face)
@@ -191,22 +163,19 @@ class SurfacePoints:
 class SurfaceArrays:
     """Arrays of a mesh for the kernels."""
 
-    vertices: np.ndarray
-    """(v, 3) float64."""
-    faces: np.ndarray
-    """(f, 3) int32."""
-    face_normals: np.ndarray
-    """(f, 3) float64."""
-    vertex_normals: np.ndarray
-    """(v, 3) float64."""
-    texel_size: float
-    """Side of a texel on the surface, scene units."""
+    vertices: np.ndarray  # (v, 3) float64
+    faces: np.ndarray  # (f, 3) int32
+    face_normals: np.ndarray  # (f, 3) float64
+    vertex_normals: np.ndarray  # (v, 3) float64
+    texel_size: float  # Side of a texel on the surface, scene units
 
     @classmethod
     def of(
         cls, vertices: np.ndarray, faces: np.ndarray, face_normals: np.ndarray, texel_size: float
     ) -> SurfaceArrays:
         """Construct with vertex normals computed."""
+        vertices = np.ascontiguousarray(vertices, np.float64)
+        faces = np.ascontiguousarray(faces, np.int32)
         return cls(vertices, faces, face_normals, vertex_normals(vertices, faces), texel_size)
 
 
@@ -220,19 +189,16 @@ class PhotoView:
     image: Pyramid
     mask: np.ndarray
     """(h, w) bool; (1, 1) true without a mask."""
-    visibility: PhotoVisibility
+    depth: np.ndarray
+    """(h, w) float32 z-depth of the mesh, infinite where it is not hit."""
+    clearance: np.ndarray
+    """(h, w) uint8 distance to the nearest silhouette, pixels, up to :data:`MAX_CLEARANCE_PX`."""
 
 
 def sample_photo(
-    points: SurfacePoints,
-    surface: SurfaceArrays,
-    view: PhotoView,
-    factors: np.ndarray,
-    weights: np.ndarray,
-    colors: np.ndarray,
-    best_clearance: np.ndarray,
-    threads: int,
-) -> None:
+    points: SurfacePoints, surface: SurfaceArrays, view: PhotoView, factors: np.ndarray,
+    weights: np.ndarray, colors: np.ndarray, best_clearance: np.ndarray, threads: int,
+) -> None:  # fmt: skip
     """Sample the photo at every point; each point keeps its k best views.
 
     Parameters
@@ -252,28 +218,11 @@ def sample_photo(
 
     def chunk(begin: int, end: int) -> None:
         _sample(
-            points.face,
-            points.bary,
-            begin,
-            end,
-            surface.vertices,
-            surface.faces,
-            surface.face_normals,
-            surface.vertex_normals,
-            surface.texel_size,
-            pose,
-            intrinsics,
-            view.focal_px,
-            view.visibility.depth,
-            view.visibility.clearance,
-            view.mask,
-            view.image.pixels,
-            view.image.levels,
-            factors,
-            weights,
-            colors,
-            best_clearance,
-        )
+            points.face, points.bary, begin, end, surface.vertices, surface.faces,
+            surface.face_normals, surface.vertex_normals, surface.texel_size, pose, intrinsics,
+            view.focal_px, view.depth, view.clearance, view.mask,
+            view.image.pixels, view.image.levels, factors, weights, colors, best_clearance,
+        )  # fmt: skip
 
     run_chunks(chunk, even_bounds(len(points), threads, 16), threads)
 
@@ -285,28 +234,11 @@ def _fade(distance: float, width: float, floor: float) -> float:
 
 @kernel(fast=False)
 def _sample(
-    point_face: Any,
-    point_bary: Any,
-    begin: int,
-    end: int,
-    vertices: Any,
-    faces: Any,
-    face_normals: Any,
-    corner_normals: Any,
-    texel_size: float,
-    pose: Any,
-    intrinsics: Any,
-    focal_px: float,
-    depth: Any,
-    clearance: Any,
-    mask: Any,
-    pixels: Any,
-    levels: Any,
-    factors: Any,
-    weights: Any,
-    colors: Any,
-    best_clearance: Any,
-) -> None:
+    point_face: Any, point_bary: Any, begin: int, end: int, vertices: Any, faces: Any,
+    face_normals: Any, corner_normals: Any, texel_size: float, pose: Any, intrinsics: Any,
+    focal_px: float, depth: Any, clearance: Any, mask: Any, pixels: Any, levels: Any,
+    factors: Any, weights: Any, colors: Any, best_clearance: Any,
+) -> None:  # fmt: skip
     height, width = depth.shape
     has_mask = mask.shape[0] == height and mask.shape[1] == width
     kept = weights.shape[1]

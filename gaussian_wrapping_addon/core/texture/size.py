@@ -41,22 +41,13 @@ def texture_memory_bytes(size_px: int, atlases: int, faces: int) -> int:
 
 
 def fit_into_memory(
-    size_px: int,
-    atlases: int,
-    faces: int,
-    free_bytes: int,
-    *,
-    may_lower: bool,
+    size_px: int, atlases: int, faces: int, free_bytes: int, *, may_lower: bool,
     may_join: bool = True,
-) -> tuple[int, int, ReportWarning | None]:
+) -> tuple[int, int, ReportWarning | None]:  # fmt: skip
     """Return side and number of textures that fit, and a warning if that is less than requested.
 
     Parameters
     ----------
-    size_px, atlases : int
-        Requested side and number.
-    faces : int
-        Number of faces of the mesh.
     free_bytes : int
         Available memory; 0 if unknown, then nothing is checked.
     may_lower : bool
@@ -78,10 +69,9 @@ def fit_into_memory(
     while side // 2 >= MIN_SIZE_PX and texture_memory_bytes(side, number, faces) > free_bytes:
         side //= 2
     fits = texture_memory_bytes(side, number, faces) <= free_bytes
-    what = "texture" if atlases == 1 else f"{atlases} textures"
-    text = (
-        f"A {what} of {size_px} pixels" if atlases == 1 else f"{what} of {size_px} pixels"
-    ) + f" may need {needed / 2**30:.1f} GB of memory; {free_bytes / 2**30:.1f} GB are free"
+    what = "A texture" if atlases == 1 else f"{atlases} textures"
+    text = f"{what} of {size_px} pixels may need {needed / 2**30:.1f} GB of memory; "
+    text += f"{free_bytes / 2**30:.1f} GB are free"
     if not (fits and may_lower):
         hint = "Close other programs or use a machine with more memory."
         if fits:
@@ -104,7 +94,6 @@ TEXELS_PER_DETAIL_POINT = 2
 """With one texel per vertex of the dense mesh, a normal map would lose half of its bends."""
 FULL_GUTTER_SIDE_PX = 4096
 MIN_GUTTER_PX = 2
-
 MAX_AUTOMATIC_SIZE_PX = 4096
 EXPECTED_UTILISATION = 0.5
 """Share of texels covered by charts; 0.4 to 0.65 were measured on ordinary meshes."""
@@ -113,7 +102,7 @@ ENOUGH = 0.8
 
 
 def required_side(
-    graph: FaceGraph, photos: PhotoSource, count: int, detail_points: int = 0, seed: int = 0
+    graph: FaceGraph, photos: PhotoSource, count: int, detail_points: int = 0
 ) -> float:
     """Return the side in pixels of one texture at about the photos' resolution, without limits.
 
@@ -121,14 +110,14 @@ def required_side(
     :data:`TEXELS_PER_DETAIL_POINT` of the ``detail_points`` of a normal map. 0 if no photo shows
     the mesh.
     """
-    wanted = side_in_photos(graph, photos, count, seed)
+    wanted = side_in_photos(graph, photos, count)
     if wanted == 0.0:
         return 0.0
     room = max(TEXELS_PER_FACE * len(graph.areas), TEXELS_PER_DETAIL_POINT * detail_points)
     return max(wanted, math.sqrt(room / EXPECTED_UTILISATION))
 
 
-def side_in_photos(graph: FaceGraph, photos: PhotoSource, count: int, seed: int = 0) -> float:
+def side_in_photos(graph: FaceGraph, photos: PhotoSource, count: int) -> float:
     """Return the side in pixels of one texture that holds what photos show of a mesh.
 
     The footprint of a photo's pixel on the surface is ``z / focal``; each sampled face uses its
@@ -136,8 +125,7 @@ def side_in_photos(graph: FaceGraph, photos: PhotoSource, count: int, seed: int 
     order of magnitude matters.
     """
     area = float(graph.areas.sum())
-    generator = np.random.default_rng(seed)
-    faces = generator.choice(len(graph.areas), SAMPLED_FACES, p=graph.areas / area)
+    faces = np.random.default_rng(0).choice(len(graph.areas), SAMPLED_FACES, p=graph.areas / area)
     centroids, normals = graph.centroids[faces], graph.normals[faces]
     best = np.full(SAMPLED_FACES, np.inf)
     for index in range(count):
@@ -154,12 +142,6 @@ def side_in_photos(graph: FaceGraph, photos: PhotoSource, count: int, seed: int 
     return ENOUGH * math.sqrt(area / EXPECTED_UTILISATION) / float(np.median(best))
 
 
-def _power_of_two(wanted: float) -> int:
-    exponent = math.ceil(math.log2(max(wanted, 1.0)))
-    largest = min(MAX_AUTOMATIC_SIZE_PX, limits.MAX_TEXTURE_SIDE_PX)
-    return int(min(max(2**exponent, MIN_SIZE_PX), largest))
-
-
 def plan_textures(wanted: float, size_px: int, max_atlases: int) -> tuple[int, int]:
     """Return the side of each texture in pixels and how many there are.
 
@@ -174,7 +156,8 @@ def plan_textures(wanted: float, size_px: int, max_atlases: int) -> tuple[int, i
         ``wanted``. 0 means one, but :data:`~.limits.MAX_AUTOMATIC_ATLASES` if one of 8192 is not
         enough and no smaller size was requested.
     """
-    side = size_px or _power_of_two(wanted)
+    nearest = 2 ** math.ceil(math.log2(max(wanted, 1.0)))
+    side = size_px or min(max(nearest, MIN_SIZE_PX), MAX_AUTOMATIC_SIZE_PX)
     most = max_atlases
     if most == 0:
         is_free = size_px in (0, limits.MAX_TEXTURE_SIDE_PX)

@@ -27,7 +27,7 @@ from .bake import (
     correction_sample_count,
     prepare_photos,
 )
-from .levels_of_detail import bake_detail, merged_statistics, wants_normal_map
+from .levels_of_detail import bake_detail, images_of, merged_statistics, wants_normal_map
 from .photo_samples import SurfaceArrays, SurfacePoints
 from .size import EXPECTED_UTILISATION, fit_into_memory, gutter_for, plan_textures, required_side
 from .unwrap.charts import texture_stretch
@@ -40,38 +40,21 @@ MIN_UV_AREA = 1e-4
 
 
 def texture_mesh(
-    mesh: SurfaceMesh,
-    scene: Scene,
-    photos: PhotoSource,
-    settings: TextureSettings,
-    work_folder: Path,
-    progress: Progress,
-    *,
-    threads: int,
-    dense: SurfaceMesh | None = None,
-    free_bytes: int = 0,
-    unwrapped: Unwrap | None = None,
-    polygons: np.ndarray | None = None,
-) -> TexturedMesh:
-    """Unwrap a mesh and bake its texture from the photos (docs/method.md, section 8).
+    mesh: SurfaceMesh, scene: Scene, photos: PhotoSource, settings: TextureSettings,
+    work_folder: Path, progress: Progress, *, threads: int, dense: SurfaceMesh | None = None,
+    free_bytes: int = 0, unwrapped: Unwrap | None = None, polygons: np.ndarray | None = None,
+) -> TexturedMesh:  # fmt: skip
+    """Unwrap a mesh of the scene frame and bake its texture (docs/method.md, section 8).
 
     Parameters
     ----------
-    mesh : SurfaceMesh
-        In the scene frame.
-    scene : Scene
-        Views of the photos.
-    photos : PhotoStore
-        Any object with ``camera``, ``photo`` and ``mask`` by index and divisor.
     settings : TextureSettings
         ``size_px = 0`` chooses the size from the photos' footprint, ``max_atlases = 0`` the number
         of textures.
     work_folder : Path
         For a temporary sub-folder of the unwrap.
-    progress : Progress
-        Span of this step.
     threads : int
-        Threads to use; the result does not depend on it.
+        The result does not depend on it.
     dense : SurfaceMesh, optional
         The mesh before decimation; its detail goes into the normal map.
     free_bytes : int
@@ -116,14 +99,12 @@ def texture_mesh(
     for number in range(atlases):
         span = progress.span(0.42 + 0.48 * number / atlases, 0.42 + 0.48 * (number + 1) / atlases)
         raster = unwrapped.raster(size_px, threads, number) if first is None else first
-        details.append(
-            bake_detail(
-                mesh, unwrapped, raster, dense, settings, span.span(0.0, 0.2),
-                threads=threads, atlas=number,
-            )
+        detail = bake_detail(
+            mesh, unwrapped, raster, dense, settings, span.span(0.0, 0.2),
+            threads=threads, atlas=number,
         )  # fmt: skip
-        overlaps = raster.overlaps
-        atlas = atlas_points(raster, unwrapped.charts)
+        details.append(detail)
+        overlaps, atlas = raster.overlaps, atlas_points(raster, unwrapped.charts)
         del raster
         first = None  # half of the memory
         baked = bake(
@@ -139,11 +120,12 @@ def texture_mesh(
     progress.update(0.9, "filling unseen texels")
     fill = fill_harmonically(colors, surface)
     images = []
-    while colors:
+    while colors:  # frees each
         images.append(colors.pop(0).finish(fill, surface, gutter_px))
     stretch = texture_stretch(mesh.vertices, mesh.faces, unwrapped.corner_uvs)
     statistics = {
         **coverage.statistics(size_px, settings, unwrapped, graph.areas),
+        **preparation.statistics,
         "stretch_mean": stretch.mean,
         "stretch_p95": stretch.p95,
         "area_collapsed_share": stretch.collapsed_share,
@@ -154,21 +136,16 @@ def texture_mesh(
         _logger.warning("no photo sees the mesh: its texture is plain grey")
     progress.update(1.0, f"texture: {100 * statistics['coverage']:.1f} % seen by photos")
     maps = [
-        AtlasMaps(image, detail.normal_map, detail.occlusion, shown)
+        AtlasMaps(image, *images_of(detail), shown)
         for image, detail, shown in zip(images, details, views, strict=True)
     ]
     return TexturedMesh.of(mesh, unwrapped.corner_uvs, unwrapped.face_atlas, maps, statistics)
 
 
 def _plan(
-    graph: FaceGraph,
-    photos: PhotoSource,
-    count: int,
-    settings: TextureSettings,
-    dense: SurfaceMesh | None,
-    free_bytes: int,
-    unwrapped: Unwrap | None,
-) -> tuple[int, int, ReportWarning | None]:
+    graph: FaceGraph, photos: PhotoSource, count: int, settings: TextureSettings,
+    dense: SurfaceMesh | None, free_bytes: int, unwrapped: Unwrap | None,
+) -> tuple[int, int, ReportWarning | None]:  # fmt: skip
     """Return side and number of textures, and a warning if memory limits them."""
     detail_points = 0
     if dense is not None and wants_normal_map(settings, is_decimated=True):
@@ -189,12 +166,7 @@ def _plan(
 
 
 def _sample_surface(
-    mesh: SurfaceMesh,
-    graph: FaceGraph,
-    unwrapped: Unwrap,
-    size_px: int,
-    photos: int,
-    threads: int,
+    mesh: SurfaceMesh, graph: FaceGraph, unwrapped: Unwrap, size_px: int, photos: int, threads: int
 ) -> tuple[SurfaceArrays, SurfacePoints, AtlasRaster | None]:
     """Return the surface with its texel size, evenly spread points, and the raster if only one.
 
@@ -210,12 +182,7 @@ def _sample_surface(
         counts.append(used)
         samples.append(_even_texels(raster, used, min(wanted, used)))
     texel_size = math.sqrt(float(graph.areas.sum()) / max(inside, 1))
-    surface = SurfaceArrays.of(
-        np.ascontiguousarray(mesh.vertices, np.float64),
-        np.ascontiguousarray(mesh.faces, np.int32),
-        graph.normals,
-        texel_size,
-    )
+    surface = SurfaceArrays.of(mesh.vertices, mesh.faces, graph.normals, texel_size)
     if len(samples) == 1:
         return surface, samples[0], raster
     parts = []
@@ -249,11 +216,8 @@ def validate_for_texturing(mesh: SurfaceMesh) -> None:
         raise MeshingError("A face of the mesh refers to a vertex that does not exist.", hint)
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
-        first = int(np.flatnonzero(~finite)[0])
-        raise MeshingError(
-            f"{int((~finite).sum())} vertices of the mesh are not finite, the first is {first}.",
-            hint,
-        )
+        text = f"{int((~finite).sum())} vertices of the mesh are not finite, the first is "
+        raise MeshingError(f"{text}{int(np.argmin(finite))}.", hint)
     cross = area_vectors(vertices.astype(np.float64), faces)
     if not (np.abs(cross).max() > 0 and np.isfinite(cross).all()):
         raise MeshingError("No face of the mesh has an area.", hint)

@@ -240,8 +240,7 @@ def _write_mesh(
             shading = "lit" if maps else "unlit"
         write_glb(
             path, local, mesh.faces, mesh.corner_uvs, albedo_png, frame.offset,
-            normal_png=maps.get("normal_png"), occlusion_png=maps.get("occlusion_png"),
-            shading=shading, face_atlas=mesh.face_atlas,
+            shading=shading, face_atlas=mesh.face_atlas, **maps,
         )  # fmt: skip
     contents = {
         "region": mesh.region, "level": mesh.level, "shading": shading, "textures": textures,

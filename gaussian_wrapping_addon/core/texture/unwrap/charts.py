@@ -20,8 +20,14 @@ from ...mesh.components import FaceGraph, face_graph, uv_charts
 from ...mesh.surface_mesh import area_vectors, half_edges
 from ...progress import Progress
 from ...worker.helper_process import run_helper
-from .overlaps import find_overlaps, join_polygons, set_cut_apart, signed_areas, split_overlaps
-from .packing_scale import chart_extents, packing_scale, packing_square, split_wide_charts
+from .overlaps import find_overlaps, join_polygons, set_cut_apart, split_overlaps
+from .packing_scale import (
+    chart_bounds,
+    packing_scale,
+    packing_square,
+    signed_areas,
+    split_wide_charts,
+)
 
 # -- Texture stretch of an unwrap -----------------------------------------------------------------
 
@@ -38,22 +44,13 @@ class Stretch:
     Root mean square over directions of the distance on the surface per unit step in the texture.
     """
 
-    mean: float
-    """Mean over the surface."""
-    p95: float
-    """95th percentile over the surface."""
-    collapsed_share: float
-    """Share of the surface that has no area in the texture."""
+    mean: float  # Mean over the surface
+    p95: float  # 95th percentile over the surface
+    collapsed_share: float  # Share of the surface that has no area in the texture
 
 
 def texture_stretch(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray) -> Stretch:
     """Measure the stretch of each face, weighted by its area (Sander and others, 2001).
-
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int32
-    corner_uvs : (f, 3, 2) float32
 
     Raises
     ------
@@ -67,7 +64,6 @@ def texture_stretch(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndar
     areas = 0.5 * np.linalg.norm(np.cross(edge_one, edge_two), axis=1)
     double = uv_one[:, 0] * uv_two[:, 1] - uv_one[:, 1] * uv_two[:, 0]
     spread = 0.5 * np.abs(double) > COLLAPSED_UV_AREA
-    total = float(areas.sum())
     if not spread.any():
         raise MeshingError("No face has an area in the texture.", "Mesh the region again.")
     inverse = 1.0 / double[spread, None]
@@ -84,7 +80,7 @@ def texture_stretch(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndar
     return Stretch(
         float((weight * stretch).sum() / weight.sum()),
         float(stretch[order[min(at, len(order) - 1)]]),
-        1.0 - float(weight.sum()) / total,
+        1.0 - float(weight.sum()) / float(areas.sum()),
     )
 
 
@@ -108,13 +104,9 @@ ANCHOR_WEIGHT = 1e-6
 
 
 def smooth_vertices(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Move vertices towards the mean of their neighbours, by at most half an edge.
+    """Return vertices moved towards the mean of their neighbours, by at most half an edge.
 
     xatlas splits charts at noisy or badly shaped faces; smoothing reduces both.
-
-    Returns
-    -------
-    (v, 3) float64
     """
     start = np.asarray(vertices, np.float64)
     centre = start[faces].mean(axis=(0, 1))
@@ -122,11 +114,11 @@ def smooth_vertices(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     begin, end = half_edges(faces)
     rows, columns = np.concatenate([begin, end]), np.concatenate([end, begin])
     count = len(start)
-    degree = np.maximum(np.bincount(rows, minlength=count), 1)
+    degree = np.bincount(rows, minlength=count)
+    isolated, degree = degree == 0, np.maximum(degree, 1)
     length = np.linalg.norm(start[rows] - start[columns], axis=1)
     limit = MAX_MOVE_SHARE * np.bincount(rows, length, count) / degree
     adjacency = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    isolated = np.bincount(rows, minlength=count) == 0
     points = start.copy()
     for _ in range(SMOOTHING_STEPS):
         move = (adjacency @ points) / degree[:, None] - start
@@ -138,31 +130,27 @@ def smooth_vertices(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def _restore_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Restore the vertices of faces that lost most of their area, so that thin tubes stay open."""
-    before = np.linalg.norm(area_vectors(start, faces), axis=1)
+    least = MIN_AREA_SHARE * np.linalg.norm(area_vectors(start, faces), axis=1)
     points = points.copy()
     while True:
-        crushed = np.linalg.norm(area_vectors(points, faces), axis=1) < MIN_AREA_SHARE * before
-        back = np.unique(faces[crushed])
-        back = back[(points[back] != start[back]).any(axis=1)]
-        if len(back) == 0:
+        crushed = np.linalg.norm(area_vectors(points, faces), axis=1) < least
+        if not _moved_back(points, start, faces[crushed]):
             return points
-        points[back] = start[back]
+
+
+def _moved_back(points: np.ndarray, start: np.ndarray, rows: np.ndarray) -> bool:
+    """Move some of the points back to the start, in place; return whether any were elsewhere."""
+    back = np.unique(rows)
+    back = back[(points[back] != start[back]).any(axis=1)]
+    points[back] = start[back]
+    return len(back) > 0
 
 
 def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index the distinct points of each chart.
+    """Index the distinct points of each chart, of (f, 3, 2) float32 UVs.
 
-    Parameters
-    ----------
-    corner_uvs : (f, 3, 2) float32
-    charts : (f,) int
-
-    Returns
-    -------
-    corners : (f, 3) int64
-        Index of a point for each corner; charts share no points.
-    first : (n,) int64
-        A corner ``3 * face + k`` at each point.
+    Returns the index of a point for each corner, (f, 3); charts share no points. And a corner
+    ``3 * face + k`` at each point, (n,).
     """
     bits = np.ascontiguousarray(corner_uvs, np.float32).reshape(-1, 2) + np.float32(0.0)
     bits = bits.view(np.uint32).astype(np.int64)  # (3 f, 2); + 0.0 maps -0.0 to 0.0
@@ -177,18 +165,11 @@ def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray
 def equalise_density(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.ndarray:
     """Scale each chart to the area of its faces, and move its lower corner to the origin.
 
-    Parameters
-    ----------
-    shapes : (f, 3, 2) float64
-        True shape of each face, see :func:`flatten_faces`.
+    The shapes are those of :func:`flatten_faces`.
     """
-    count = int(charts.max()) + 1
     uvs = np.asarray(corner_uvs, np.float64)
-    low = np.full((count, 2), np.inf)
-    high = np.full((count, 2), -np.inf)
-    for corner in range(3):
-        np.minimum.at(low, charts, uvs[:, corner])
-        np.maximum.at(high, charts, uvs[:, corner])
+    low, high = chart_bounds(uvs, charts)
+    count = len(low)
     true = np.bincount(charts, np.abs(signed_areas(shapes)), count)
     flat = np.bincount(charts, np.abs(signed_areas(uvs)), count)
     # A chart without area must not grow beyond its edges.
@@ -216,18 +197,8 @@ def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.
 
     Rounds of two steps (Liu and others 2008, "A Local/Global Approach to Mesh Parameterization"):
     the best rotation of each face, then the least-squares points for all rotated faces. Points of
-    faces that flip or overlap as a result are restored.
-
-    Parameters
-    ----------
-    corner_uvs : (f, 3, 2) float
-        Charts of uniform density, counter-clockwise.
-    charts : (f,) int
-    shapes : (f, 3, 2) float64
-
-    Returns
-    -------
-    (f, 3, 2) float64
+    faces that flip or overlap as a result are restored. The charts, (f, 3, 2), are of uniform
+    density and counter-clockwise; the shapes are those of :func:`flatten_faces`.
     """
     start = np.asarray(corner_uvs, np.float64)
     corners, first = chart_points(corner_uvs.astype(np.float32), charts)
@@ -250,14 +221,9 @@ def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.
         cross = edges[..., 0] * moved[..., 1] - edges[..., 1] * moved[..., 0]
         sine = (weights * cross).sum(axis=1)
         length = np.maximum(np.hypot(cosine, sine), 1e-300)
-        cosine, sine = cosine / length, sine / length
-        turned = np.stack(
-            [
-                cosine[:, None] * edges[..., 0] - sine[:, None] * edges[..., 1],
-                sine[:, None] * edges[..., 0] + cosine[:, None] * edges[..., 1],
-            ],
-            axis=2,
-        )
+        cosine, sine = (cosine / length)[:, None], (sine / length)[:, None]
+        x, y = edges[..., 0], edges[..., 1]
+        turned = np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=2)
         edge_targets = (weights[..., None] * turned).reshape(-1, 2)
         right_side = anchor * points
         for axis in range(2):
@@ -272,12 +238,7 @@ def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.
 def _restore_folded_faces(
     points: np.ndarray, start: np.ndarray, corners: np.ndarray, charts: np.ndarray
 ) -> np.ndarray:
-    """Restore the points of faces that flipped or overlap since the start.
-
-    Returns
-    -------
-    (f, 3, 2) float64
-    """
+    """Return UVs, (f, 3, 2), with the points restored of faces that flipped or overlap since."""
     count = int(charts.max()) + 1
     before = start[corners]
     was_up = signed_areas(before) > 0.0
@@ -286,16 +247,12 @@ def _restore_folded_faces(
     for _ in range(MAX_ROUNDS_BACK):
         now = points[corners]
         pairs = find_overlaps(now, charts)
-        pairs = pairs[
-            folded[charts[pairs[:, 0]]] == 0
-        ]  # charts that overlapped before are split later
+        # Charts that overlapped before are split later.
+        pairs = pairs[folded[charts[pairs[:, 0]]] == 0]
         bad = was_up & (signed_areas(now) <= 0.0)
         bad[pairs] = True
-        back = np.unique(corners[bad])
-        back = back[(points[back] != start[back]).any(axis=1)]
-        if len(back) == 0:
+        if not _moved_back(points, start, corners[bad]):
             return now
-        points[back] = start[back]
     still_folded = np.bincount(charts, bad, count) > 0
     return np.where(still_folded[charts][:, None, None], before, points[corners])
 
@@ -339,15 +296,10 @@ def split_into_chunks(graph: FaceGraph, max_faces: int = MAX_CHUNK_FACES) -> np.
 
     Chunks grow from a seed over shared edges, by distance and deviation of normals; small chunks
     are merged with the neighbour with which they share most edges; isolated small pieces are
-    bundled.
-
-    Returns
-    -------
-    (f,) int32
-        Labels from 0; every chunk has at most ``1.3 * max_faces`` faces.
+    bundled. Returns labels from 0, (f,) int32; a chunk has at most ``1.3 * max_faces`` faces.
     """
     radius = float(np.sqrt(max(graph.areas.mean(), 1e-300) * max_faces / np.pi))
-    neighbours = np.where(graph.opposite >= 0, graph.opposite // 3, -1).astype(np.int32)
+    neighbours = (graph.opposite // 3).astype(np.int32)  # -1 without one
     labels = _grow(neighbours, graph.centroids, graph.normals, radius, max_faces)
     return _merge_small(labels, neighbours, max_faces)
 
@@ -453,12 +405,10 @@ def _bundle(labels: np.ndarray, max_faces: int) -> np.ndarray:
     current, filled, used = -1, max_faces, 0
     for index, size in enumerate(sizes.tolist()):
         if size >= SMALL_CHUNK_SHARE * max_faces:
-            bundle[index] = used
-            used += 1
+            bundle[index], used = used, used + 1
             continue
         if filled + size > max_faces:
-            current, filled = used, 0
-            used += 1
+            current, filled, used = used, 0, used + 1
         bundle[index] = current
         filled += size
     return bundle[inverse]
@@ -498,25 +448,18 @@ class Charts:
     polygons: np.ndarray | None = None
     """(k,) int64 polygon of each face, if polygons are to stay whole."""
 
-    def density(self, size_px: int, gutter_px: int, atlases: int = 1) -> float:
+    def density(self, size_px: int, gutter_px: int, atlases: int) -> float:
         """Return the approximate texels per edge on all but 5 % of the surface."""
-        corners = np.arange(self.corner_uvs.size // 2).reshape(-1, 3)
-        extents = chart_extents(self.corner_uvs.reshape(-1, 2), corners, self.labels)
+        low, high = chart_bounds(self.corner_uvs, self.labels)
         side_px, padding_px = packing_square(size_px, gutter_px)
-        scale = packing_scale(extents, side_px, padding_px, atlases) * size_px / side_px
+        scale = packing_scale(high - low, side_px, padding_px, atlases) * size_px / side_px
         return scale / max(self.stretch.p95, 1.0)
 
 
 def find_charts(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    size_px: int,
-    gutter_px: int,
-    folder: Path,
-    progress: Progress,
-    atlases: int = 1,
-    polygons: np.ndarray | None = None,
-) -> Charts:
+    vertices: np.ndarray, faces: np.ndarray, size_px: int, gutter_px: int, folder: Path,
+    progress: Progress, atlases: int, polygons: np.ndarray | None,
+) -> Charts:  # fmt: skip
     """Cut the mesh into charts without folds with xatlas.
 
     Charts are found on a smoothed copy: on meshes as rough as real ones, xatlas makes up to twelve
@@ -529,15 +472,11 @@ def find_charts(
         Median edge about 1, near the origin.
     faces : (f, 3) int32
         Faces with non-zero area.
-    size_px, gutter_px : int
-        Side of the texture and texels to keep free between charts.
+    size_px, gutter_px, atlases : int
+        Side of the texture, texels to keep free between charts, and number of textures.
     folder : Path
         For the files of the helper process.
-    progress : Progress
-        Span of this step.
-    atlases : int
-        Number of textures for the charts.
-    polygons : (f,) int64, optional
+    polygons : (f,) int64 or None
         Polygon that each face is a part of. Charts cut none of them, but for folded ones with more
         than four sides.
 
@@ -546,20 +485,19 @@ def find_charts(
     WorkerError, DatasetError, ResourceError
         xatlas crashed, returned invalid results, took too long or got too little memory.
     """
-    copy = smooth_vertices(vertices, faces)
+    copy, rest = smooth_vertices(vertices, faces), progress.span(0.6, 1.0)
     try:
         first = _charts(vertices, copy, faces, folder, progress.span(0.0, 0.6), polygons)
     except MemoryShortageError:
         raise
     except (WorkerError, ResourceError, DatasetError) as error:
         _logger.info("xatlas failed on the smoothed copy: %s", error.message)
-        return _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0), polygons)
-    too_stretched = (
-        first.stretch.mean > MAX_MEAN_STRETCH or first.stretch.collapsed_share > MAX_LOST_SHARE
-    )
+        return _charts(vertices, vertices, faces, folder, rest, polygons)
+    stretch = first.stretch
+    too_stretched = stretch.mean > MAX_MEAN_STRETCH or stretch.collapsed_share > MAX_LOST_SHARE
     if not too_stretched and len(first.faces) == len(faces):
         return first
-    second = _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0), polygons)
+    second = _charts(vertices, vertices, faces, folder, rest, polygons)
     density = [one.density(size_px, gutter_px, atlases) for one in (first, second)]
     _logger.debug("texels for an edge: %.2f, without smoothing %.2f", *density)
     lost = first.stretch.collapsed_share - second.stretch.collapsed_share
@@ -568,13 +506,9 @@ def find_charts(
 
 
 def _charts(
-    vertices: np.ndarray,
-    positions: np.ndarray,
-    faces: np.ndarray,
-    folder: Path,
-    progress: Progress,
-    polygons: np.ndarray | None,
-) -> Charts:
+    vertices: np.ndarray, positions: np.ndarray, faces: np.ndarray, folder: Path,
+    progress: Progress, polygons: np.ndarray | None,
+) -> Charts:  # fmt: skip
     """Cut the mesh into charts at given positions, and relax these to ``vertices``."""
     corner_uvs = _run_xatlas(positions, faces, folder, progress.span(0.0, 0.7))
     kept = np.flatnonzero(np.isfinite(corner_uvs).all(axis=(1, 2)))
@@ -585,7 +519,9 @@ def _charts(
     progress.update(0.75, "fitting charts to the surface")
     labels = uv_charts(graph, faces, corner_uvs)
     shapes = flatten_faces(vertices, faces)
-    flat = equalise_density(_counter_clockwise(corner_uvs, labels), labels, shapes)
+    flat = corner_uvs.astype(np.float64)
+    flat[np.bincount(labels, signed_areas(flat))[labels] < 0.0, :, 0] *= -1.0  # mirrored charts
+    flat = equalise_density(flat, labels, shapes)
     if polygons is not None:
         polygons = polygons[kept]
         flat = join_polygons(flat, labels, faces, shapes, graph, polygons)
@@ -599,13 +535,6 @@ def _charts(
     side = max(float(np.abs(flat).max()), 1e-300)
     stretch = texture_stretch(vertices, faces, flat / side)
     return Charts(kept, flat, labels, stretch, polygons)
-
-
-def _counter_clockwise(corner_uvs: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Mirror the charts with negative total signed area."""
-    uvs = np.asarray(corner_uvs, np.float64).copy()
-    uvs[np.bincount(labels, signed_areas(uvs))[labels] < 0.0, :, 0] *= -1.0
-    return uvs
 
 
 def _run_xatlas(
@@ -622,14 +551,11 @@ def _run_xatlas(
         vertices.append(positions[used].astype(np.float32))
         local.append(inverse.reshape(-1, 3).astype(np.uint32))
         vertex_bounds.append(vertex_bounds[-1] + len(used))
-    np.savez(
-        folder / "input.npz",
-        vertices=np.concatenate(vertices),
-        corners=np.concatenate(local),
-        vertex_bounds=np.array(vertex_bounds),
-        face_bounds=face_bounds,
-    )
-    result = _run(CHARTS_HELPER, folder, len(faces), progress.span(0.1, 1.0))["corner_uvs"]
+    task = {
+        "vertices": np.concatenate(vertices), "corners": np.concatenate(local),
+        "vertex_bounds": np.array(vertex_bounds), "face_bounds": face_bounds,
+    }  # fmt: skip
+    result = _run(CHARTS_HELPER, folder, len(faces), progress.span(0.1, 1.0), task)["corner_uvs"]
     if result.shape != (len(faces), 3, 2):
         raise WorkerError("xatlas returned UVs of another mesh.")
     corner_uvs = np.empty((len(faces), 3, 2), np.float32)
@@ -637,27 +563,20 @@ def _run_xatlas(
     return corner_uvs
 
 
-def _run(helper: str, folder: Path, faces: int, progress: Progress) -> dict[str, np.ndarray]:
+def _run(
+    helper: str, folder: Path, faces: int, progress: Progress, task: dict[str, Any]
+) -> dict[str, np.ndarray]:
+    np.savez(folder / "input.npz", **task)
     output = folder / "output.npz"
     output.unlink(missing_ok=True)
-    run_helper(
-        helper,
-        folder,
-        progress,
-        deadline_s=DEADLINE_BASE_S + DEADLINE_PER_FACE_S * faces,
-        memory_bytes=HELPER_MEMORY_BYTES,
-    )
+    deadline_s = DEADLINE_BASE_S + DEADLINE_PER_FACE_S * faces
+    run_helper(helper, folder, progress, deadline_s=deadline_s, memory_bytes=HELPER_MEMORY_BYTES)
     with np.load(output, allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays.files}
 
 
 def pack_charts(
-    charts: Charts,
-    size_px: int,
-    gutter_px: int,
-    folder: Path,
-    progress: Progress,
-    atlases: int = 1,
+    charts: Charts, size_px: int, gutter_px: int, folder: Path, progress: Progress, atlases: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Pack charts into at most ``atlases`` unit squares, all at the same scale.
 
@@ -681,16 +600,12 @@ def pack_charts(
     if atlases > 1:
         labels = split_wide_charts(charts.corner_uvs, labels, atlases, charts.polygons)
     corners, first = chart_points(flat, labels)
-    np.savez(
-        folder / "input.npz",
-        points=flat.reshape(-1, 2)[first],
-        corners=corners.astype(np.uint32),
-        charts=labels.astype(np.uint32),
-        size_px=size_px,
-        gutter_px=gutter_px,
-        atlases=atlases,
-    )
-    output = _run(PACK_HELPER, folder, len(flat), progress)
+    task = {
+        "points": flat.reshape(-1, 2)[first], "corners": corners.astype(np.uint32),
+        "charts": labels.astype(np.uint32), "size_px": size_px, "gutter_px": gutter_px,
+        "atlases": atlases,
+    }  # fmt: skip
+    output = _run(PACK_HELPER, folder, len(flat), progress, task)
     points, numbers = output["points"], output["atlas"]
     if points.shape != (len(first), 2) or numbers.shape != (len(first),):
         raise WorkerError("xatlas returned UVs of other charts.")

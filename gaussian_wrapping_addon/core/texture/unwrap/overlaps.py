@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ...compiled import inline, kernel
 from ...mesh.components import FaceGraph, components
+from .packing_scale import signed_areas
 
 # -- Find overlapping faces within a chart exactly, and split charts until there are none ---------
 
@@ -22,65 +23,39 @@ LEAST_CLASS_SHARE = 1.0 / 64.0
 """Share of the median width or height: all smaller faces are in one class."""
 
 
-def signed_areas(flat: np.ndarray) -> np.ndarray:
-    """Return (f,) areas of (f, 3, 2) triangles, positive when counter-clockwise."""
-    one, two = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
-    return np.asarray(0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
-
-
 def find_overlaps(corner_uvs: np.ndarray, charts: np.ndarray) -> np.ndarray:
-    """Find the pairs of faces of the same chart that overlap.
-
-    Returns
-    -------
-    (p, 2) int64
-        Each pair once.
-    """
+    """Find the pairs of faces of the same chart that overlap: (p, 2) int64, each once."""
     uvs = np.ascontiguousarray(corner_uvs, np.float64)
     edges = np.linalg.norm(uvs - np.roll(uvs, -1, axis=1), axis=2)
     solid = edges[edges > 0]
     if len(solid) == 0:
         return np.empty((0, 2), np.int64)
     depth = OVERLAP_DEPTH_SHARE * float(np.median(solid))
-    found, _ = overlapping_pairs(uvs, charts, depth)
-    return found
+    return overlapping_pairs(uvs, charts, depth)[0]
 
 
 def overlapping_pairs(uvs: np.ndarray, charts: np.ndarray, depth: float) -> tuple[np.ndarray, int]:
     """Find pairs of faces of one chart that penetrate each other by more than ``depth``.
 
-    Returns
-    -------
-    pairs : (p, 2) int64
-        Each once.
-    candidates : int
-        Number of pairs tested.
+    Returns them, (p, 2) int64, each once, and how many pairs were tested.
 
-    Notes
-    -----
     Bounding boxes are sorted into classes by width and height, each within a factor of two, and
     within a class into rows of its height. A box intersects at most three rows of each class of at
     least its height, and in a row only boxes within twice the width are tested: the cost grows with
     the intersecting boxes, for any aspect ratio and orientation.
     """
-    rows = _rows(uvs, charts)
+    order, arrays = _rows(uvs, charts)
     found = np.empty((0, 2), np.int64)
     candidates = np.zeros(1, np.int64)
-    count = int(_overlapping(*rows.arrays, depth, found, candidates))
+    count = int(_overlapping(*arrays, depth, found, candidates))
     if count:
         found = np.empty((count, 2), np.int64)
-        _overlapping(*rows.arrays, depth, found, candidates)
-    return np.asarray(rows.order[found], np.int64), int(candidates[0])
+        _overlapping(*arrays, depth, found, candidates)
+    return np.asarray(order[found], np.int64), int(candidates[0])
 
 
-class _Rows(NamedTuple):
-    order: np.ndarray
-    """(f,) faces sorted by chart, class, row and left border; ``arrays`` is in this order."""
-    arrays: tuple[np.ndarray, ...]
-    """Arguments of :func:`_overlapping`."""
-
-
-def _rows(uvs: np.ndarray, charts: np.ndarray) -> _Rows:
+def _rows(uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Return the (f,) faces sorted by chart, class, row and left border; arrays in this order."""
     low, high = uvs.min(axis=1), uvs.max(axis=1)  # (f, 2)
     size = high - low
     # One class for all very small boxes, as the number of classes below is unbounded.
@@ -103,14 +78,11 @@ def _rows(uvs: np.ndarray, charts: np.ndarray) -> _Rows:
     begins = np.flatnonzero(_changes(height_key[:, 0], height_key[:, 1]))
     group = begins[np.searchsorted(begins, np.arange(len(class_begin)), side="right") - 1]
     classes_begin = group[np.searchsorted(class_begin, own_height, side="right") - 1]
-    return _Rows(
-        order,
-        (
-            np.ascontiguousarray(uvs[order]), np.ascontiguousarray(low[order]),
-            np.ascontiguousarray(high[order]), classes_begin, classes_end, first_row,
-            np.exp2(exponent[class_begin].astype(np.float64)), row[row_begin[:-1]], row_begin,
-            exponent[:, 1], exponent[class_begin, 1],
-        ),
+    return order, (
+        np.ascontiguousarray(uvs[order]), np.ascontiguousarray(low[order]),
+        np.ascontiguousarray(high[order]), classes_begin, classes_end, first_row,
+        np.exp2(exponent[class_begin].astype(np.float64)), row[row_begin[:-1]], row_begin,
+        exponent[:, 1], exponent[class_begin, 1],
     )  # fmt: skip
 
 
@@ -125,19 +97,8 @@ def split_overlaps(corner_uvs: np.ndarray, charts: np.ndarray, graph: FaceGraph)
     """Split charts until no two faces of one overlap; UVs are unchanged.
 
     A new chart grows from the central face of the old one over shared edges, without faces that it
-    would overlap or that are flipped; the remaining faces are split in the same way.
-
-    Parameters
-    ----------
-    corner_uvs : (f, 3, 2) float
-        Finite; different charts may overlap.
-    charts : (f,) int
-        Each connected.
-
-    Returns
-    -------
-    (f,) int32
-        New labels from 0.
+    would overlap or that are flipped; the remaining faces are split in the same way. UVs are
+    finite; different charts, each connected, may overlap. Returns labels from 0, (f,) int32.
     """
     pairs = find_overlaps(corner_uvs, charts)
     areas = signed_areas(np.asarray(corner_uvs, np.float64))
@@ -151,12 +112,10 @@ def split_overlaps(corner_uvs: np.ndarray, charts: np.ndarray, graph: FaceGraph)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     both = both[np.argsort(both[:, 0], kind="stable")]
     starts = np.searchsorted(both[:, 0], np.arange(len(charts) + 1))
-    neighbours = np.where(graph.opposite >= 0, graph.opposite // 3, -1).astype(np.int64)
+    neighbours = (graph.opposite // 3).astype(np.int64)  # -1 without one
     centres = np.asarray(corner_uvs, np.float64).mean(axis=1)
-    middle = (
-        np.stack([np.bincount(charts, centres[:, axis], count) for axis in range(2)], axis=1)
-        / np.maximum(np.bincount(charts, minlength=count), 1)[:, None]
-    )
+    sums = np.stack([np.bincount(charts, centres[:, axis], count) for axis in range(2)], axis=1)
+    middle = sums / np.maximum(np.bincount(charts, minlength=count), 1)[:, None]
     distance = np.linalg.norm(centres - middle[charts], axis=1)
     faces = np.flatnonzero(broken[charts])
     faces = faces[np.lexsort((distance[faces], charts[faces]))]
@@ -164,8 +123,12 @@ def split_overlaps(corner_uvs: np.ndarray, charts: np.ndarray, graph: FaceGraph)
         np.ascontiguousarray(charts, np.int64), faces, neighbours, np.sign(areas), starts,
         np.ascontiguousarray(both[:, 1]), count,
     )  # fmt: skip
-    other = np.where(graph.opposite >= 0, graph.opposite // 3, 0)
-    return components(graph, pieces[other] == pieces[:, None])
+    return connected_pieces(graph, pieces)
+
+
+def connected_pieces(graph: FaceGraph, labels: np.ndarray) -> np.ndarray:
+    """Return labels from 0, (f,) int32, of the connected pieces of faces with the same label."""
+    return components(graph, labels[graph.opposite // 3] == labels[:, None])
 
 
 @inline
@@ -295,33 +258,16 @@ SAME_POINT_SHARE = 0.5
 
 
 def join_polygons(
-    corner_uvs: np.ndarray,
-    charts: np.ndarray,
-    faces: np.ndarray,
-    shapes: np.ndarray,
-    graph: FaceGraph,
-    polygons: np.ndarray,
-) -> np.ndarray:
+    corner_uvs: np.ndarray, charts: np.ndarray, faces: np.ndarray, shapes: np.ndarray,
+    graph: FaceGraph, polygons: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """Move the triangles of cut polygons into the chart that holds most of the polygon.
 
     A moved triangle is laid beside its neighbour of the same polygon, in its true shape, or between
     the points that the chart has already. It may overlap others there.
 
-    Parameters
-    ----------
-    corner_uvs : (f, 3, 2) float64
-        Charts at the scale of the surface, counter-clockwise.
-    charts : (f,) int
-    faces : (f, 3) int
-    shapes : (f, 3, 2) float64
-        Of :func:`.charts.flatten_faces`.
-    graph : FaceGraph
-    polygons : (f,) int
-        Polygon of each face.
-
-    Returns
-    -------
-    (f, 3, 2) float64
+    The charts, (f, 3, 2), are at the scale of the surface and counter-clockwise; the shapes of the
+    faces are those of :func:`.charts.flatten_faces`. Returns new UVs.
     """
     cut = _cut(charts, polygons)
     if not cut.any():
@@ -334,41 +280,25 @@ def join_polygons(
         home = int(kinds[np.argmax(np.bincount(inverse.ravel(), areas[rows]))])
         placed = [row for row in rows.tolist() if charts[row] == home]
         for row, corner, beside in _spread(placed, set(rows.tolist()), graph):
-            near, far = _laid_beside(uvs, faces, shapes, row, corner, beside)
+            begin, end, far = _lay_beside(uvs, faces, shapes, row, corner, beside)
             known = points[home, int(faces[row, (corner + 2) % 3])]
-            reach = SAME_POINT_SHARE * float(np.linalg.norm(near[1] - near[0]))
+            reach = SAME_POINT_SHARE * float(np.linalg.norm(end - begin))
             gaps = [float(np.linalg.norm(point - far)) for point in known]
             if gaps and min(gaps) <= reach:
-                far = known[int(np.argmin(gaps))]
+                uvs[row, (corner + 2) % 3] = known[int(np.argmin(gaps))]
             else:
                 known.append(far)
-            uvs[row, corner], uvs[row, (corner + 1) % 3] = near
-            uvs[row, (corner + 2) % 3] = far
     return uvs
 
 
 def set_cut_apart(
-    corner_uvs: np.ndarray,
-    charts: np.ndarray,
-    faces: np.ndarray,
-    shapes: np.ndarray,
-    graph: FaceGraph,
-    polygons: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    corner_uvs: np.ndarray, charts: np.ndarray, faces: np.ndarray, shapes: np.ndarray,
+    graph: FaceGraph, polygons: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Give quads that are still cut, where charts would fold, a chart of their own each.
 
-    Polygons with more than four sides may stay cut: laid flat, their triangles could overlap.
-
-    Parameters
-    ----------
-    corner_uvs, charts, faces, shapes, graph, polygons
-        As for :func:`join_polygons`.
-
-    Returns
-    -------
-    corner_uvs : (f, 3, 2) float64
-    charts : (f,) int32
-        Labels from 0; each chart is connected.
+    Polygons with more than four sides may stay cut: laid flat, their triangles could overlap. The
+    parameters are those of :func:`join_polygons`. Returns UVs, and the charts, each connected.
     """
     cut = _cut(charts, polygons) & (np.bincount(polygons)[polygons] == 2)
     if not cut.any():
@@ -377,18 +307,12 @@ def set_cut_apart(
     fresh = int(labels.max()) + 1
     for rows in _rows_of_polygons(polygons, cut):
         first = int(rows[0])
-        steps = list(_spread([first], set(rows.tolist()), graph))
-        if not steps:
-            continue  # its triangles share no edge
-        uvs[first] = shapes[first]
-        row, corner, beside = steps[0]
-        near, far = _laid_beside(uvs, faces, shapes, row, corner, beside)
-        uvs[row, corner], uvs[row, (corner + 1) % 3] = near
-        uvs[row, (corner + 2) % 3] = far
-        labels[rows] = fresh
-        fresh += 1
-    other = np.where(graph.opposite >= 0, graph.opposite // 3, 0)
-    return uvs, components(graph, labels[other] == labels[:, None])
+        for row, corner, beside in _spread([first], set(rows.tolist()), graph):  # the other, if any
+            uvs[first] = shapes[first]
+            _lay_beside(uvs, faces, shapes, row, corner, beside)
+            labels[rows] = fresh
+            fresh += 1
+    return uvs, connected_pieces(graph, labels)
 
 
 def _cut(charts: np.ndarray, polygons: np.ndarray) -> np.ndarray:
@@ -424,10 +348,7 @@ def _points_of_charts(
 def _spread(placed: list[int], rows: set[int], graph: FaceGraph) -> Iterator[tuple[int, int, int]]:
     """Walk from placed triangles to the others over their shared edges.
 
-    Yields
-    ------
-    row, corner, beside : int
-        A triangle, its corner where the edge begins, and the placed triangle's half-edge.
+    Yields each triangle, its corner where the edge begins, and the placed triangle's half-edge.
     """
     queue, waiting = list(placed), rows - set(placed)
     for row in queue:
@@ -440,10 +361,10 @@ def _spread(placed: list[int], rows: set[int], graph: FaceGraph) -> Iterator[tup
                 yield other, opposite % 3, 3 * row + corner
 
 
-def _laid_beside(
+def _lay_beside(
     uvs: np.ndarray, faces: np.ndarray, shapes: np.ndarray, row: int, corner: int, beside: int
-) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the points of a triangle's edge, and of its third corner in the true shape."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Set and return the points of a triangle's edge, and of its third corner in the true shape."""
     face, at = divmod(beside, 3)
     begin, end = uvs[face, at], uvs[face, (at + 1) % 3]
     if faces[face, at] != faces[row, corner]:
@@ -451,4 +372,6 @@ def _laid_beside(
     one, two, three = (shapes[row, (corner + k) % 3] for k in range(3))
     edge, side, wanted = (complex(*v) for v in (two - one, three - one, end - begin))
     turned = side * wanted / edge if edge else 0j
-    return (begin.copy(), end.copy()), begin + np.array([turned.real, turned.imag])
+    far = begin + np.array([turned.real, turned.imag])
+    uvs[row, corner], uvs[row, (corner + 1) % 3], uvs[row, (corner + 2) % 3] = begin, end, far
+    return begin, end, far

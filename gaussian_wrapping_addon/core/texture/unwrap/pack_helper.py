@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ...errors import DatasetError
 from ...worker.helper_process import emit
-from .packing_scale import chart_extents, packing_scale, packing_square
+from .packing_scale import chart_bounds, packing_scale, packing_square
 
 GROWTH = 1.1
 MAX_GROWTHS = 8
@@ -40,10 +39,7 @@ def main(folder: Path) -> None:
         task = {name: arrays[name] for name in arrays.files}
     size_px = int(task["size_px"])
     side_px, padding_px = packing_square(size_px, float(task["gutter_px"]))
-    while True:
-        packed = _largest(task, side_px, padding_px)
-        if packed is not None:
-            break
+    while (packed := _largest(task, side_px, padding_px)) is None:
         if padding_px == 0:
             raise DatasetError("xatlas could not pack the charts.")
         padding_px //= 2
@@ -56,8 +52,8 @@ def main(folder: Path) -> None:
 
 def _largest(task: dict[str, np.ndarray], side_px: int, padding_px: int) -> _Packed | None:
     """Pack at the largest scale that fits into the squares; ``None`` if none was found."""
-    extents = chart_extents(task["points"], task["corners"], task["charts"])
-    scale = packing_scale(extents, side_px, padding_px, int(task["atlases"]))
+    low, high = chart_bounds(task["points"][task["corners"]], task["charts"])
+    scale = packing_scale(high - low, side_px, padding_px, int(task["atlases"]))
     packed = _pack(task, scale, side_px, padding_px)
     too_large = 0.0
     for factor in SHRINKING if packed is None else ():
@@ -106,10 +102,6 @@ def _pack(
         return None
     if atlas.width != side_px or atlas.height != side_px:
         return None
-    return _points(task, atlas, scale, side_px)
-
-
-def _points(task: dict[str, np.ndarray], atlas: Any, scale: float, side_px: int) -> _Packed | None:
     source, _, uvs = atlas.get_mesh(0)
     squares, charts = (np.asarray(a) for a in atlas.get_mesh_vertex_assignment(0)[:2])
     assigned = charts != UNASSIGNED

@@ -30,28 +30,24 @@ def packing_square(size_px: int, gutter_px: float) -> tuple[int, int]:
     return side_px, math.ceil(gutter_px * side_px / size_px)
 
 
-def chart_extents(points: np.ndarray, corners: np.ndarray, charts: np.ndarray) -> np.ndarray:
-    """Return (c, 2) width and height of charts.
+def signed_areas(flat: np.ndarray) -> np.ndarray:
+    """Return (f,) areas of (f, 3, 2) triangles, positive when counter-clockwise."""
+    one, two = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
+    return np.asarray(0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
 
-    Parameters
-    ----------
-    points : (n, 2) float
-    corners : (f, 3) int
-        Index of the point at each corner.
-    charts : (f,) int
-        Labels from 0.
-    """
+
+def chart_bounds(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper corner, (c, 2) each, of (f, 3, 2) charts with labels from 0."""
     labels = charts.astype(np.int64)
     count = int(labels.max()) + 1
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     for corner in range(3):
-        at = points[corners[:, corner]]
-        np.minimum.at(low, labels, at)
-        np.maximum.at(high, labels, at)
-    return high - low
+        np.minimum.at(low, labels, corner_uvs[:, corner])
+        np.maximum.at(high, labels, corner_uvs[:, corner])
+    return low, high
 
 
-def packing_scale(extents: np.ndarray, side_px: int, padding_px: int, squares: int = 1) -> float:
+def packing_scale(extents: np.ndarray, side_px: int, padding_px: int, squares: int) -> float:
     """Return the texels per unit at which boxes with padding fill most of the squares."""
     low, high = 0.0, side_px / max(float(extents.max()), 1e-30)
     largest = high
@@ -63,45 +59,25 @@ def packing_scale(extents: np.ndarray, side_px: int, padding_px: int, squares: i
 
 
 def split_wide_charts(
-    corner_uvs: np.ndarray,
-    charts: np.ndarray,
-    squares: int,
-    polygons: np.ndarray | None = None,
+    corner_uvs: np.ndarray, charts: np.ndarray, squares: int, polygons: np.ndarray | None = None
 ) -> np.ndarray:
     """Split charts that are too wide for several squares.
 
     A chart cannot be larger than a square: if one chart holds most of the surface, several squares
     would give no more resolution than one.
 
-    Parameters
-    ----------
-    corner_uvs : (f, 3, 2) float64
-        All charts at the same scale.
-    charts : (f,) int
-        Labels from 0.
-    squares : int
-    polygons : (f,) int, optional
-        Polygon of each face: those within one chart are not cut.
-
-    Returns
-    -------
-    (f,) int32
-        New labels; pieces of one label need not be connected.
+    The charts, (f, 3, 2) with labels from 0, are all at the same scale. Polygons within one chart
+    are not cut. Returns new labels, (f,) int32; pieces of one label need not be connected.
     """
     labels = charts.astype(np.int64)
-    edge_one, edge_two = (corner_uvs[:, k] - corner_uvs[:, 0] for k in (1, 2))
-    double = edge_one[:, 0] * edge_two[:, 1] - edge_one[:, 1] * edge_two[:, 0]
-    side = math.sqrt(0.5 * float(np.abs(double).sum()) / (USED_SHARE * squares))
+    side = math.sqrt(float(np.abs(signed_areas(corner_uvs)).sum()) / (USED_SHARE * squares))
     centres = corner_uvs.mean(axis=1)  # (f, 2)
     if polygons is not None:
         centres = _centres_of_polygons(centres, labels, polygons)
     rows = np.arange(len(labels))
-    corners = np.arange(3 * len(labels)).reshape(-1, 3)
     for _ in range(MAX_CUTS):
-        count = int(labels.max()) + 1
-        extents = chart_extents(corner_uvs.reshape(-1, 2), corners, labels)
-        low = np.full((count, 2), np.inf)
-        np.minimum.at(low, labels, corner_uvs.min(axis=1))
+        low, high = chart_bounds(corner_uvs, labels)
+        count, extents = len(low), high - low
         wide = extents.max(axis=1) > WIDE_SHARE * side
         axis = extents.argmax(axis=1)
         middle = (low + 0.5 * extents)[np.arange(count), axis]

@@ -21,14 +21,14 @@ from ...errors import (
     WorkerError,
     unwritable_error,
 )
-from ...mesh.components import FaceGraph, components, face_graph, uv_charts
+from ...mesh.components import FaceGraph, face_graph, uv_charts
 from ...mesh.surface_mesh import SurfaceMesh, edge_lengths
 from ...mesh.textured_mesh import FIRST_UDIM, TILE_COLUMNS, TILE_ROWS
 from ...progress import Progress, ReportWarning
 from ..atlas import AtlasRaster, raster_atlas
 from .charts import find_charts, pack_charts
-from .overlaps import split_overlaps
-from .packing_scale import split_wide_charts
+from .overlaps import connected_pieces, split_overlaps
+from .packing_scale import chart_bounds, signed_areas, split_wide_charts
 
 # -- Fallback unwrap: box projection along the axes, charts packed in shelves ---------------------
 
@@ -45,31 +45,19 @@ _PLANES = ((1, 2), (2, 1), (2, 0), (0, 2), (0, 1), (1, 0))
 
 
 def box_unwrap(
-    mesh: SurfaceMesh,
-    graph: FaceGraph,
-    size_px: int,
-    gutter_px: int,
-    progress: Progress,
-    atlases: int = 1,
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Unwrap by projection along the six axis directions.
+    mesh: SurfaceMesh, graph: FaceGraph, size_px: int, gutter_px: int, progress: Progress,
+    atlases: int,
+) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
+    """Unwrap by projection along the six axis directions; charts with overlaps are split.
 
-    Returns
-    -------
-    corner_uvs : (f, 3, 2) float32
-        UVs in [0, 1], v upwards; charts with overlaps are split.
-    face_atlas : (f,) uint8
-        Atlas of each face, below ``atlases``.
-    gutter_px : float
-        Texels kept between charts; fewer than requested if there is no room.
+    Returns what :func:`.charts.pack_charts` does.
     """
     axis = _axis_of_faces(graph)
     corners = mesh.vertices[mesh.faces]
     plane = np.array(_PLANES)[axis]  # (f, 2)
     flat = np.take_along_axis(corners, plane[:, None, :], axis=2)  # (f, 3, 2)
     progress.update(0.2, "box projection")
-    other = np.where(graph.opposite >= 0, graph.opposite // 3, 0)
-    charts = components(graph, axis[other] == axis[:, None])
+    charts = connected_pieces(graph, axis)
     charts = split_overlaps(flat - corners.mean(axis=(0, 1))[plane][:, None, :], charts, graph)
     progress.update(0.6, "box projection: packing")
     if atlases > 1:
@@ -87,7 +75,7 @@ def _axis_of_faces(graph: FaceGraph) -> np.ndarray:
         for corner in range(3):
             has = graph.opposite[:, corner] >= 0
             votes[rows[has], axis[graph.opposite[has, corner] // 3]] += NEIGHBOUR_VOTE
-        allowed = (cosines > MIN_COSINE) | (rows[:, None] < 0)
+        allowed = cosines > MIN_COSINE
         allowed[rows, cosines.argmax(axis=1)] = True
         chosen = np.where(allowed, cosines + votes, -np.inf).argmax(axis=1)
         if (chosen == axis).all():
@@ -100,12 +88,7 @@ def _pack(
     flat: np.ndarray, charts: np.ndarray, size_px: int, gutter_px: int, atlases: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Pack charts in shelves at the largest scale that fits; reduce the gutters if none does."""
-    count = int(charts.max()) + 1
-    low = np.full((count, 2), np.inf)
-    high = np.full((count, 2), -np.inf)
-    for corner in range(3):
-        np.minimum.at(low, charts, flat[:, corner])
-        np.maximum.at(high, charts, flat[:, corner])
+    low, high = chart_bounds(flat, charts)
     extent = high - low
     turned = extent[:, 1] > extent[:, 0]  # wide charts make lower shelves
     lying = np.where(turned[:, None], extent[:, ::-1], extent)
@@ -130,19 +113,16 @@ def _largest_scale(
     extent: np.ndarray, size_px: int, gutter: float, atlases: int
 ) -> tuple[float, np.ndarray | None]:
     high = size_px / max(float(extent.max()), 1e-300)
-    low = 0.0
-    positions = _shelves(extent * high, size_px, gutter, atlases)
-    if positions is not None:
-        return high, positions
-    best: np.ndarray | None = None
+    best = _shelves(extent * high, size_px, gutter, atlases)
+    if best is not None:
+        return high, best
     # Below a hundredth of the largest scale, charts would have no texels.
     low = 0.01 * high
     best = _shelves(extent * low, size_px, gutter, atlases)
-    if best is None and gutter >= 0.01:
-        return low, None
     if best is None:
-        low = 0.0
-        best = np.zeros((len(extent), 3))
+        if gutter >= 0.01:
+            return low, None
+        low, best = 0.0, np.zeros((len(extent), 3))
     for _ in range(SCALE_STEPS):
         middle = 0.5 * (low + high)
         positions = _shelves(extent * middle, size_px, gutter, atlases)
@@ -155,8 +135,6 @@ def _largest_scale(
 
 def _shelves(extent_px: np.ndarray, size_px: int, gutter: float, atlases: int) -> np.ndarray | None:
     """Return x, y of the lower left corner of each box and its atlas; ``None`` without room."""
-    if float(((extent_px + gutter) ** 2).min()) < 0:
-        return None
     if float(np.prod(extent_px + gutter, axis=1).sum()) > atlases * float(size_px) ** 2:
         return None
     order = np.argsort(-extent_px[:, 1], kind="stable")
@@ -221,28 +199,20 @@ class Unwrap:
 
 
 def unwrap(
-    mesh: SurfaceMesh,
-    size_px: int,
-    gutter_px: int,
-    work_folder: Path,
-    progress: Progress,
-    *,
-    threads: int = 1,
-    atlases: int = 1,
-    polygons: np.ndarray | None = None,
-) -> Unwrap:
-    """Compute UVs for all face corners, without overlaps.
+    mesh: SurfaceMesh, size_px: int, gutter_px: int, work_folder: Path, progress: Progress, *,
+    threads: int = 1, atlases: int = 1, polygons: np.ndarray | None = None,
+) -> Unwrap:  # fmt: skip
+    """Compute UVs for all face corners of a finite mesh with some area, without overlaps.
+
+    xatlas crashes, hangs or returns NaN on some meshes. In these cases a box projection replaces
+    it, with a warning and ``method = "box"``.
 
     Parameters
     ----------
-    mesh : SurfaceMesh
-        Valid mesh: finite, at least one face with area.
     size_px, gutter_px : int
         Side of the texture and texels to keep free between charts.
     work_folder : Path
         Folder for a temporary sub-folder, which is removed before returning.
-    progress : Progress
-        Span of this step.
     atlases : int
         Maximum number of textures for the charts, all at the same density.
     polygons : (f,) int64, optional
@@ -255,11 +225,6 @@ def unwrap(
         The system gave xatlas too little memory.
     ResourceError
         The disk is full.
-
-    Notes
-    -----
-    xatlas crashes, hangs or returns NaN on some meshes. In these cases a box projection replaces
-    it, with a warning and ``method = "box"``.
     """
     graph = face_graph(mesh.vertices, mesh.faces)
     try:
@@ -285,36 +250,23 @@ def unwrap(
     if gutter_left_px < gutter_px:
         _logger.warning(
             "the texture is too small for gutters of %d texels between charts: using %.1f",
-            gutter_px,
-            gutter_left_px,
-        )
+            gutter_px, gutter_left_px,
+        )  # fmt: skip
     progress.update(0.95, "finding charts")
     # Atlases share the unit square: shifted apart, charts of different atlases cannot touch.
     apart = corner_uvs + 2.0 * face_atlas.astype(np.float64)[:, None, None]
     charts = uv_charts(graph, mesh.faces, apart)
     progress.update(1.0, f"unwrapped with {method}")
-    return Unwrap(
-        corner_uvs, charts, method, float(gutter_left_px), reason,
-        _renumber(face_atlas) if face_atlas.any() else None,
-    )  # fmt: skip
-
-
-def _renumber(face_atlas: np.ndarray) -> np.ndarray:
-    """Renumber the used atlases from 0, without gaps."""
-    return np.unique(face_atlas, return_inverse=True)[1].ravel().astype(np.uint8)
+    used = None
+    if face_atlas.any():  # without gaps, from 0
+        used = np.unique(face_atlas, return_inverse=True)[1].ravel().astype(np.uint8)
+    return Unwrap(corner_uvs, charts, method, float(gutter_left_px), reason, used)
 
 
 def _xatlas(
-    mesh: SurfaceMesh,
-    graph: FaceGraph,
-    size_px: int,
-    gutter_px: int,
-    work_folder: Path,
-    progress: Progress,
-    threads: int,
-    atlases: int = 1,
-    polygons: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, float]:
+    mesh: SurfaceMesh, graph: FaceGraph, size_px: int, gutter_px: int, work_folder: Path,
+    progress: Progress, threads: int, atlases: int = 1, polygons: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
     corners = mesh.vertices[mesh.faces]
     if not np.isfinite(corners).all():
         raise DatasetError("Vertices of the mesh are not finite.")
@@ -410,21 +362,15 @@ _NEW_UVS = "Unwrap the mesh, or have new UVs made (--uvs new; in the panel, UVs:
 class OwnUvs:
     """UVs of a mesh, ready for baking."""
 
-    unwrapped: Unwrap
-    """UVs within their tile; one atlas for each tile in use."""
-    udims: tuple[int, ...]
-    """UDIM number of each atlas; ``(1001,)`` for ordinary UVs."""
+    unwrapped: Unwrap  # UVs within their tile; one atlas for each tile in use
+    udims: tuple[int, ...]  # UDIM number of each atlas; ``(1001,)`` for ordinary UVs
     warnings: tuple[ReportWarning, ...]
 
 
 def own_uvs(mesh: SurfaceMesh, corner_uvs: np.ndarray) -> OwnUvs:
     """Check the UVs of a mesh and split them by UDIM tile.
 
-    Parameters
-    ----------
-    mesh : SurfaceMesh
-    corner_uvs : (f, 3, 2) float
-        v upwards; tiles are unit squares from (0, 0) on.
+    UVs are (f, 3, 2), v upwards; tiles are unit squares from (0, 0) on.
 
     Raises
     ------
@@ -435,31 +381,25 @@ def own_uvs(mesh: SurfaceMesh, corner_uvs: np.ndarray) -> OwnUvs:
     uvs = np.array(corner_uvs, np.float64)  # (f, 3, 2)
     _refuse(~np.isfinite(uvs).all(axis=(1, 2)), "has UVs that are not finite")
     graph = face_graph(mesh.vertices, mesh.faces)
-    flat = _uv_areas(uvs) <= FLAT_UV_AREA
+    flat = np.abs(signed_areas(uvs)) <= FLAT_UV_AREA
     share = float(graph.areas[flat].sum() / max(graph.areas.sum(), 1e-300))
     if share > MAX_FLAT_SHARE:
-        raise MeshingError(
-            f"The UVs of {100 * share:.0f} % of the surface have no area: nothing can be painted "
-            "there.",
-            _NEW_UVS,
-        )
+        text = f"The UVs of {100 * share:.0f} % of the surface have no area: nothing can be "
+        raise MeshingError(text + "painted there.", _NEW_UVS)
     middle = uvs.mean(axis=1)
     # A collapsed face on the far edge of a tile must not open the next one.
     collapsed = np.maximum(np.ceil(middle) - 1.0, 0.0)
     tile = np.where(flat[:, None], collapsed, np.floor(middle)).astype(np.int64)  # (f, 2)
     inside = uvs - tile[:, None]
     off = np.maximum(-inside, inside - 1.0).max(axis=(1, 2))
-    _refuse(
-        ((tile < 0) | (tile >= [TILE_COLUMNS, TILE_ROWS])).any(axis=1),
-        "has UVs outside of the UDIM tiles (from 0 to 10 and from 0 to 100)",
-    )
+    outside = ((tile < 0) | (tile >= [TILE_COLUMNS, TILE_ROWS])).any(axis=1)
+    _refuse(outside, "has UVs outside of the UDIM tiles (from 0 to 10 and from 0 to 100)")
     _refuse(off > EDGE_TOLERANCE, "has UVs that cross the edge of a tile, as repeated textures do")
     number = tile[:, 0] + TILE_COLUMNS * tile[:, 1]
     tiles, face_atlas = np.unique(number, return_inverse=True)
     if len(tiles) > limits.MAX_ATLASES:
-        raise MeshingError(
-            f"The UVs lie in {len(tiles)} UDIM tiles; the limit is {limits.MAX_ATLASES}.", _NEW_UVS
-        )
+        text = f"The UVs lie in {len(tiles)} UDIM tiles; the limit is {limits.MAX_ATLASES}."
+        raise MeshingError(text, _NEW_UVS)
     inside = inside.clip(0.0, 1.0).astype(np.float32)
     apart = inside + 2.0 * face_atlas.reshape(-1, 1, 1)
     charts = uv_charts(graph, mesh.faces, apart)
@@ -490,13 +430,7 @@ def overlap_warning(overlapping: int, used: int) -> ReportWarning | None:
 
 def uv_area(corner_uvs: np.ndarray) -> float:
     """Return the area of (f, 3, 2) UVs, in squares of a texture; faces that overlap count each."""
-    return float(_uv_areas(np.asarray(corner_uvs, np.float64)).sum())
-
-
-def _uv_areas(uvs: np.ndarray) -> np.ndarray:
-    one, other = uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
-    areas: np.ndarray = 0.5 * np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0])
-    return areas
+    return float(np.abs(signed_areas(np.asarray(corner_uvs, np.float64))).sum())
 
 
 def _refuse(bad: np.ndarray, what: str) -> None:

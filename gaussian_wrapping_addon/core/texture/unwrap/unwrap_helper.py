@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,16 @@ def main(folder: Path) -> None:
     with np.load(folder / "input.npz", allow_pickle=False) as arrays:
         task = {name: arrays[name] for name in arrays.files}
     emit(fraction=0.0, message="xatlas: finding charts")
-    _write(folder, task, _generate(task))
+    atlas = _generate(task)
+    corner_uvs = np.full((len(task["corners"]), 3, 2), np.nan, np.float32)
+    for index, (begin, end) in enumerate(pairwise(task["face_bounds"].tolist())):
+        _, corners, uvs = atlas.get_mesh(index)
+        assigned = np.asarray(atlas.get_mesh_vertex_assignment(index)[1]) != UNASSIGNED
+        # Back to texels: the sides of the atlas may differ, but its texels are square.
+        texels = np.asarray(uvs, np.float64) * [atlas.width, atlas.height]
+        texels[~assigned] = np.nan
+        corner_uvs[begin:end] = texels[np.asarray(corners).reshape(-1, 3)]
+    np.savez(folder / "output.npz", corner_uvs=corner_uvs)
     emit(fraction=1.0, message="xatlas: charts found")
 
 
@@ -39,8 +49,8 @@ def _generate(task: dict[str, np.ndarray]) -> Any:
     import xatlas
 
     atlas = xatlas.Atlas()
-    bounds = zip(_pairs(task["vertex_bounds"]), _pairs(task["face_bounds"]), strict=True)
-    for (v0, v1), (f0, f1) in bounds:
+    bounds = (pairwise(task[name].tolist()) for name in ("vertex_bounds", "face_bounds"))
+    for (v0, v1), (f0, f1) in zip(*bounds, strict=True):
         atlas.add_mesh(task["vertices"][v0:v1], task["corners"][f0:f1])
     packing = xatlas.PackOptions()
     packing.resolution = ROUGH_SIDE_PX
@@ -53,19 +63,3 @@ def _generate(task: dict[str, np.ndarray]) -> Any:
             "The fallback unwrap is used instead.",
         )
     return atlas
-
-
-def _write(folder: Path, task: dict[str, np.ndarray], atlas: Any) -> None:
-    corner_uvs = np.full((len(task["corners"]), 3, 2), np.nan, np.float32)
-    for index, (begin, end) in enumerate(_pairs(task["face_bounds"])):
-        _, corners, uvs = atlas.get_mesh(index)
-        assigned = np.asarray(atlas.get_mesh_vertex_assignment(index)[1]) != UNASSIGNED
-        # Back to texels: the sides of the atlas may differ, but its texels are square.
-        texels = np.asarray(uvs, np.float64) * [atlas.width, atlas.height]
-        texels[~assigned] = np.nan
-        corner_uvs[begin:end] = texels[np.asarray(corners).reshape(-1, 3)]
-    np.savez(folder / "output.npz", corner_uvs=corner_uvs)
-
-
-def _pairs(bounds: np.ndarray) -> list[tuple[int, int]]:
-    return list(zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True))
