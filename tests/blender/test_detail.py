@@ -17,7 +17,7 @@ from gaussian_wrapping_addon.core.mesh.tangent_frame import tangent_frames
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.texture.atlas import raster_atlas
 from gaussian_wrapping_addon.core.texture.dense_detail import DenseSurface, bake_normal_map
-from gaussian_wrapping_addon.core.texture.files import glb_bytes
+from gaussian_wrapping_addon.core.texture.files import write_glb
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
 from gaussian_wrapping_addon.ops import addon
 from gaussian_wrapping_addon.ops.mesh_data import build_mesh
@@ -133,8 +133,10 @@ def test_5k_faces_with_a_normal_map_look_like_200k(tmp_path: Path) -> None:
     assert psnr(pictures["dense"], pictures["plain"]) < WANTED_DB
     # The same through a GLB file, with the normals and tangents of Blender's reader.
     images = [(tmp_path / f"{kind}.png").read_bytes() for kind in ("albedo", "normal")]
-    data = glb_bytes(light.vertices, light.faces, uvs, images[0], np.zeros(3), normal_png=images[1])
-    (tmp_path / "light.glb").write_bytes(data)
+    write_glb(
+        tmp_path / "light.glb", light.vertices, light.faces, uvs, images[:1], np.zeros(3),
+        normal_png=images[1:],
+    )  # fmt: skip
     before = set(bpy.data.objects)
     bpy.ops.import_scene.gltf(filepath=str(tmp_path / "light.glb"))
     (read,) = [o for o in set(bpy.data.objects) - before if o.type == "MESH"]

@@ -123,7 +123,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "glb": (
         "a.glb",
         lambda p: write_glb(
-            p, cube().mesh.vertices, cube().mesh.faces, cube().corner_uvs, b"", np.zeros(3)
+            p, cube().mesh.vertices, cube().mesh.faces, cube().corner_uvs, [b""], np.zeros(3)
         ),
     ),
     "textured": ("mesh.npz", lambda p: write_textured(cube(), p.parent, ("glb",), UTM)),

@@ -141,8 +141,8 @@ def test_files_of_a_result_folder_lead_back_to_the_world(tmp_path: Path) -> None
     write_json(tmp_path / "transform.json", {"offset": offset.tolist(), "frames": frames})
     corner_uvs = (UVS / 2.0).astype(np.float32)
     png = b"\x89PNG"
-    write_glb(tmp_path / "mesh.glb", world - offset, FACES, corner_uvs, png, offset)
-    write_obj(tmp_path / "mesh.obj", world - offset, FACES, corner_uvs, "albedo.png")
+    write_glb(tmp_path / "mesh.glb", world - offset, FACES, corner_uvs, [png], offset)
+    write_obj(tmp_path / "mesh.obj", world - offset, FACES, corner_uvs, ["albedo.png"])
     for name in ("mesh.glb", "mesh.obj"):
         path = tmp_path / name
         found = world_from_file(path).points(read_mesh_file(path).vertices)

@@ -20,7 +20,7 @@ from gaussian_wrapping_addon.core.texture.dense_detail import (
     NO_HIT,
     REACH_SHARE,
     DenseSurface,
-    NormalMap,
+    DetailMap,
     bake_normal_map,
     bake_occlusion,
     cage_distance,
@@ -50,7 +50,7 @@ def bake(light: SurfaceMesh, uvs: np.ndarray, dense: SurfaceMesh, size_px: int =
 
 
 def decoded(
-    light: SurfaceMesh, uvs: np.ndarray, result: NormalMap, raster: AtlasRaster
+    light: SurfaceMesh, uvs: np.ndarray, result: DetailMap, raster: AtlasRaster
 ) -> tuple[np.ndarray, np.ndarray]:
     """Read the map as a renderer does: positions and unit normals of the texels."""
     inside = raster.inside
@@ -149,7 +149,7 @@ def test_the_other_side_of_a_plate_is_not_taken() -> None:
     points[:, 2] = np.where(points[:, 2] > 0, 0.01, -0.01)
     normals = np.array([0, 0, 1.0]) * np.sign(points[:, 2:])
     surface = DenseSurface(dense)
-    cage = cage_distance(light, DenseSurface(light), surface)
+    cage = cage_distance(light, surface)
     assert 0.01 <= cage < 0.03
     matches = surface.correspondences(points, normals, cage)
     assert (matches.method == BY_RAY).all()
@@ -174,8 +174,6 @@ def test_rays_end_at_their_reach() -> None:
     down = np.array([[0.0, 0, -1]] * 2)
     assert surface.first_hits(points, down, 0.51).face.min() >= 0
     assert surface.first_hits(points, down, 0.49).face.tolist() == [-1, -1]
-    assert surface.is_hit(points, down, 0.51).all()
-    assert not surface.is_hit(points, down, 0.49).any()
 
 
 def test_faces_without_area_or_uvs_do_no_harm() -> None:

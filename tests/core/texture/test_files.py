@@ -272,15 +272,15 @@ def test_nan_is_refused_by_each_writer(tmp_path: Path) -> None:
     with pytest.raises(MeshingError, match="Vertex 2"):
         write_mesh_ply(tmp_path / "m.ply", bad.mesh.vertices, bad.mesh.faces)
     with pytest.raises(MeshingError, match="Vertex 2"):
-        write_obj(tmp_path / "m.obj", bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, "a.png")
-    path, png, zero = tmp_path / "m.glb", b"", np.zeros(3)
+        write_obj(tmp_path / "m.obj", bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, ["a.png"])
+    path, png, zero = tmp_path / "m.glb", [b""], np.zeros(3)
     with pytest.raises(MeshingError, match="Vertex 2"):
         write_glb(path, bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, png, zero)
     bad = spoiled("nan uv")
     with pytest.raises(MeshingError, match="Face 3"):
         write_glb(path, bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, png, zero)
     with pytest.raises(MeshingError, match="Face 3"):
-        write_obj(tmp_path / "m.obj", bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, "a.png")
+        write_obj(tmp_path / "m.obj", bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, ["a.png"])
     # Finite, but not in single precision.
     good = cube()
     with pytest.raises(MeshingError, match="not finite"):
@@ -306,6 +306,10 @@ def test_unknown_formats_and_names_with_spaces_are_refused(tmp_path: Path) -> No
         write_textured(good, tmp_path, ("fbx",), Similarity())
     with pytest.raises(UsageError, match="cannot refer to"):
         write_obj(
-            tmp_path / "m.obj", good.mesh.vertices, good.mesh.faces, good.corner_uvs, "my image.png"
+            tmp_path / "m.obj",
+            good.mesh.vertices,
+            good.mesh.faces,
+            good.corner_uvs,
+            ["my image.png"],
         )
     assert list(tmp_path.iterdir()) == []

@@ -20,7 +20,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.scene.camera import Similarity
-from gaussian_wrapping_addon.core.texture.files import glb_bytes, write_textured
+from gaussian_wrapping_addon.core.texture.files import write_glb, write_textured
 from tests.core.texture.detail_scenes import bumpy_ball, flat_uvs
 from tests.core.texture.test_files import UTM, cube
 
@@ -113,11 +113,10 @@ def test_the_khronos_validator_finds_nothing(tmp_path: Path) -> None:
     for shading in ("lit", "unlit"):
         mesh = with_maps()
         files[shading] = tmp_path / f"{shading}.glb"
-        data = glb_bytes(
-            mesh.mesh.vertices, mesh.mesh.faces, mesh.corner_uvs, png, np.zeros(3),
-            normal_png=png, shading=shading,
+        write_glb(
+            files[shading], mesh.mesh.vertices, mesh.mesh.faces, mesh.corner_uvs, [png],
+            np.zeros(3), normal_png=[png], shading=shading,
         )  # fmt: skip
-        files[shading].write_bytes(data)
     said = dict(zip(files, reports(list(files.values())), strict=True))
     assert {name: problems(report) for name, report in said.items() if problems(report)} == {}
     assert all(

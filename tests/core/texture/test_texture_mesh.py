@@ -168,9 +168,7 @@ def test_faces_smaller_than_a_texel_are_neither_seen_nor_unseen(areas: tuple) ->
     """Of three faces one is seen, one is not, and one has no texel to tell by."""
     points = SurfacePoints(np.array([0, 0, 1]), np.zeros((3, 2), np.float32))
     views = np.array([2, 0, 0], np.uint8)
-    baked = BakedColors(
-        np.zeros((3, 3), np.uint8), views, views > 0, views > 0, 1, 0.0, False, 0.0, False, 0
-    )
+    baked = BakedColors(np.zeros((3, 3), np.uint8), views, views > 0, views > 0, 0)
     unwrapped = Unwrap(np.zeros((3, 3, 2), np.float32), np.zeros(3, np.int32), "box", 2.0)
     coverage = CoverageStatistics(3)
     coverage.add(points, baked, 0)
