@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch import Tensor
 from .. import limits
 from ..compiled import inline, kernel, part
 from ..errors import UsageError
-from ..gaussians.model import GaussianArrays, OrientedGaussians
+from ..gaussians.model import TRAINED, GaussianArrays, OrientedGaussians
 from ..parallel import default_threads, even_bounds, run_chunks
 from ..scene.camera import Camera
 from .projection_kernels import (
@@ -479,8 +480,7 @@ class RawGradients:
     @classmethod
     def zeros(cls, gaussians: RawArrays) -> RawGradients:
         """Return zero gradients of the Gaussians' shapes and float type."""
-        names = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
-        return cls(**{name: np.zeros_like(getattr(gaussians, name)) for name in names})
+        return cls(*(np.zeros_like(getattr(gaussians, name)) for name in TRAINED))
 
 
 @dataclass(frozen=True)
@@ -578,7 +578,9 @@ def project_gaussians(
         between pixel centres, or with non-finite values.
     """
     count = len(gaussians)
-    screen = _output(count, out)
+    screen = ScreenGaussians.allocate(count) if out is None else out
+    if len(screen) != count:
+        raise UsageError(f"The output holds {len(screen)} rows, not {count}.", "Allocate it anew.")
     packed = pack_camera(camera, options.near_z)
     degree = used_degree(gaussians.sh.shape[1], options)
     threads = options.threads or default_threads()
@@ -603,11 +605,10 @@ def project_arrays(
     near_z: float,
     *,
     threads: int = 0,
-    out: ScreenGaussians | None = None,
 ) -> ScreenGaussians:
     """Project activated Gaussians like :func:`project_gaussians`; the colour columns are 0."""
     count = len(arrays)
-    screen = _output(count, out)
+    screen = ScreenGaussians.allocate(count)
     packed = pack_camera(camera, near_z)
     threads = threads or default_threads()
 
@@ -653,20 +654,6 @@ def project_backward(
     _backward(gaussians, camera, options, screen, grad_params, None, grads_out)
 
 
-def allocate_visible(gaussians: RawArrays, count: int) -> VisibleGradients:
-    """Return arrays for the gradients of up to ``count`` visible Gaussians."""
-    coefficients = gaussians.sh.shape[1]
-    return VisibleGradients(
-        np.zeros(count, np.int32),
-        np.zeros((count, 3), np.float32),
-        np.zeros((count, 3), np.float32),
-        np.zeros((count, 4), np.float32),
-        np.zeros(count, np.float32),
-        np.zeros((count, coefficients, 3), np.float32),
-        np.zeros((count, 4), np.float32),
-    )
-
-
 def project_backward_visible(
     gaussians: RawArrays,
     camera: Camera,
@@ -674,9 +661,9 @@ def project_backward_visible(
     screen: ScreenGaussians,
     grad_params: np.ndarray,
     ids: np.ndarray,
-    out: VisibleGradients | None = None,
+    take: Callable[[str, tuple[int, ...], Any], np.ndarray] | None = None,
 ) -> VisibleGradients:
-    """Write the gradient with respect to the raw parameters of some Gaussians, one row each.
+    """Return the gradient with respect to the raw parameters of some Gaussians, one row each.
 
     Parameters
     ----------
@@ -687,40 +674,19 @@ def project_backward_visible(
     grad_params : (n, 24) float32 or float64
         Gradient with respect to ``screen.params``; only the rows ``ids`` are read.
     ids : (v,) int32
-        Indices of Gaussians, increasing. Those that are not visible get rows of 0.
-    out : VisibleGradients, optional
-        Arrays of at least v rows (:func:`allocate_visible`); overwritten.
-
-    Returns
-    -------
-    VisibleGradients
-        Views of the first v rows of ``out``. Coefficients above the degree used get 0.
-
-    Raises
-    ------
-    UsageError
-        If ``out`` has fewer than v rows or another number of harmonics coefficients.
+        Indices of Gaussians, increasing. Those that are not visible get rows of 0, as do
+        coefficients above the degree used.
+    take : callable, optional
+        ``take(name, shape, dtype)`` returns the arrays to write; by default new ones.
     """
-    count = len(ids)
-    if out is None:
-        out = allocate_visible(gaussians, count)
-    if len(out.means) < count or out.sh.shape[1] != gaussians.sh.shape[1]:
-        raise UsageError(
-            f"The scratch holds {len(out.means)} rows of {out.sh.shape[1]} coefficients, not "
-            f"{count} of {gaussians.sh.shape[1]}.",
-            "Allocate it anew.",
-        )
-    part = VisibleGradients(
-        ids,
-        out.means[:count],
-        out.log_scales[:count],
-        out.quats[:count],
-        out.opacity_logits[:count],
-        out.sh[:count],
-        out.orientation[:count],
-    )
-    _backward(gaussians, camera, options, screen, grad_params, ids, part)
-    return part
+    rows = [
+        np.empty(shape, np.float32) if take is None else take(f"grad {name}", shape, np.float32)
+        for name in TRAINED
+        for shape in [(len(ids), *getattr(gaussians, name).shape[1:])]
+    ]
+    out = VisibleGradients(ids, *rows)
+    _backward(gaussians, camera, options, screen, grad_params, ids, out)
+    return out
 
 
 _NO_IDS = np.zeros(0, np.int32)
@@ -762,11 +728,3 @@ def _backward(
         )
 
     run_chunks(run, even_bounds(count, threads), threads)
-
-
-def _output(count: int, out: ScreenGaussians | None) -> ScreenGaussians:
-    if out is None:
-        return ScreenGaussians.allocate(count)
-    if len(out) != count:
-        raise UsageError(f"The output holds {len(out)} rows, not {count}.", "Allocate it anew.")
-    return out

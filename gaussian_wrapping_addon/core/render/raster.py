@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..compiled import inline, kernel
-from ..parallel import empty_array, even_bounds, run_chunks
+from ..parallel import run_chunks
 from ..scene.camera import Camera
 from .isosurface import LIST_VALUES, SOLVER_VALUES, solve_block
 from .projection import RawArrays, ScreenGaussians
@@ -186,35 +186,6 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
                 _write_intersection(depth, absolute, m, _SUMS, params, i, intersections, slot)
 
     return backward_range
-
-
-@kernel(fast=False)
-def sum_intersections(
-    first: int,
-    end: int,
-    intersections: np.ndarray,
-    intersection_offsets: np.ndarray,
-    grad_params: np.ndarray,
-    grad_px: np.ndarray,
-    grad_abs_px: np.ndarray,
-) -> None:
-    """Sum the intersection gradients of the Gaussians ``first .. end`` into ``grad_params``.
-
-    Columns 22 and 23 of ``grad_params (n, 24)`` become 0; ``grad_px (n,)`` and ``grad_abs_px (n,)``
-    receive the norms of the gradient on (u, v) and of its sum of absolute values.
-    """
-    total = np.zeros(ROW_VALUES, np.float32)
-    for i in range(first, end):
-        total[:] = ZERO
-        for slot in range(intersection_offsets[i], intersection_offsets[i + 1]):
-            for column in range(ROW_VALUES):
-                total[column] += intersections[slot, column]
-        grad_px[i] = math.sqrt(total[0] * total[0] + total[1] * total[1])
-        grad_abs_px[i] = math.sqrt(total[ABS_U] * total[ABS_U] + total[ABS_V] * total[ABS_V])
-        total[ABS_U] = ZERO
-        total[ABS_V] = ZERO
-        for column in range(ROW_VALUES):
-            grad_params[i, column] = total[column]
 
 
 # -- Compiled reduction of per-intersection values of one band to the visible Gaussians -----------
@@ -455,13 +426,19 @@ _MOST_BLOCKS = 32
 """Blocks of a tile if a block has eight pixels."""
 
 
+def _int32_zeros(count: int) -> np.ndarray:
+    return np.zeros(count, np.int32)
+
+
 def _take(pool: list[np.ndarray], count: int, make: Callable[[int], np.ndarray]) -> np.ndarray:
     """Return an array of at least ``count`` values from a pool, or a new, larger one."""
     try:
         kept = pool.pop()
+        if len(kept) >= count:
+            return kept
     except IndexError:
-        return make(count * 5 // 4)
-    return kept if len(kept) >= count else make(count * 5 // 4)
+        pass
+    return make(count * 5 // 4)
 
 
 @dataclass
@@ -475,7 +452,6 @@ class RenderBuffers:
     scratch: list[np.ndarray] = field(default_factory=list)
     lists: list[np.ndarray] = field(default_factory=list)
     contributors: list[np.ndarray] = field(default_factory=list)
-    intersections: list[np.ndarray] = field(default_factory=list)
     renderers: list[Any] = field(default_factory=list)
     """Idle :class:`~.view_renderer.ViewRenderer` with their memory."""
 
@@ -484,17 +460,14 @@ class RenderBuffers:
 
         ``longest`` is the largest number of intersections of a tile; only depth needs lists.
         """
-        spare = [
-            (self.scratch, self.take_scratch()),
-            (self.lists, self.take_lists(longest if depth else 0)),
-            (self.contributors, self.take_contributors(longest)),
-        ]
-        for pool, array in spare:
+        for pool, array, make in (
+            (self.scratch, self.take_scratch(), aligned_zeros),
+            (self.lists, self.take_lists(longest if depth else 0), aligned_zeros),
+            (self.contributors, self.take_contributors(longest), _int32_zeros),
+        ):
             pool.append(array)
             while len(pool) < threads:
-                pool.append(
-                    array.copy() if pool is self.contributors else aligned_zeros(len(array))
-                )
+                pool.append(make(len(array)))
 
     def take_scratch(self) -> np.ndarray:
         """Return the uninitialised state of one thread's tile."""
@@ -507,17 +480,7 @@ class RenderBuffers:
     def take_contributors(self, longest: int) -> np.ndarray:
         """Return uninitialised contributor lists for all blocks of such a tile."""
         count = _MOST_BLOCKS * (longest + CONTRIBUTORS_PADDING)
-        return _take(self.contributors, count, lambda size: np.zeros(size, np.int32))
-
-    def take_intersections(self, count: int) -> np.ndarray:
-        """Return at least ``count`` uninitialised rows of intersection gradients."""
-        try:
-            kept = self.intersections.pop()
-        except IndexError:
-            kept = np.zeros((0, ROW_VALUES), np.float32)
-        if len(kept) >= count:
-            return kept
-        return empty_array(count * 5 // 4 * ROW_VALUES, np.float32).reshape(-1, ROW_VALUES)
+        return _take(self.contributors, count, _int32_zeros)
 
 
 @dataclass(frozen=True)
@@ -678,32 +641,3 @@ def write_intersection_gradients(
         buffers.scratch.append(scratch)
 
     run_chunks(run, view.bounds, view.threads)
-
-
-def blend_backward(
-    view: ScreenView,
-    images: Images,
-    grads: list[np.ndarray],
-    buffers: RenderBuffers,
-    *,
-    absolute: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the gradient on params (n, 24), and its signed and absolute norms on (u, v), (n,)."""
-    lists, count = view.lists, len(view.screen)
-    intersections = buffers.take_intersections(len(lists.gaussian_ids))
-    depth = bool(grads[4].any())
-    write_intersection_gradients(
-        view, images, grads, buffers, intersections, depth=depth, absolute=absolute
-    )
-    grad_params = np.zeros((count, ROW_VALUES), np.float32)
-    grad_px = np.zeros(count, np.float32)
-    grad_abs_px = np.zeros(count, np.float32)
-
-    def combine(first: int, end: int) -> None:
-        sum_intersections(
-            first, end, intersections, lists.intersection_offsets, grad_params, grad_px, grad_abs_px
-        )
-
-    run_chunks(combine, even_bounds(count, view.threads), view.threads)
-    buffers.intersections.append(intersections)
-    return grad_params, grad_px, grad_abs_px

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba.core import types
-from numba.extending import intrinsic
 
 from .. import limits
 from ..compiled import inline, kernel
-from .simd import BLOCK_COLUMNS, BLOCK_WIDTH, HALF, TILE, Block, Vector
+from .simd import BLOCK_COLUMNS, BLOCK_WIDTH, HALF, TILE, Block, Vector, compile_time
 
 # -- Compiled kernels of tile binning: pixel ranges, intersected tiles, slots, scattering ---------
 
@@ -452,41 +451,26 @@ def _reached_blocks(
     return _Words(block, chosen)
 
 
-def _mask_intrinsic(lanes: int) -> Any:
-    @intrinsic
-    def mask(  # type: ignore[no-untyped-def]
-        typingctx, ids, at, boxes, skews, left, top, masks, masks_at
-    ):
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            block = Block(_GROUP, context, builder)
-            ids_data, boxes_data, skews_data, out = (
-                block.data(sig.args[k], args[k]) for k in (0, 2, 3, 6)
-            )
-            columns = _columns(block, ids_data, args[1], boxes_data, skews_data)
-            words = _reached_blocks(block, columns, args[4], args[5], lanes // BLOCK_WIDTH)
-            pointer = builder.gep(out, [args[7]], inbounds=True)
-            builder.store(words.value, builder.bitcast(pointer, words.value.type.as_pointer()), 4)
-            return context.get_dummy_value()
+@compile_time
+def _mask_group(  # type: ignore[no-untyped-def]
+    typingctx, lanes, ids, at, boxes, skews, left, top, masks, masks_at
+):
+    """Write the masks of the 16 Gaussians ``ids[at ..]`` in one tile to ``masks[masks_at ..]``."""
 
-        index, single = types.intp, types.float32
-        return types.void(ids, index, boxes, skews, single, single, masks, index), generate
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        block = Block(_GROUP, context, builder)
+        ids_data, boxes_data, skews_data, out = (
+            block.data(sig.args[k], args[k]) for k in (1, 3, 4, 7)
+        )
+        columns = _columns(block, ids_data, args[2], boxes_data, skews_data)
+        height = lanes.literal_value // BLOCK_WIDTH
+        words = _reached_blocks(block, columns, args[5], args[6], height)
+        pointer = builder.gep(out, [args[8]], inbounds=True)
+        builder.store(words.value, builder.bitcast(pointer, words.value.type.as_pointer()), 4)
+        return context.get_dummy_value()
 
-    return mask
-
-
-_mask_16, _mask_8 = _mask_intrinsic(16), _mask_intrinsic(8)
-
-
-@inline
-def _mask_group(
-    lanes: Any, ids: Any, at: Any, boxes: Any, skews: Any, left: Any, top: Any, out: Any,
-    out_at: Any,
-) -> None:  # fmt: skip
-    """Write the masks of the 16 Gaussians ``ids[at ..]`` in one tile to ``out[out_at ..]``."""
-    if lanes == 16:
-        _mask_16(ids, at, boxes, skews, left, top, out, out_at)
-    else:
-        _mask_8(ids, at, boxes, skews, left, top, out, out_at)
+    index, single = types.intp, types.float32
+    return types.void(lanes, ids, index, boxes, skews, single, single, masks, index), generate
 
 
 @functools.cache

@@ -11,7 +11,7 @@ import numpy as np
 from .. import limits
 from ..compiled import kernel
 from ..errors import ResourceError, UsageError
-from ..parallel import ArrayStore, balanced_bounds, default_threads, even_bounds, run_chunks
+from ..parallel import ArrayStore, balanced_bounds, even_bounds, run_chunks
 from .projection import ScreenGaussians
 from .tile_kernels import (
     ID,
@@ -415,38 +415,6 @@ class TileBinning:
         run_chunks(assign, np.arange(chunks + 1), threads)
         offsets[self._count] = slots[-1]
         return offsets
-
-
-def bin_gaussians(
-    screen: ScreenGaussians,
-    width: int,
-    height: int,
-    threads: int = 0,
-    store: ArrayStore | None = None,
-) -> TileLists:
-    """Sort the visible Gaussians by distance and scatter them into tile lists.
-
-    One radix sort of the distances and one counting sort into tiles; within each tile the order is
-    that of a stable sort, for any number of threads. Tiles at the corners of a box that the ellipse
-    itself does not reach leave the Gaussian out.
-
-    Parameters
-    ----------
-    screen : ScreenGaussians
-        Projected for an image of ``width`` x ``height`` pixels.
-    threads : int
-        0 uses every core.
-    store : ArrayStore, optional
-        Owns the lists, which are valid until its next binning; by default a new one.
-
-    Raises
-    ------
-    ResourceError
-        If the lists would hold more than 2^31 - 1 intersections.
-    """
-    store = ArrayStore() if store is None else store
-    binning = TileBinning(screen, width, height, threads or default_threads(), store)
-    return binning.lists(0, binning.tiles_x * binning.tiles_y)
 
 
 def _bounds(count: int, threads: int) -> np.ndarray:

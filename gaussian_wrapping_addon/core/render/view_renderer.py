@@ -240,24 +240,10 @@ class ViewPass:
             rendered another view since.
         """
         grad_params = self.params_gradient(grads)
-        gaussians, count = self.gaussians, len(self.ids)
-
-        def take(name: str) -> np.ndarray:
-            shape = (count, *getattr(gaussians, name).shape[1:])
-            return self._store.take(f"grad {name}", shape, np.float32)
-
-        out = VisibleGradients(
-            self.ids,
-            take("means"),
-            take("log_scales"),
-            take("quats"),
-            take("opacity_logits"),
-            take("sh"),
-            take("orientation"),
-        )
         return project_backward_visible(
-            gaussians, self._camera, self._options, self.screen, grad_params, self.ids, out
-        )
+            self.gaussians, self._camera, self._options, self.screen, grad_params, self.ids,
+            self._store.take,
+        )  # fmt: skip
 
     def params_gradient(self, grads: ImageGradients) -> np.ndarray:
         """Return the (n, 24) float32 gradient on the screen params; only rows ``ids`` are valid."""
