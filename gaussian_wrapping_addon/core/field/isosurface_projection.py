@@ -250,13 +250,9 @@ class _Search:
         self.status[close & newton] = ProjectionStatus.CONVERGED
         self.status[close & ~newton] = ProjectionStatus.BISECTED
         return ProjectionResult(
-            self.best_x,
-            self.best_v.astype(np.float32),
-            self.status,
-            residual.astype(np.float32),
-            self.best_camera,
-            evaluations,
-        )
+            self.best_x, self.best_v.astype(np.float32), self.status, residual.astype(np.float32),
+            self.best_camera, evaluations,
+        )  # fmt: skip
 
     # -- next positions ---------------------------------------------------------------------------
 

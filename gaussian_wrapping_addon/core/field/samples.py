@@ -147,15 +147,12 @@ def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
         owner_parts.append(rows[owners[order]].astype(np.int32))
         slots, cells, entries = slots + capacity, cells + len(unique_keys), entries + len(keys)
     return BoxGrid(
-        origin,
-        level_size,
-        np.asarray(table_begin, np.int64),
-        np.asarray(table_mask, np.int64),
+        origin, level_size, np.asarray(table_begin, np.int64), np.asarray(table_mask, np.int64),
         np.concatenate(slot_key_parts) if slot_key_parts else np.zeros(0, np.int64),
         np.concatenate(slot_cell_parts) if slot_cell_parts else np.zeros(0, np.int32),
         np.concatenate(begin_parts),
         np.concatenate(owner_parts) if owner_parts else np.zeros(0, np.int32),
-    )
+    )  # fmt: skip
 
 
 # -- Surface samples from the cameras' depth maps, and point pairs across the surface from them

@@ -167,18 +167,10 @@ def strip_span(x0: float, y0: float, x1: float, y1: float, skew: float, top: flo
 
 @kernel(fast=False)
 def scan_areas(
-    begin: int,
-    end: int,
-    order: np.ndarray,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    tiles_x: int,
-    tiles_y: int,
-    heads: np.ndarray,
-    intersection_offsets: np.ndarray,
-    gaussian_ids: np.ndarray,
+    begin: int, end: int, order: np.ndarray, boxes: np.ndarray, skews: np.ndarray, tiles_x: int,
+    tiles_y: int, heads: np.ndarray, intersection_offsets: np.ndarray, gaussian_ids: np.ndarray,
     intersection_slots: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Count the intersections of ``order[begin .. end]``; write them if ``gaussian_ids`` has room.
 
     Counting adds to ``heads (tiles,)`` and writes the number of intersections of Gaussian i to
@@ -219,15 +211,9 @@ def scan_areas(
 
 @kernel(fast=False)
 def find_cells(
-    coordinates: np.ndarray,
-    width: int,
-    height: int,
-    tiles_x: int,
-    tiles_y: int,
-    shift: int,
-    cells: np.ndarray,
-    start: np.ndarray,
-) -> None:
+    coordinates: np.ndarray, width: int, height: int, tiles_x: int, tiles_y: int, shift: int,
+    cells: np.ndarray, start: np.ndarray,
+) -> None:  # fmt: skip
     """Write the cell of each position, or -1; count the positions of cell c in ``start[c + 1]``."""
     mask = (1 << shift) - 1
     cell_px = np.float32(TILE >> shift)

@@ -105,24 +105,12 @@ def _span_gradient(span: Any, x: Any, y: Any, t: Any, weight: Any, stop: Any) ->
 
 @kernel(fast=True)
 def query_gradient_range(
-    first_tile: int,
-    end_tile: int,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    start: np.ndarray,
-    gaussian_ids: np.ndarray,
-    intersection_slots: np.ndarray,
-    tiles_x: int,
-    shift: int,
-    cell_start: np.ndarray,
-    coordinates: np.ndarray,
-    depths: np.ndarray,
-    weights: np.ndarray,
-    stops: np.ndarray,
-    intersection_grads: np.ndarray,
+    first_tile: int, end_tile: int, params: np.ndarray, boxes: np.ndarray, skews: np.ndarray,
+    start: np.ndarray, gaussian_ids: np.ndarray, intersection_slots: np.ndarray, tiles_x: int,
+    shift: int, cell_start: np.ndarray, coordinates: np.ndarray, depths: np.ndarray,
+    weights: np.ndarray, stops: np.ndarray, intersection_grads: np.ndarray,
     grad_coordinates: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Write the gradient of ``sum weights * log T(depths)`` for the positions of tiles.
 
     Parameters

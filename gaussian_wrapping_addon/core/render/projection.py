@@ -310,29 +310,13 @@ def _drop_overflows(m: Any) -> None:
 
 @kernel(fast=False, fused=True)
 def backward_range(
-    begin: int,
-    end: int,
-    ids: np.ndarray,
-    compact: bool,
-    means: np.ndarray,
-    log_scales: np.ndarray,
-    quats: np.ndarray,
-    opacity_logits: np.ndarray,
-    sh: np.ndarray,
-    orientation: np.ndarray,
-    filter_3d: np.ndarray,
-    degree: int,
-    camera: np.ndarray,
-    params: np.ndarray,
-    visible: np.ndarray,
-    grad_params: np.ndarray,
-    grad_means: np.ndarray,
-    grad_log_scales: np.ndarray,
-    grad_quats: np.ndarray,
-    grad_opacity_logits: np.ndarray,
-    grad_sh: np.ndarray,
+    begin: int, end: int, ids: np.ndarray, compact: bool, means: np.ndarray, log_scales: np.ndarray,
+    quats: np.ndarray, opacity_logits: np.ndarray, sh: np.ndarray, orientation: np.ndarray,
+    filter_3d: np.ndarray, degree: int, camera: np.ndarray, params: np.ndarray, visible: np.ndarray,
+    grad_params: np.ndarray, grad_means: np.ndarray, grad_log_scales: np.ndarray,
+    grad_quats: np.ndarray, grad_opacity_logits: np.ndarray, grad_sh: np.ndarray,
     grad_orientation: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Write the gradients of the Gaussians ``begin .. end``, or of ``ids[begin .. end]``.
 
     The gradient is 0 for Gaussians that are not visible or if it overflows float32. With
@@ -587,13 +571,8 @@ def project_gaussians(
 
     def run(begin: int, end: int) -> None:
         project_raw_range(
-            begin,
-            end,
-            *gaussians.arguments(),
-            degree,
-            packed,
-            *screen.arguments(),
-        )
+            begin, end, *gaussians.arguments(), degree, packed, *screen.arguments(),
+        )  # fmt: skip
 
     run_chunks(run, even_bounds(count, threads), threads)
     return screen
@@ -614,16 +593,9 @@ def project_arrays(
 
     def run(begin: int, end: int) -> None:
         project_activated_range(
-            begin,
-            end,
-            arrays.means,
-            arrays.scales,
-            arrays.rotations,
-            arrays.log_opacities,
-            arrays.normals,
-            packed,
-            *screen.arguments(),
-        )
+            begin, end, arrays.means, arrays.scales, arrays.rotations, arrays.log_opacities,
+            arrays.normals, packed, *screen.arguments(),
+        )  # fmt: skip
 
     run_chunks(run, even_bounds(count, threads), threads)
     return screen
@@ -709,22 +681,10 @@ def _backward(
 
     def run(begin: int, end: int) -> None:
         backward_range(
-            begin,
-            end,
-            _NO_IDS if ids is None else ids,
-            ids is not None,
-            *gaussians.arguments(),
-            degree,
-            packed,
-            screen.params,
-            screen.visible,
-            grad_params,
-            grads_out.means,
-            grads_out.log_scales,
-            grads_out.quats,
-            grads_out.opacity_logits,
-            grads_out.sh,
+            begin, end, _NO_IDS if ids is None else ids, ids is not None, *gaussians.arguments(),
+            degree, packed, screen.params, screen.visible, grad_params, grads_out.means,
+            grads_out.log_scales, grads_out.quats, grads_out.opacity_logits, grads_out.sh,
             grads_out.orientation,
-        )
+        )  # fmt: skip
 
     run_chunks(run, even_bounds(count, threads), threads)

@@ -230,16 +230,9 @@ _SIGN_END = 20.0
 
 @inline
 def load_raw(
-    m: Any,
-    lane: Any,
-    i: Any,
-    means: Any,
-    log_scales: Any,
-    quats: Any,
-    opacity_logits: Any,
-    orientation: Any,
-    filter_3d: Any,
-) -> None:
+    m: Any, lane: Any, i: Any, means: Any, log_scales: Any, quats: Any, opacity_logits: Any,
+    orientation: Any, filter_3d: Any,
+) -> None:  # fmt: skip
     """Load all raw parameters of Gaussian i except its harmonics."""
     m[MEAN + lane] = means[i, 0]
     m[MEAN + BLOCK + lane] = means[i, 1]
@@ -576,23 +569,11 @@ def _write_row(
 
 @kernel(fast=False, fused=True)
 def project_raw_range(
-    begin: int,
-    end: int,
-    means: np.ndarray,
-    log_scales: np.ndarray,
-    quats: np.ndarray,
-    opacity_logits: np.ndarray,
-    sh: np.ndarray,
-    orientation: np.ndarray,
-    filter_3d: np.ndarray,
-    degree: int,
-    camera: np.ndarray,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    visible: np.ndarray,
-    depths: np.ndarray,
-    skews: np.ndarray,
-) -> None:
+    begin: int, end: int, means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray,
+    opacity_logits: np.ndarray, sh: np.ndarray, orientation: np.ndarray, filter_3d: np.ndarray,
+    degree: int, camera: np.ndarray, params: np.ndarray, boxes: np.ndarray, visible: np.ndarray,
+    depths: np.ndarray, skews: np.ndarray,
+) -> None:  # fmt: skip
     """Project the raw Gaussians ``begin .. end``; hidden ones only get visibility and depth."""
     m = block_scratch(_PLANES)
     queue = np.empty(QUEUE + BLOCK, np.int64)
@@ -663,20 +644,10 @@ def project_raw_range(
 
 @kernel(fast=False, fused=True)
 def project_activated_range(
-    begin: int,
-    end: int,
-    means: np.ndarray,
-    scales: np.ndarray,
-    rotations: np.ndarray,
-    log_opacities: np.ndarray,
-    normals: np.ndarray,
-    camera: np.ndarray,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    visible: np.ndarray,
-    depths: np.ndarray,
-    skews: np.ndarray,
-) -> None:
+    begin: int, end: int, means: np.ndarray, scales: np.ndarray, rotations: np.ndarray,
+    log_opacities: np.ndarray, normals: np.ndarray, camera: np.ndarray, params: np.ndarray,
+    boxes: np.ndarray, visible: np.ndarray, depths: np.ndarray, skews: np.ndarray,
+) -> None:  # fmt: skip
     """Project the activated Gaussians ``begin .. end``; the colour columns are 0."""
     m = block_scratch(_PLANES)
     for lane in range(BLOCK):

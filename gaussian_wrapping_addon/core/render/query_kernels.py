@@ -123,16 +123,9 @@ def _add_distant(
 
 @kernel(fast=False)
 def _shrink_range(
-    begin: int,
-    end: int,
-    scale: float,
-    width: int,
-    height: int,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    visible: np.ndarray,
-) -> None:
+    begin: int, end: int, scale: float, width: int, height: int, params: np.ndarray,
+    boxes: np.ndarray, skews: np.ndarray, visible: np.ndarray,
+) -> None:  # fmt: skip
     """Scale the rows ``begin .. end`` of a screen ``scale`` times as fine to pixels.
 
     Rows that the image of ``width`` x ``height`` hides because rendering them would overflow
@@ -196,15 +189,9 @@ _FLOAT_MARGIN = np.float32(4e-6)
 
 @part(fast=False)
 def fill_tile(
-    tile: int,
-    tiles_x: int,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    start: np.ndarray,
-    gaussian_ids: np.ndarray,
-    spans: np.ndarray,
-) -> None:
+    tile: int, tiles_x: int, params: np.ndarray, boxes: np.ndarray, skews: np.ndarray,
+    start: np.ndarray, gaussian_ids: np.ndarray, spans: np.ndarray,
+) -> None:  # fmt: skip
     """Store the Gaussians of a tile and their ellipses in ``spans (s, 22 * 32) float32``."""
     left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
     count = start[tile + 1] - start[tile]
@@ -263,15 +250,9 @@ def _mark_intersecting(span: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> None:
 
 @part(fast=True)
 def fill_cell(
-    columns: int,
-    part: int,
-    shift: int,
-    count: int,
-    tile_spans: np.ndarray,
-    spans: np.ndarray,
-    nearest_depths: np.ndarray,
-    members: np.ndarray,
-) -> int:
+    columns: int, part: int, shift: int, count: int, tile_spans: np.ndarray, spans: np.ndarray,
+    nearest_depths: np.ndarray, members: np.ndarray,
+) -> int:  # fmt: skip
     """Store the Gaussians of a tile that reach one of its cells; return their number.
 
     Parameters
@@ -487,22 +468,11 @@ def _evaluate_span(span: Any, x: Any, y: Any) -> None:
 
 @kernel(fast=True)
 def query_range(
-    first_tile: int,
-    end_tile: int,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    start: np.ndarray,
-    gaussian_ids: np.ndarray,
-    tiles_x: int,
-    shift: int,
-    cell_start: np.ndarray,
-    coordinates: np.ndarray,
-    limit: float,
-    values: np.ndarray,
-    slopes: np.ndarray,
+    first_tile: int, end_tile: int, params: np.ndarray, boxes: np.ndarray, skews: np.ndarray,
+    start: np.ndarray, gaussian_ids: np.ndarray, tiles_x: int, shift: int, cell_start: np.ndarray,
+    coordinates: np.ndarray, limit: float, values: np.ndarray, slopes: np.ndarray,
     stops: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Write the depth of the isosurface and the slope of ``-log T`` at the positions of tiles.
 
     ``values (k,)`` are 0 where there is no depth. ``stops (k,) int32`` receives the number of

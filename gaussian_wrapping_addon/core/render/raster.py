@@ -125,30 +125,13 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
 
     @kernel(fast=True)
     def backward_range(
-        first_tile: int,
-        end_tile: int,
-        params: np.ndarray,
-        start: np.ndarray,
-        gaussian_ids: np.ndarray,
-        intersection_slots: np.ndarray,
-        masks: np.ndarray,
-        tiles_x: int,
-        width: int,
-        height: int,
-        color: np.ndarray,
-        normal: np.ndarray,
-        geometric: np.ndarray,
-        alpha_image: np.ndarray,
-        depth_image: np.ndarray,
-        slope_image: np.ndarray,
-        g_color: np.ndarray,
-        g_normal: np.ndarray,
-        g_geometric: np.ndarray,
-        g_alpha: np.ndarray,
-        g_depth: np.ndarray,
-        m: np.ndarray,
-        intersections: np.ndarray,
-    ) -> None:
+        first_tile: int, end_tile: int, params: np.ndarray, start: np.ndarray,
+        gaussian_ids: np.ndarray, intersection_slots: np.ndarray, masks: np.ndarray, tiles_x: int,
+        width: int, height: int, color: np.ndarray, normal: np.ndarray, geometric: np.ndarray,
+        alpha_image: np.ndarray, depth_image: np.ndarray, slope_image: np.ndarray,
+        g_color: np.ndarray, g_normal: np.ndarray, g_geometric: np.ndarray, g_alpha: np.ndarray,
+        g_depth: np.ndarray, m: np.ndarray, intersections: np.ndarray,
+    ) -> None:  # fmt: skip
         """Write the gradients of the tiles' intersections to their slots, (p, 24)."""
         images = (color, normal, geometric, alpha_image, depth_image, slope_image)
         grads = (g_color, g_normal, g_geometric, g_alpha, g_depth)
@@ -193,14 +176,9 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
 
 @kernel(fast=False)
 def add_intersection_gradients(
-    begin: int,
-    end: int,
-    ids: np.ndarray,
-    intersections: np.ndarray,
-    intersection_offsets: np.ndarray,
-    fresh: bool,
-    grad_params: np.ndarray,
-) -> None:
+    begin: int, end: int, ids: np.ndarray, intersections: np.ndarray,
+    intersection_offsets: np.ndarray, fresh: bool, grad_params: np.ndarray,
+) -> None:  # fmt: skip
     """Add the intersection gradients of the Gaussians ``ids[begin .. end]`` to ``grad_params``.
 
     With ``fresh`` the rows of ``grad_params (n, 24)`` start at 0, whatever their content. The last
@@ -223,13 +201,9 @@ def add_intersection_gradients(
 
 @kernel(fast=False)
 def write_screen_gradients(
-    begin: int,
-    end: int,
-    ids: np.ndarray,
-    grad_params: np.ndarray,
-    grad_px: np.ndarray,
+    begin: int, end: int, ids: np.ndarray, grad_params: np.ndarray, grad_px: np.ndarray,
     grad_abs_px: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Write the norms of the gradient on (u, v) and of its sum of absolute values.
 
     The columns of the absolute values are then set to 0, as params have none there, and so are rows
@@ -253,14 +227,9 @@ def write_screen_gradients(
 
 @kernel(fast=False)
 def add_intersection_weights(
-    begin: int,
-    end: int,
-    ids: np.ndarray,
-    intersection_weights: np.ndarray,
-    intersection_offsets: np.ndarray,
-    weight_sum: np.ndarray,
-    weight_max: np.ndarray,
-) -> None:
+    begin: int, end: int, ids: np.ndarray, intersection_weights: np.ndarray,
+    intersection_offsets: np.ndarray, weight_sum: np.ndarray, weight_max: np.ndarray,
+) -> None:  # fmt: skip
     """Reduce the blending weights of the Gaussians ``ids[begin .. end]`` over intersections."""
     for k in range(begin, end):
         i = ids[k]
@@ -273,13 +242,9 @@ def add_intersection_weights(
 
 @kernel(fast=False)
 def mark_visible(
-    begin: int,
-    end: int,
-    ids: np.ndarray,
-    boxes: np.ndarray,
-    visible: np.ndarray,
+    begin: int, end: int, ids: np.ndarray, boxes: np.ndarray, visible: np.ndarray,
     radii_px: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Mark the Gaussians ``ids[begin .. end]`` visible; write half their boxes' longer side."""
     for k in range(begin, end):
         i = ids[k]
@@ -316,30 +281,13 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
 
     @kernel(fast=True)
     def forward_range(
-        first_tile: int,
-        end_tile: int,
-        params: np.ndarray,
-        start: np.ndarray,
-        gaussian_ids: np.ndarray,
-        intersection_slots: np.ndarray,
-        masks: np.ndarray,
-        tiles_x: int,
-        width: int,
-        height: int,
-        background: np.ndarray,
-        limit: float,
-        m: np.ndarray,
-        lists: np.ndarray,
-        contributors: np.ndarray,
-        color: np.ndarray,
-        normal: np.ndarray,
-        geometric: np.ndarray,
-        alpha_image: np.ndarray,
-        depth_image: np.ndarray,
-        slope_image: np.ndarray,
-        intersection_weights: np.ndarray,
-        strongest: np.ndarray,
-    ) -> None:
+        first_tile: int, end_tile: int, params: np.ndarray, start: np.ndarray,
+        gaussian_ids: np.ndarray, intersection_slots: np.ndarray, masks: np.ndarray, tiles_x: int,
+        width: int, height: int, background: np.ndarray, limit: float, m: np.ndarray,
+        lists: np.ndarray, contributors: np.ndarray, color: np.ndarray, normal: np.ndarray,
+        geometric: np.ndarray, alpha_image: np.ndarray, depth_image: np.ndarray,
+        slope_image: np.ndarray, intersection_weights: np.ndarray, strongest: np.ndarray,
+    ) -> None:  # fmt: skip
         """Render tiles.
 
         ``lists`` and, for each block, ``contributors`` have room for the longest tile list.
@@ -590,18 +538,9 @@ def blend(
         entries = buffers.take_lists(longest if depth else 0)
         contributors = buffers.take_contributors(longest)
         forward(
-            first,
-            end,
-            *view.arguments(),
-            background,
-            limit,
-            scratch,
-            entries,
-            contributors,
-            *images.arguments(),
-            intersection_weights,
-            images.strongest,
-        )
+            first, end, *view.arguments(), background, limit, scratch, entries, contributors,
+            *images.arguments(), intersection_weights, images.strongest,
+        )  # fmt: skip
         buffers.scratch.append(scratch)
         buffers.lists.append(entries)
         buffers.contributors.append(contributors)
@@ -630,14 +569,8 @@ def write_intersection_gradients(
     def run(first: int, end: int) -> None:
         scratch = buffers.take_scratch()
         backward(
-            first,
-            end,
-            *view.arguments(),
-            *images.arguments(),
-            *grads,
-            scratch,
-            intersections,
-        )
+            first, end, *view.arguments(), *images.arguments(), *grads, scratch, intersections,
+        )  # fmt: skip
         buffers.scratch.append(scratch)
 
     run_chunks(run, view.bounds, view.threads)

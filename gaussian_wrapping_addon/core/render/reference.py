@@ -259,42 +259,6 @@ def render_reference(
     )
 
 
-def reference_depth_at(
-    gaussians: OrientedGaussians, camera: Camera, positions: Tensor, options: RenderOptions
-) -> Tensor:
-    """Return the depth of :func:`render_reference` at any positions of the image.
-
-    The definition of :func:`~.depth_query.solve_depths`; only tests compare with it.
-
-    Parameters
-    ----------
-    gaussians, camera, options
-        As for :func:`render_reference`.
-    positions : (m, 2) tensor
-        Pixels, the Gaussians' float type; differentiable.
-
-    Returns
-    -------
-    (m,) tensor
-        z-depth in scene units; 0 where there is none and off ``[0, width] x [0, height]``.
-    """
-    rays, seen = _evaluate_rays_at(gaussians, camera, positions, options)
-    return positions.new_zeros(len(positions)).index_put((seen,), _depth(rays, options))
-
-
-def _evaluate_rays_at(
-    gaussians: OrientedGaussians, camera: Camera, positions: Tensor, options: RenderOptions
-) -> tuple[_RayEvaluation, Tensor]:
-    """Evaluate the rays of the positions on the image; return also these positions' indices."""
-    screen = reference_projection(gaussians, camera, options)
-    chosen = torch.nonzero(screen.usable)[:, 0]
-    order = chosen[torch.argsort(screen.depths[chosen].float(), stable=True)]
-    size = positions.new_tensor([camera.width, camera.height])
-    seen = torch.nonzero(((positions >= 0.0) & (positions <= size)).all(1))[:, 0]
-    x, y = positions[seen].unbind(1)
-    return _evaluate_rays(screen.params[order], x, y), seen
-
-
 def _render_rows(
     params: Tensor,
     background: Tensor,
@@ -330,13 +294,9 @@ def _evaluate_rays(params: Tensor, x: Tensor, y: Tensor) -> _RayEvaluation:
     alpha = torch.where(contributes, alpha, 0.0)
     before = _transmittance_before(alpha)
     return _RayEvaluation(
-        log_alpha,
-        alpha * before,
-        contributes,
-        torch.prod(1.0 - alpha, dim=1),
-        z * (1.0 + shift) / denominator,
-        a0 * denominator,
-    )
+        log_alpha, alpha * before, contributes, torch.prod(1.0 - alpha, dim=1),
+        z * (1.0 + shift) / denominator, a0 * denominator,
+    )  # fmt: skip
 
 
 def _transmittance_before(alpha: Tensor) -> Tensor:

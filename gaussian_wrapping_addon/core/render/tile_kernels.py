@@ -33,14 +33,9 @@ _AHEAD = 4
 
 @kernel(fast=False)
 def range_pixels(
-    begin: int,
-    end: int,
-    boxes: np.ndarray,
-    visible: np.ndarray,
-    width: int,
-    height: int,
+    begin: int, end: int, boxes: np.ndarray, visible: np.ndarray, width: int, height: int,
     ranges: np.ndarray,
-) -> tuple[int, int]:
+) -> tuple[int, int]:  # fmt: skip
     """Write the pixel ranges of the Gaussians ``begin .. end``.
 
     Returns
@@ -66,20 +61,10 @@ def range_pixels(
 
 @kernel(fast=False)
 def span_tiles(
-    begin: int,
-    end: int,
-    record: int,
-    span: int,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    visible: np.ndarray,
-    depths: np.ndarray,
-    ranges: np.ndarray,
-    spans: np.ndarray,
-    records: np.ndarray,
-    keys: np.ndarray,
-    changes: np.ndarray,
-) -> tuple[int, int, np.int64, np.int64]:
+    begin: int, end: int, record: int, span: int, boxes: np.ndarray, skews: np.ndarray,
+    visible: np.ndarray, depths: np.ndarray, ranges: np.ndarray, spans: np.ndarray,
+    records: np.ndarray, keys: np.ndarray, changes: np.ndarray,
+) -> tuple[int, int, np.int64, np.int64]:  # fmt: skip
     """Find the tiles that the ellipses of the Gaussians ``begin .. end`` reach.
 
     The ellipse clipped to the strip of pixel centres of a tile row is convex, so the columns follow
@@ -177,14 +162,9 @@ def span_tiles(
 
 @kernel(fast=False)
 def count_band(
-    begin: int,
-    end: int,
-    first_tile: int,
-    end_tile: int,
-    tiles_x: int,
-    spans: np.ndarray,
+    begin: int, end: int, first_tile: int, end_tile: int, tiles_x: int, spans: np.ndarray,
     records: np.ndarray,
-) -> int:
+) -> int:  # fmt: skip
     """Replace the slots by the numbers of intersections within a band; return their sum."""
     all_intersections = 0
     first_band_row, end_band_row = first_tile // tiles_x, (end_tile - 1) // tiles_x + 1
@@ -203,14 +183,9 @@ def count_band(
 
 @kernel(fast=False)
 def assign_slots(
-    begin: int,
-    end: int,
-    begin_gaussian: int,
-    end_gaussian: int,
-    slot: int,
-    records: np.ndarray,
+    begin: int, end: int, begin_gaussian: int, end_gaussian: int, slot: int, records: np.ndarray,
     intersection_offsets: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Turn the numbers of intersections into first slots, counting from ``slot``.
 
     Writes ``intersection_offsets`` of the Gaussians ``begin_gaussian .. end_gaussian``, whose
@@ -242,14 +217,9 @@ def rank_records(
 
 @inline
 def _scatter(
-    filled: Any,
-    tiles: Any,
-    slots: Any,
-    ids: Any,
-    heads: Any,
-    gaussian_ids: Any,
+    filled: Any, tiles: Any, slots: Any, ids: Any, heads: Any, gaussian_ids: Any,
     intersection_slots: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Scatter the buffered intersections to the heads of their tiles."""
     for intersection in range(filled):
         listed_tile = np.uint64(tiles[intersection])
@@ -261,17 +231,10 @@ def _scatter(
 
 @kernel(fast=False)
 def scatter_tiles(
-    first_tile: int,
-    end_tile: int,
-    first_band_tile: int,
-    end_band_tile: int,
-    tiles_x: int,
-    ranked: np.ndarray,
-    spans: np.ndarray,
-    heads: np.ndarray,
-    gaussian_ids: np.ndarray,
+    first_tile: int, end_tile: int, first_band_tile: int, end_band_tile: int, tiles_x: int,
+    ranked: np.ndarray, spans: np.ndarray, heads: np.ndarray, gaussian_ids: np.ndarray,
     intersection_slots: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Write the intersections of some tiles of a band at their ``heads``.
 
     The tiles are ``first_tile .. end_tile``; ``ranked`` holds the records by increasing distance.
@@ -479,15 +442,9 @@ def mask_kernel(lanes: int) -> Any:
 
     @kernel(fast=True)
     def mask_range(
-        first_tile: int,
-        end_tile: int,
-        start: np.ndarray,
-        gaussian_ids: np.ndarray,
-        boxes: np.ndarray,
-        skews: np.ndarray,
-        tiles_x: int,
-        masks: np.ndarray,
-    ) -> None:
+        first_tile: int, end_tile: int, start: np.ndarray, gaussian_ids: np.ndarray,
+        boxes: np.ndarray, skews: np.ndarray, tiles_x: int, masks: np.ndarray,
+    ) -> None:  # fmt: skip
         """Write ``masks (intersections,) uint32``: bit ``4 block row + block column`` of the tile.
 
         The part of the ellipse between the first and last pixel centres of a row of blocks is

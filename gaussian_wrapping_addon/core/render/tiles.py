@@ -49,14 +49,9 @@ def _coarse_histogram(
 
 @kernel(fast=False)
 def _sort_part(
-    keys: np.ndarray,
-    bounds: np.ndarray,
-    first_key: int,
-    end_key: int,
-    packed: np.ndarray,
-    other: np.ndarray,
-    order: np.ndarray,
-) -> None:
+    keys: np.ndarray, bounds: np.ndarray, first_key: int, end_key: int, packed: np.ndarray,
+    other: np.ndarray, order: np.ndarray,
+) -> None:  # fmt: skip
     """Write the indices of the keys in ``first_key .. end_key`` to ``order``, sorted.
 
     ``order`` has exactly their number of elements, ``packed`` and ``other`` one more.
@@ -140,14 +135,9 @@ def order_by_keys(
             begin, stop = int(begins[part]), int(begins[part + 1])
             room = slice(begin + part, stop + part + 1)
             _sort_part(
-                keys,
-                bounds,
-                int(cuts[part]),
-                int(cuts[part + 1]),
-                packed[room],
-                other[room],
+                keys, bounds, int(cuts[part]), int(cuts[part + 1]), packed[room], other[room],
                 order[begin:stop],
-            )
+            )  # fmt: skip
 
     run_chunks(sort, np.arange(len(cuts)), threads)
     return order
@@ -264,20 +254,10 @@ class TileBinning:
         def spans(first: int, end: int) -> None:
             for chunk in range(first, end):
                 results[chunk] = span_tiles(
-                    self._gaussians[chunk],
-                    self._gaussians[chunk + 1],
-                    starts[chunk, 0],
-                    starts[chunk, 1],
-                    screen.boxes,
-                    screen.skews,
-                    screen.visible,
-                    screen.depths,
-                    self.pixel_ranges,
-                    self._spans,
-                    self._records,
-                    keys,
-                    changes[chunk],
-                )
+                    self._gaussians[chunk], self._gaussians[chunk + 1], starts[chunk, 0],
+                    starts[chunk, 1], screen.boxes, screen.skews, screen.visible, screen.depths,
+                    self.pixel_ranges, self._spans, self._records, keys, changes[chunk],
+                )  # fmt: skip
 
         run_chunks(spans, np.arange(chunks + 1), threads)
         # Gaussians that turn out to reach no tile leave gaps at the ends of the runs.
@@ -359,30 +339,17 @@ class TileBinning:
 
         def scatter(first_tile: int, end_tile: int) -> None:
             scatter_tiles(
-                first_tile,
-                end_tile,
-                first,
-                end,
-                self.tiles_x,
-                ranked,
-                self._spans,
-                heads,
-                gaussian_ids,
-                intersection_slots,
-            )
+                first_tile, end_tile, first, end, self.tiles_x, ranked, self._spans, heads,
+                gaussian_ids, intersection_slots,
+            )  # fmt: skip
 
         # Each thread passes over the whole order and keeps what falls into its tiles.
         bounds = first + balanced_bounds(self.tile_counts[first:end], threads)
         run_chunks(scatter, bounds, threads)
         return TileLists(
-            start,
-            gaussian_ids,
-            intersection_slots,
-            intersection_offsets,
-            self.pixel_ranges,
-            self.tiles_x,
-            self.tiles_y,
-        )
+            start, gaussian_ids, intersection_slots, intersection_offsets, self.pixel_ranges,
+            self.tiles_x, self.tiles_y,
+        )  # fmt: skip
 
     def _offsets(self, first: int, end: int) -> np.ndarray:
         """Number the slots of a band; return (n + 1,) offsets."""

@@ -90,15 +90,9 @@ def _block_masks(
 
     def mark(first: int, end: int) -> None:
         mask_range(
-            first,
-            end,
-            lists.start,
-            lists.gaussian_ids,
-            screen.boxes,
-            screen.skews,
-            lists.tiles_x,
+            first, end, lists.start, lists.gaussian_ids, screen.boxes, screen.skews, lists.tiles_x,
             masks,
-        )
+        )  # fmt: skip
 
     run_chunks(mark, bounds, threads)
     return masks
@@ -208,14 +202,9 @@ class ViewPass:
 
         def add(begin: int, end: int) -> None:
             add_intersection_weights(
-                begin,
-                end,
-                self.ids,
-                weights,
-                lists.intersection_offsets,
-                statistics.weight_sum,
+                begin, end, self.ids, weights, lists.intersection_offsets, statistics.weight_sum,
                 statistics.weight_max,
-            )
+            )  # fmt: skip
 
         run_chunks(add, self._visible_bounds(), self._threads)
 

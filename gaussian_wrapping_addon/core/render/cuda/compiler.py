@@ -82,14 +82,10 @@ class DriverModule:
         self._enter()
         try:
             _check_driver(
-                self._cuda,
-                "cuLaunchKernel",
-                self._functions[name],
+                self._cuda, "cuLaunchKernel", self._functions[name],
                 *(ctypes.c_uint(value) for value in (blocks, 1, 1, threads, 1, 1, 0)),
-                ctypes.c_void_p(stream),
-                parameters,
-                None,
-            )
+                ctypes.c_void_p(stream), parameters, None,
+            )  # fmt: skip
         finally:
             self._leave()
 

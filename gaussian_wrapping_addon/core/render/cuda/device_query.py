@@ -90,16 +90,9 @@ def query_view(
     count, device = len(gaussians), gaussians.means.device
     screen = DeviceScreen.empty(count, device)
     kernels.launch_each(
-        "project_finely",
-        count,
-        *raw.arguments(),
-        fine_scale(camera),
-        screen.params,
-        screen.boxes,
-        screen.visible,
-        screen.depths,
-        screen.skews,
-    )
+        "project_finely", count, *raw.arguments(), fine_scale(camera), screen.params, screen.boxes,
+        screen.visible, screen.depths, screen.skews,
+    )  # fmt: skip
     return DeviceQueryView(kernels, raw, camera, options, screen)
 
 
@@ -135,20 +128,10 @@ def solve_depths(view: DeviceQueryView, positions: Tensor) -> DeviceQueryResult:
     found, slopes = torch.empty((2, count), device=positions.device).unbind()
     stops = torch.empty(count, dtype=torch.int32, device=positions.device)
     view.kernels.launch(
-        "solve_points",
-        -(-count // WARPS),
-        count,
-        view.screen.params,
-        lists.start,
-        lists.gaussian_ids,
-        tiles[0] * tiles[1],
-        points.tiles,
-        points.coordinates,
-        float(view.options.depth_valid_transmittance),
-        found,
-        slopes,
-        stops,
-    )
+        "solve_points", -(-count // WARPS), count, view.screen.params, lists.start,
+        lists.gaussian_ids, tiles[0] * tiles[1], points.tiles, points.coordinates,
+        float(view.options.depth_valid_transmittance), found, slopes, stops,
+    )  # fmt: skip
     values = torch.empty_like(found)
     values[points.order] = found
     return DeviceQueryResult(values, points, lists, found, slopes, stops)
@@ -182,44 +165,21 @@ def add_query_gradients(
     tiles_x, tiles_y = _tile_counts(view.camera)
     rows = params.new_empty((len(lists.gaussian_ids), ROW_VALUES))
     view.kernels.launch(
-        "query_gradients",
-        tiles_x * tiles_y,
-        params,
-        lists.start,
-        lists.gaussian_ids,
-        lists.intersection_slots,
-        points.start,
-        points.coordinates,
-        result.found,
-        weights,
-        result.stops,
-        rows,
-    )
+        "query_gradients", tiles_x * tiles_y, params, lists.start, lists.gaussian_ids,
+        lists.intersection_slots, points.start, points.coordinates, result.found, weights,
+        result.stops, rows,
+    )  # fmt: skip
     view.kernels.launch(
-        "sum_pairs",
-        -(-len(params) // WARPS),
-        len(params),
-        rows,
-        lists.intersection_offsets,
+        "sum_pairs", -(-len(params) // WARPS), len(params), rows, lists.intersection_offsets,
         grad_params,
-    )
+    )  # fmt: skip
     count = len(weights)
     by_coordinates = params.new_empty((count, 2))
     view.kernels.launch(
-        "position_gradients",
-        -(-count // WARPS),
-        count,
-        params,
-        lists.start,
-        lists.gaussian_ids,
-        tiles_x * tiles_y,
-        points.tiles,
-        points.coordinates,
-        result.found,
-        weights,
-        result.stops,
+        "position_gradients", -(-count // WARPS), count, params, lists.start, lists.gaussian_ids,
+        tiles_x * tiles_y, points.tiles, points.coordinates, result.found, weights, result.stops,
         by_coordinates,
-    )
+    )  # fmt: skip
     grad_positions = torch.empty_like(by_coordinates)
     grad_positions[points.order] = by_coordinates
     return grad_positions
@@ -250,15 +210,9 @@ def project_query_gradients(
     gaussians = view.raw.gaussians
     found = {name: torch.zeros_like(getattr(gaussians, name)) for name in _TRAINED}
     view.kernels.launch_each(
-        "project_backward",
-        count,
-        *view.raw.arguments(),
-        reached,
-        grad_params,
-        *found.values(),
-        torch.zeros_like(gaussians.sh),
-        torch.zeros_like(gaussians.orientation),
-    )
+        "project_backward", count, *view.raw.arguments(), reached, grad_params, *found.values(),
+        torch.zeros_like(gaussians.sh), torch.zeros_like(gaussians.orientation),
+    )  # fmt: skip
     return found
 
 
@@ -306,17 +260,9 @@ def _list_points(view: DeviceQueryView, points: SortedPoints) -> PointLists:
         )
     unsorted = torch.empty((3, intersections), dtype=torch.int32, device=device)
     kernels.launch_each(
-        "list_areas",
-        count,
-        order,
-        rank_offsets,
-        intersection_offsets,
-        *ellipses,
-        areas,
-        tiles_x,
-        tiles_y,
-        *unsorted.unbind(),
-    )
+        "list_areas", count, order, rank_offsets, intersection_offsets, *ellipses, areas, tiles_x,
+        tiles_y, *unsorted.unbind(),
+    )  # fmt: skip
     # Short keys need half as many passes of the radix sort.
     keys = unsorted[0].to(torch.int16 if tiles < 2**15 else torch.int32)
     by_tile = torch.sort(keys, stable=True)

@@ -104,15 +104,9 @@ def project(kernels: Kernels, raw: RawTensors) -> DeviceScreen:
     count, device = len(raw.gaussians), raw.gaussians.means.device
     screen = DeviceScreen.empty(count, device)
     kernels.launch_each(
-        "project_gaussians",
-        count,
-        *raw.arguments(),
-        screen.params,
-        screen.boxes,
-        screen.visible,
-        screen.depths,
-        screen.skews,
-    )
+        "project_gaussians", count, *raw.arguments(), screen.params, screen.boxes, screen.visible,
+        screen.depths, screen.skews,
+    )  # fmt: skip
     return screen
 
 
@@ -172,17 +166,9 @@ def _count(
     count = len(screen.params)
     counts = torch.empty(count, dtype=torch.int64, device=screen.params.device)
     kernels.launch_each(
-        "count_pairs",
-        count,
-        screen.boxes,
-        screen.skews,
-        screen.visible,
-        camera.width,
-        camera.height,
-        first_row,
-        end_row,
-        counts,
-    )
+        "count_pairs", count, screen.boxes, screen.skews, screen.visible, camera.width,
+        camera.height, first_row, end_row, counts,
+    )  # fmt: skip
     return counts
 
 
@@ -201,34 +187,19 @@ def _list(
     rank_offsets = offsets(counts[order])
     unsorted = torch.empty((3, intersections), dtype=torch.int32, device=device)
     kernels.launch_each(
-        "list_pairs",
-        len(order),
-        order,
-        rank_offsets,
-        intersection_offsets,
-        screen.boxes,
-        screen.skews,
-        camera.width,
-        camera.height,
-        tiles_x,
-        first_row,
-        end_row,
-        *unsorted.unbind(),
-    )
+        "list_pairs", len(order), order, rank_offsets, intersection_offsets, screen.boxes,
+        screen.skews, camera.width, camera.height, tiles_x, first_row, end_row, *unsorted.unbind(),
+    )  # fmt: skip
     tiles = tiles_x * (end_row - first_row)
     # Short keys need half as many passes of the radix sort.
     keys = unsorted[0].to(torch.int16 if tiles < 2**15 else torch.int32)
     by_tile = torch.sort(keys, stable=True)
     edges = torch.arange(tiles + 1, dtype=keys.dtype, device=device)
     return Band(
-        first_row,
-        tiles,
-        torch.searchsorted(by_tile.values, edges),
-        unsorted[1][by_tile.indices],
-        unsorted[2][by_tile.indices],
-        intersection_offsets,
+        first_row, tiles, torch.searchsorted(by_tile.values, edges), unsorted[1][by_tile.indices],
+        unsorted[2][by_tile.indices], intersection_offsets,
         torch.zeros((intersections, WARPS), dtype=torch.int32, device=device),
-    )
+    )  # fmt: skip
 
 
 def offsets(counts: Tensor) -> Tensor:
@@ -368,48 +339,24 @@ class DeviceView:
         weighed = self.options.statistics
         weights = screen.params.new_zeros((len(band.gaussian_ids) if weighed else 0, 2))
         kernels.launch(
-            "forward_tiles_weights" if weighed else "forward_tiles",
-            band.tiles,
-            screen.params,
-            screen.boxes,
-            screen.skews,
-            band.start,
-            band.gaussian_ids,
-            band.intersection_slots,
-            *self._geometry(band),
-            *(float(value) for value in self.options.background),
-            images.color,
-            images.normal,
-            images.geometric_normal,
-            images.alpha,
-            band.masks,
-            weights,
+            "forward_tiles_weights" if weighed else "forward_tiles", band.tiles, screen.params,
+            screen.boxes, screen.skews, band.start, band.gaussian_ids, band.intersection_slots,
+            *self._geometry(band), *(float(value) for value in self.options.background),
+            images.color, images.normal, images.geometric_normal, images.alpha, band.masks, weights,
             images.strongest,
-        )
+        )  # fmt: skip
         sums.reached.logical_or_(band.intersection_offsets.diff() > 0)
         if weighed:
             kernels.launch_each(
-                "sum_weights",
-                len(screen.params),
-                weights,
-                band.intersection_offsets,
-                sums.weight_sum,
-                sums.weight_max,
-            )
+                "sum_weights", len(screen.params), weights, band.intersection_offsets,
+                sums.weight_sum, sums.weight_max,
+            )  # fmt: skip
         if self.options.depth:
             kernels.launch(
-                "isosurface_tiles",
-                band.tiles,
-                screen.params,
-                band.start,
-                band.gaussian_ids,
-                band.masks,
-                *self._geometry(band),
-                float(self.options.depth_valid_transmittance),
-                images.alpha,
-                images.depth,
-                images.slope,
-            )
+                "isosurface_tiles", band.tiles, screen.params, band.start, band.gaussian_ids,
+                band.masks, *self._geometry(band), float(self.options.depth_valid_transmittance),
+                images.alpha, images.depth, images.slope,
+            )  # fmt: skip
 
     def params_gradient(self, incoming: list[Tensor | None]) -> Tensor:
         """Return the (n, 24) gradient on the screen params.
@@ -434,31 +381,17 @@ class DeviceView:
         for band in self.band_lists:
             rows = params.new_empty((len(band.gaussian_ids), ROW_VALUES))
             kernels.launch(
-                name,
-                band.tiles,
-                params,
-                band.start,
-                band.gaussian_ids,
-                band.intersection_slots,
-                band.masks,
-                *self._geometry(band),
-                *outputs,
-                self.images.slope,
-                *given,
-                rows,
-            )
+                name, band.tiles, params, band.start, band.gaussian_ids, band.intersection_slots,
+                band.masks, *self._geometry(band), *outputs, self.images.slope, *given, rows,
+            )  # fmt: skip
             blocks = -(-len(params) // WARPS)
             kernels.launch(
                 "sum_pairs", blocks, len(params), rows, band.intersection_offsets, grad_params
             )
         kernels.launch_each(
-            "finish_params",
-            len(params),
-            int(gathers),
-            grad_params,
-            self.statistics.grad_px,
+            "finish_params", len(params), int(gathers), grad_params, self.statistics.grad_px,
             self.statistics.grad_abs_px,
-        )
+        )  # fmt: skip
         return grad_params
 
     def backward(self, incoming: list[Tensor | None]) -> dict[str, Tensor]:
@@ -478,13 +411,9 @@ class DeviceView:
         raw = self._raw
         found = {name: torch.zeros_like(getattr(raw.gaussians, name)) for name in TRAINED}
         self._kernels.launch_each(
-            "project_backward",
-            len(grad_params),
-            *raw.arguments(),
-            self.screen.visible,
-            grad_params,
-            *found.values(),
-        )
+            "project_backward", len(grad_params), *raw.arguments(), self.screen.visible,
+            grad_params, *found.values(),
+        )  # fmt: skip
         return found
 
     def _geometry(self, band: Band) -> tuple[int, int, int, int]:
