@@ -161,10 +161,8 @@ def _evaluate(typingctx, lanes, m, lists, count, factor):  # type: ignore[no-unt
         block, entries = solver.block, solver.block.data(sig.args[2], args[2])
         t = solver.read(AT_DEPTH) * block.splat(args[4])
         product, slope, curvature = (
-            State(block, solver.read(_PREFIX)),
-            State(block, 0.0),
-            State(block, 0.0),
-        )
+            State(block, solver.read(_PREFIX)), State(block, 0.0), State(block, 0.0),
+        )  # fmt: skip
 
         def multiply(n: Any) -> None:
             _, (alpha, peak, sharpness) = solver.entry(entries, n)

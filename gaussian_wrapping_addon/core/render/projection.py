@@ -124,17 +124,13 @@ def _shape_gradients(m: Any, camera: Any) -> None:
             c, m[ROTATION + lane], m[ROTATION + 3 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
         )
         b = in_camera(
-            c,
-            m[ROTATION + BLOCK + lane],
-            m[ROTATION + 4 * BLOCK + lane],
+            c, m[ROTATION + BLOCK + lane], m[ROTATION + 4 * BLOCK + lane],
             m[ROTATION + 7 * BLOCK + lane],
-        )
+        )  # fmt: skip
         d = in_camera(
-            c,
-            m[ROTATION + 2 * BLOCK + lane],
-            m[ROTATION + 5 * BLOCK + lane],
+            c, m[ROTATION + 2 * BLOCK + lane], m[ROTATION + 5 * BLOCK + lane],
             m[ROTATION + 8 * BLOCK + lane],
-        )
+        )  # fmt: skip
         var0, var1, var2 = m[SCALE + lane], m[SCALE + BLOCK + lane], m[SCALE + 2 * BLOCK + lane]
         w0, w1, w2 = 1.0 / var0, 1.0 / var1, 1.0 / var2
         others0, others1, others2 = w1 * w2, w2 * w0, w0 * w1
@@ -177,17 +173,14 @@ def _shape_gradients(m: Any, camera: Any) -> None:
         flip = 1.0 / math.sqrt(hx * hx + hy * hy + hz * hz)
         nx, ny, nz = hx * flip, hy * flip, hz * flip
         gx, gy, gz = in_camera(
-            c,
-            m[_GRAD + 19 * BLOCK + lane],
-            m[_GRAD + 20 * BLOCK + lane],
+            c, m[_GRAD + 19 * BLOCK + lane], m[_GRAD + 20 * BLOCK + lane],
             m[_GRAD + 21 * BLOCK + lane],
-        )
+        )  # fmt: skip
         along = gx * nx + gy * ny + gz * nz
         g_h = (
-            g_hx - (gx - along * nx) * flip,
-            g_hy - (gy - along * ny) * flip,
+            g_hx - (gx - along * nx) * flip, g_hy - (gy - along * ny) * flip,
             (along * nz - gz) * flip,
-        )
+        )  # fmt: skip
         g_b, g_f = (g_bxx, g_bxy, g_byy), (g_fxx, g_fxy, g_fyy)
         g_cov = 0.5 * m[_GRAD + 22 * BLOCK + lane] / math.sqrt(cov_zz)
 
@@ -237,10 +230,8 @@ def _raw_gradients(m: Any) -> None:
         inverse = 0.0 if degenerate else inverse
         w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
         g00, g11, g22 = (
-            m[ROTATION + lane],
-            m[ROTATION + 4 * BLOCK + lane],
-            m[ROTATION + 8 * BLOCK + lane],
-        )
+            m[ROTATION + lane], m[ROTATION + 4 * BLOCK + lane], m[ROTATION + 8 * BLOCK + lane],
+        )  # fmt: skip
         g01, g10 = m[ROTATION + BLOCK + lane], m[ROTATION + 3 * BLOCK + lane]
         g02, g20 = m[ROTATION + 2 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
         g12, g21 = m[ROTATION + 5 * BLOCK + lane], m[ROTATION + 7 * BLOCK + lane]
@@ -261,10 +252,8 @@ def _raw_gradients(m: Any) -> None:
         g = m[_GRAD + 11 * BLOCK + lane] * m[OPACITY + lane]
         m[_GRAD_LOGIT + lane] = g * m[TRANSPARENCY + lane]
         k0, k1, k2 = (
-            m[RAW_SHARE + lane],
-            m[RAW_SHARE + BLOCK + lane],
-            m[RAW_SHARE + 2 * BLOCK + lane],
-        )
+            m[RAW_SHARE + lane], m[RAW_SHARE + BLOCK + lane], m[RAW_SHARE + 2 * BLOCK + lane],
+        )  # fmt: skip
         m[_GRAD_SCALE + lane] = k0 * m[_GRAD_SCALE + lane] + (1.0 - k0) * g
         m[_GRAD_SCALE + BLOCK + lane] = k1 * m[_GRAD_SCALE + BLOCK + lane] + (1.0 - k1) * g
         m[_GRAD_SCALE + 2 * BLOCK + lane] = k2 * m[_GRAD_SCALE + 2 * BLOCK + lane] + (1.0 - k2) * g
@@ -497,12 +486,10 @@ class ScreenGaussians:
     def allocate(cls, count: int) -> ScreenGaussians:
         """Return arrays for ``count`` Gaussians, none visible; pass them as ``out`` to reuse."""
         return cls(
-            np.zeros((count, PARAM_COLUMNS), np.float32),
-            np.zeros((count, 4), np.float32),
-            np.zeros(count, np.bool_),
-            np.full(count, np.inf, np.float32),
+            np.zeros((count, PARAM_COLUMNS), np.float32), np.zeros((count, 4), np.float32),
+            np.zeros(count, np.bool_), np.full(count, np.inf, np.float32),
             np.zeros(count, np.float32),
-        )
+        )  # fmt: skip
 
     def arguments(self) -> tuple[np.ndarray, ...]:
         """Return the arrays in the argument order of the kernels."""

@@ -284,10 +284,8 @@ def activate_block(m: np.ndarray, camera: np.ndarray) -> None:
     for lane in range(BLOCK):
         filter_sq = m[FILTER + lane] * m[FILTER + lane]
         raw0, raw1, raw2 = (
-            m[RAW_SHARE + lane],
-            m[RAW_SHARE + BLOCK + lane],
-            m[RAW_SHARE + 2 * BLOCK + lane],
-        )
+            m[RAW_SHARE + lane], m[RAW_SHARE + BLOCK + lane], m[RAW_SHARE + 2 * BLOCK + lane],
+        )  # fmt: skip
         variance0, variance1, variance2 = raw0 + filter_sq, raw1 + filter_sq, raw2 + filter_sq
         m[SCALE + lane] = variance0
         m[SCALE + BLOCK + lane] = variance1
@@ -389,10 +387,9 @@ def load_camera_axes(camera: Any) -> Any:
 def in_camera(c: Any, a: Any, b: Any, d: Any) -> Any:
     """Return the vector (a, b, d) rotated by ``c``."""
     return (
-        c[0] * a + c[1] * b + c[2] * d,
-        c[3] * a + c[4] * b + c[5] * d,
+        c[0] * a + c[1] * b + c[2] * d, c[3] * a + c[4] * b + c[5] * d,
         c[6] * a + c[7] * b + c[8] * d,
-    )
+    )  # fmt: skip
 
 
 @inline
@@ -422,17 +419,13 @@ def _project_shapes(m: Any, camera: Any) -> None:
             c, m[ROTATION + lane], m[ROTATION + 3 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
         )
         r01, r11, r21 = in_camera(
-            c,
-            m[ROTATION + BLOCK + lane],
-            m[ROTATION + 4 * BLOCK + lane],
+            c, m[ROTATION + BLOCK + lane], m[ROTATION + 4 * BLOCK + lane],
             m[ROTATION + 7 * BLOCK + lane],
-        )
+        )  # fmt: skip
         r02, r12, r22 = in_camera(
-            c,
-            m[ROTATION + 2 * BLOCK + lane],
-            m[ROTATION + 5 * BLOCK + lane],
+            c, m[ROTATION + 2 * BLOCK + lane], m[ROTATION + 5 * BLOCK + lane],
             m[ROTATION + 8 * BLOCK + lane],
-        )
+        )  # fmt: skip
         var0, var1, var2 = m[SCALE + lane], m[SCALE + BLOCK + lane], m[SCALE + 2 * BLOCK + lane]
         w0, w1, w2 = 1.0 / var0, 1.0 / var1, 1.0 / var2
         others0, others1, others2 = w1 * w2, w2 * w0, w0 * w1

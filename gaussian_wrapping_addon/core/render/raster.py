@@ -487,14 +487,12 @@ class Images:
         three = (*one, 3)
         no_image = (0, 0)
         images = cls(
-            color=take("color", three, np.float32),
-            normal=take("normal", three, np.float32),
-            geometric=take("geometric", three, np.float32),
-            alpha=take("alpha", one, np.float32),
+            color=take("color", three, np.float32), normal=take("normal", three, np.float32),
+            geometric=take("geometric", three, np.float32), alpha=take("alpha", one, np.float32),
             depth=take("depth", one, np.float32),
             slope=take("slope", one if options.depth else no_image, np.float32),
             strongest=take("strongest", one if options.statistics else no_image, np.int32),
-        )
+        )  # fmt: skip
         if not options.depth:
             images.depth.fill(0.0)
         return images

@@ -251,12 +251,9 @@ def render_reference(
     ]
     image = torch.cat(chunks).reshape(camera.height, camera.width, 11)
     return Render(
-        color=image[..., 0:3],
-        normal=image[..., 3:6],
-        geometric_normal=image[..., 6:9],
-        alpha=image[..., 9],
-        depth=image[..., 10],
-    )
+        color=image[..., 0:3], normal=image[..., 3:6], geometric_normal=image[..., 6:9],
+        alpha=image[..., 9], depth=image[..., 10],
+    )  # fmt: skip
 
 
 def _render_rows(

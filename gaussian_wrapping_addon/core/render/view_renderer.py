@@ -50,11 +50,9 @@ def allocate_screen(count: int, store: ArrayStore) -> ScreenGaussians:
     """Return uninitialised arrays for the projection of ``count`` Gaussians."""
     return ScreenGaussians(
         store.take("params", (count, ROW_VALUES), np.float32),
-        store.take("boxes", (count, 4), np.float32),
-        store.take("in image", count, np.bool_),
-        store.take("depths", count, np.float32),
-        store.take("skews", count, np.float32),
-    )
+        store.take("boxes", (count, 4), np.float32), store.take("in image", count, np.bool_),
+        store.take("depths", count, np.float32), store.take("skews", count, np.float32),
+    )  # fmt: skip
 
 
 def band_view(
@@ -251,20 +249,13 @@ class ViewPass:
             view = self._view(band)
             lists = view.lists
             intersections = store.take(
-                "intersections",
-                (len(lists.gaussian_ids), ROW_VALUES),
-                np.float32,
+                "intersections", (len(lists.gaussian_ids), ROW_VALUES), np.float32,
                 self._max_intersections,
-            )
+            )  # fmt: skip
             write_intersection_gradients(
-                view,
-                self._images,
-                incoming,
-                self._renderer.buffers,
-                intersections,
-                depth=depth,
+                view, self._images, incoming, self._renderer.buffers, intersections, depth=depth,
                 absolute=absolute,
-            )
+            )  # fmt: skip
             self._add_intersections(lists, intersections, grad_params, band == self._bands[-1])
         if self.statistics is not None:
             self._write_screen_gradients(self.statistics, grad_params)

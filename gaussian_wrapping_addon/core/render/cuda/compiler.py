@@ -59,12 +59,9 @@ class DriverModule:
             for name in names:
                 function = ctypes.c_void_p()
                 _check_driver(
-                    self._cuda,
-                    "cuModuleGetFunction",
-                    ctypes.byref(function),
-                    module,
+                    self._cuda, "cuModuleGetFunction", ctypes.byref(function), module,
                     name.encode(),
-                )
+                )  # fmt: skip
                 self._functions[name] = function
         finally:
             self._leave()

@@ -233,11 +233,9 @@ def _sort_points(positions: Tensor, camera: Camera) -> SortedPoints:
     by_tile = torch.sort(keys, stable=True)
     edges = torch.arange(tiles_x * tiles_y + 1, dtype=torch.int32, device=positions.device)
     return SortedPoints(
-        positions[by_tile.indices],
-        by_tile.indices,
-        by_tile.values,
+        positions[by_tile.indices], by_tile.indices, by_tile.values,
         torch.searchsorted(by_tile.values, edges),
-    )
+    )  # fmt: skip
 
 
 def _list_points(view: DeviceQueryView, points: SortedPoints) -> PointLists:
@@ -268,8 +266,6 @@ def _list_points(view: DeviceQueryView, points: SortedPoints) -> PointLists:
     by_tile = torch.sort(keys, stable=True)
     edges = torch.arange(tiles + 1, dtype=keys.dtype, device=device)
     return PointLists(
-        torch.searchsorted(by_tile.values, edges),
-        unsorted[1][by_tile.indices],
-        unsorted[2][by_tile.indices],
-        intersection_offsets,
-    )
+        torch.searchsorted(by_tile.values, edges), unsorted[1][by_tile.indices],
+        unsorted[2][by_tile.indices], intersection_offsets,
+    )  # fmt: skip

@@ -137,13 +137,10 @@ def empty_statistics(count: int, options: RenderOptions) -> RenderStatistics:
     """Return statistics of zeros for ``count`` Gaussians."""
     weighed = count if options.statistics else 0
     return RenderStatistics(
-        visible=np.zeros(count, np.bool_),
-        radii_px=np.zeros(count, np.float32),
-        weight_sum=np.zeros(weighed, np.float32),
-        weight_max=np.zeros(weighed, np.float32),
-        grad_px=np.zeros(count, np.float32),
-        grad_abs_px=np.zeros(count, np.float32),
-    )
+        visible=np.zeros(count, np.bool_), radii_px=np.zeros(count, np.float32),
+        weight_sum=np.zeros(weighed, np.float32), weight_max=np.zeros(weighed, np.float32),
+        grad_px=np.zeros(count, np.float32), grad_abs_px=np.zeros(count, np.float32),
+    )  # fmt: skip
 
 
 def fill_statistics(statistics: RenderStatistics, view: DeviceView) -> None:

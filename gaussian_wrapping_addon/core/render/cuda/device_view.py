@@ -44,12 +44,10 @@ class DeviceScreen:
     def empty(cls, count: int, device: torch.device) -> DeviceScreen:
         """Return a screen for a kernel to fill."""
         return cls(
-            torch.empty((count, ROW_VALUES), device=device),
-            torch.empty((count, 4), device=device),
-            torch.empty(count, dtype=torch.bool, device=device),
+            torch.empty((count, ROW_VALUES), device=device), torch.empty((count, 4), device=device),
+            torch.empty(count, dtype=torch.bool, device=device), torch.empty(count, device=device),
             torch.empty(count, device=device),
-            torch.empty(count, device=device),
-        )
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -86,17 +84,9 @@ class RawTensors:
         """Return the arguments that projection forward and backward share."""
         g = self.gaussians
         return (
-            g.means,
-            g.log_scales,
-            g.quats,
-            g.opacity_logits,
-            g.sh,
-            int(g.sh.shape[1]),
-            self.degree,
-            g.orientation,
-            g.filter_3d,
-            self.camera,
-        )
+            g.means, g.log_scales, g.quats, g.opacity_logits, g.sh, int(g.sh.shape[1]), self.degree,
+            g.orientation, g.filter_3d, self.camera,
+        )  # fmt: skip
 
 
 def project(kernels: Kernels, raw: RawTensors) -> DeviceScreen:
@@ -232,14 +222,12 @@ class DeviceImages:
         """Return images for the kernels to fill; depth is 0 unless it is solved."""
         shape = (camera.height, camera.width)
         return cls(
-            torch.empty((*shape, 3), device=device),
-            torch.empty((*shape, 3), device=device),
-            torch.empty((*shape, 3), device=device),
-            torch.empty(shape, device=device),
+            torch.empty((*shape, 3), device=device), torch.empty((*shape, 3), device=device),
+            torch.empty((*shape, 3), device=device), torch.empty(shape, device=device),
             torch.zeros(shape, device=device),
             torch.empty(shape if options.depth else (0,), device=device),
             torch.empty(shape if options.statistics else (0,), dtype=torch.int32, device=device),
-        )
+        )  # fmt: skip
 
 
 @dataclass
@@ -262,11 +250,9 @@ class DeviceStatistics:
         gathered = count if options.gathers_statistics else 0
         return cls(
             torch.zeros(count, dtype=torch.bool, device=device),
-            torch.zeros(weighed, device=device),
-            torch.zeros(weighed, device=device),
-            torch.zeros(gathered, device=device),
-            torch.zeros(gathered, device=device),
-        )
+            torch.zeros(weighed, device=device), torch.zeros(weighed, device=device),
+            torch.zeros(gathered, device=device), torch.zeros(gathered, device=device),
+        )  # fmt: skip
 
 
 class DeviceView:
