@@ -367,17 +367,9 @@ _NO_PIXELS = np.uint64(0)
 def solve_block(lanes: Any, m: Any, b: Any, lists: Any, count: Any) -> None:
     """Solve one block: z-depth (0 where there is none) and floored slope of its pixels.
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    m : (n,) float32
-        The tile's scratch, with brackets and initial guesses from blending; depth and slope are
-        written.
-    b : int
-        Start of the block in each plane.
-    lists : (n,) float32
-        Entries of the block, ``count`` of them; none if no pixel has an isosurface. Reordered.
+    The tile's scratch ``m`` holds brackets and initial guesses from blending, and receives both
+    from ``b`` on, the start of the block in each plane. ``lists`` has ``count`` entries, none if no
+    pixel has an isosurface; they are reordered.
     """
     is_open = _NO_PIXELS
     if count > 0:

@@ -61,19 +61,8 @@ def fine_scale(camera: Camera) -> int:
 def project_finely(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> ScreenGaussians:
     """Project onto a screen finer by a power of two, and scale the rows back to pixels.
 
-    Parameters
-    ----------
-    gaussians : RawArrays
-        Scene frame.
-    camera : Camera
-        In the scene frame.
-    options : RenderOptions
-        As for :func:`~.projection.project_gaussians`.
-
-    Returns
-    -------
-    ScreenGaussians
-        In pixels of ``camera``; Gaussians that rendering hides at that size are hidden.
+    Arguments as for :func:`~.projection.project_gaussians`. The result is in pixels of ``camera``;
+    Gaussians that rendering hides at that size are hidden.
     """
     threads = options.threads or default_threads()
     scale = fine_scale(camera)
@@ -255,23 +244,10 @@ def fill_cell(
 ) -> int:  # fmt: skip
     """Store the Gaussians of a tile that reach one of its cells; return their number.
 
-    Parameters
-    ----------
-    columns : int
-        Columns of ``spans``.
-    part : int
-        Index of the cell within its tile.
-    count : int
-        Gaussians of the tile.
-    tile_spans : (t, 22 * 32) float32
-        From :func:`fill_tile`.
-    spans : (s, columns * 32) float32
-        The last span is padded with Gaussians of opacity 0.
-    nearest_depths : (s + 1,) float32
-        Receives the z-depth in front of which every Gaussian of this span and later ones has
-        negligible density.
-    members : (g,) int64
-        Receives the index of each Gaussian in the tile's list.
+    ``part`` is the cell within its tile, whose ``count`` Gaussians :func:`fill_tile` wrote to
+    ``tile_spans``. ``spans (s, columns * 32)`` is padded with Gaussians of opacity 0;
+    ``nearest_depths (s + 1,)`` receives the z-depth in front of which every Gaussian of a span and
+    later ones has negligible density, ``members`` each Gaussian's index in the tile's list.
     """
     cell_px = TILE >> shift
     margin = np.float32(PIXEL_MARGIN)

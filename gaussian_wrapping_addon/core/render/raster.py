@@ -110,16 +110,10 @@ def _write_intersection(
 
 @functools.cache
 def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
-    """Return the gradient kernel for blocks of ``lanes`` pixels, compiled on first call.
+    """Return the gradient kernel for blocks of 8 or 16 pixels, compiled on first call.
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    depth : bool
-        Include the gradient of the depth image.
-    absolute : bool
-        Also sum the absolute gradients on (u, v) per pixel (AbsGS).
+    ``depth`` includes the gradient of the depth image; ``absolute`` also sums the absolute
+    gradients on (u, v) per pixel (AbsGS).
     """
     block_height = lanes // BLOCK_WIDTH
 
@@ -265,16 +259,10 @@ FORWARD_SCRATCH = FORWARD_PLANES * STRIDE + SOLVER_VALUES
 
 @functools.cache
 def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
-    """Return the blending kernel for blocks of ``lanes`` pixels, compiled on first call.
+    """Return the blending kernel for blocks of 8 or 16 pixels, compiled on first call.
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    depth : bool
-        Also solve the isosurface.
-    weights : bool
-        Also collect the blending weights per intersection and the strongest Gaussian per pixel.
+    ``depth`` also solves the isosurface; ``weights`` also collects the blending weights per
+    intersection and the strongest Gaussian per pixel.
     """
     blocks = PLANE // lanes
     block_height = lanes // BLOCK_WIDTH
@@ -483,9 +471,8 @@ class Images:
             def take(name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
                 return np.zeros(shape, dtype)
 
-        one = (camera.height, camera.width)
+        one, no_image = (camera.height, camera.width), (0, 0)
         three = (*one, 3)
-        no_image = (0, 0)
         images = cls(
             color=take("color", three, np.float32), normal=take("normal", three, np.float32),
             geometric=take("geometric", three, np.float32), alpha=take("alpha", one, np.float32),
@@ -510,16 +497,8 @@ def blend(
 ) -> np.ndarray:
     """Blend the tiles of a view into ``images`` and solve the isosurface depth.
 
-    Parameters
-    ----------
-    intersection_weights : (intersections, 2) float32, optional
-        Receives the weights; by default a new array.
-
-    Returns
-    -------
-    (intersections, 2) float32
-        Sum and maximum of the blending weight of each intersection, by slot; (0, 2) without
-        statistics.
+    Returns (intersections, 2) float32, ``intersection_weights`` or a new array: sum and maximum of
+    the blending weight of each intersection, by slot; (0, 2) without statistics.
     """
     options, lists = view.options, view.lists
     depth, weights = options.depth, options.statistics

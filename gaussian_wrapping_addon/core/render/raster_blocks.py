@@ -129,24 +129,11 @@ def blend_block(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Blend ``contributors[first .. first + count]`` into a block; return its list's length.
 
-    Parameters
-    ----------
-    lanes, depth, weights : literal
-        Pixels per block; write the list and initialise the solver; collect blending weights.
-    m : (n,) float32
-        The tile's scratch.
-    number : int
-        The block.
-    begin : int
-        First intersection of the tile; indices of the strongest Gaussians are relative to it.
-    x, y : float32
-        Centre of the tile's first pixel, pixels.
-    lists : (n,) float32
-        Receives the entries.
-    nearest_depths : (n,) float32
-        For each intersection of the tile, the nearest z-depth that it or a later one reaches.
-    limit : float32
-        Largest final transmittance of a pixel that has a depth.
+    ``lanes``, ``depth`` (write the entries to ``lists`` and initialise the solver) and ``weights``
+    (collect blending weights) are literals. ``m`` is the tile's scratch, ``begin`` its first
+    intersection, to which indices of the strongest Gaussians are relative, and ``x, y`` the centre
+    of its first pixel. ``nearest_depths`` holds, for each of its intersections, the nearest z-depth
+    that it or a later one reaches; ``limit`` is the largest final transmittance with a depth.
     """
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]

@@ -87,17 +87,9 @@ def list_contributors(
 ) -> None:
     """List, for each block, which intersections ``begin .. begin + count`` of a tile reach it.
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    masks : (intersections,) uint32
-    capacity : int
-        Values of ``contributors`` per block, at least ``count + CONTRIBUTORS_PADDING``.
-    contributors : (blocks * capacity,) int32
-        Receives the intersections of block b, increasing, from ``b * capacity`` on.
-    counts : (blocks,) int64
-        Receives the length of each list.
+    ``contributors (blocks * capacity,) int32`` receives those of block b, increasing, from
+    ``b * capacity`` on, and ``counts (blocks,) int64`` their number. The capacity is at least
+    ``count + CONTRIBUTORS_PADDING``.
     """
     blocks = PLANE // lanes
     if lanes == TILE:
@@ -361,23 +353,9 @@ def write_row(
 ) -> None:
     """Write one row of a tile's forward planes to the images.
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    depth : bool
-        Include depth and slope.
-    m : (n,) float32
-        The tile's scratch.
-    offset : int
-        Start of the row in each plane.
-    live : int
-        Columns of the tile in the image.
-    background : (3,) float32
-    images : tuple
-        Colour, normal, geometric normal, alpha, depth, slope; C-contiguous.
-    at : int
-        Index of the row's first pixel in an image.
+    The row starts at ``offset`` in each plane of the scratch ``m`` and at pixel ``at`` of the
+    images (colour, normal, geometric normal, alpha, and with ``depth`` also depth and slope), which
+    are C-contiguous; ``live`` columns of the tile lie in them.
     """
     if live == TILE:
         _write(lanes, depth, True, m, offset, live, background, images, at)

@@ -73,18 +73,9 @@ class DeviceQueryResult:
 def query_view(
     kernels: Kernels, gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
 ) -> DeviceQueryView:
-    """Project Gaussians for queries only, including those between pixel centres.
+    """Project float32 Gaussians for queries only, including those between pixel centres.
 
-    Parameters
-    ----------
-    kernels : Kernels
-        Of the tensors' device.
-    gaussians : OrientedGaussians
-        Scene frame, float32.
-    camera : Camera
-        In the scene frame.
-    options : RenderOptions
-        ``near_z`` and ``depth_valid_transmittance`` are used.
+    Of the options ``near_z`` and ``depth_valid_transmittance`` are used.
     """
     raw = RawTensors.of(gaussians.replaced(sh=gaussians.sh[:, :1]), camera, options)
     count, device = len(gaussians), gaussians.means.device
@@ -99,23 +90,9 @@ def query_view(
 def solve_depths(view: DeviceQueryView, positions: Tensor) -> DeviceQueryResult:
     """Solve the depth of the 0.5-isosurface at positions of a view.
 
-    Parameters
-    ----------
-    view : DeviceQueryView
-    positions : (m, 2) float32
-        Pixels, on the view's device.
-
-    Returns
-    -------
-    DeviceQueryResult
-        z-depths; 0 where there is none, outside ``[0, width] x [0, height]`` and for NaN.
-
-    Raises
-    ------
-    UsageError
-        If the positions are not (m, 2).
-    ResourceError
-        If the tile lists are too long to be indexed.
+    ``positions (m, 2)`` are pixels, on the view's device; UsageError if their shape differs,
+    ResourceError if the tile lists are too long to be indexed. The result is 0 where there is no
+    depth, outside ``[0, width] x [0, height]`` and for NaN.
     """
     if positions.dim() != 2 or positions.shape[1] != 2:
         raise UsageError(
@@ -142,22 +119,9 @@ def add_query_gradients(
 ) -> Tensor:
     """Add the gradient of ``sum grads * values`` to that on the view's ``screen.params``.
 
-    Bitwise reproducible on the same GPU.
-
-    Parameters
-    ----------
-    view : DeviceQueryView
-        The view of the query.
-    result : DeviceQueryResult
-    grads : (m,) floats
-        On ``result.values``; ignored for positions without a result.
-    grad_params : (n, 24) float32
-        Accumulated into; columns from 13 on are unchanged.
-
-    Returns
-    -------
-    (m, 2) float32
-        The gradient on the positions.
+    Bitwise reproducible on the same GPU. ``grads (m,)`` are ignored for positions without a result;
+    columns of ``grad_params (n, 24) float32`` from 13 on are unchanged. Returns the (m, 2) float32
+    gradient on the positions.
     """
     points, lists, params = result.points, result.lists, view.screen.params
     incoming = grads[points.order].float() / result.slopes
@@ -190,18 +154,9 @@ def project_query_gradients(
 ) -> dict[str, Tensor]:
     """Return the gradients on the raw parameters from those on the view's ``screen.params``.
 
-    Parameters
-    ----------
-    view : DeviceQueryView
-    result : DeviceQueryResult
-        The only query whose gradients ``grad_params`` holds.
-    grad_params : (n, 24) float32
-        Rows that are not finite are set to 0.
-
-    Returns
-    -------
-    dict
-        Tensors (n, ...) of means, log_scales, quats and opacity_logits; 0 where not reached.
+    ``grad_params (n, 24) float32`` holds the gradients of this one query; rows that are not finite
+    are set to 0. Returns tensors (n, ...) of means, log_scales, quats and opacity_logits, 0 where
+    not reached.
     """
     count = len(grad_params)
     nothing = grad_params.new_empty(0)

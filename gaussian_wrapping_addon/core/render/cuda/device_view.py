@@ -105,16 +105,8 @@ def bin_bands(
 ) -> Iterator[Band]:
     """Yield the tile lists of a view in bands of tile rows, as few as the budget allows.
 
-    Parameters
-    ----------
-    budget_bytes : int
-        Half of it is for what all bands keep for the backward pass, half for the gradient rows of
-        one band at a time.
-
-    Raises
-    ------
-    ResourceError
-        If one tile row, or all lists together, exceed it.
+    Half of it is for what all bands keep for the backward pass, half for the gradient rows of one
+    band at a time. Raises ResourceError if one tile row, or all lists together, exceed it.
     """
     tile = limits.TILE_PX
     tiles_x, tiles_y = -(-camera.width // tile), -(-camera.height // tile)
@@ -347,11 +339,7 @@ class DeviceView:
     def params_gradient(self, incoming: list[Tensor | None]) -> Tensor:
         """Return the (n, 24) gradient on the screen params.
 
-        Parameters
-        ----------
-        incoming : list of tensors
-            Contiguous gradients on the five images in the order of :data:`IMAGES`; ``None`` for
-            zeros.
+        ``incoming`` are contiguous gradients on the images of :data:`IMAGES`; ``None`` for zeros.
         """
         outputs = [getattr(self.images, name) for name in IMAGES]
         with_depth = self.options.depth and incoming[4] is not None
@@ -383,17 +371,12 @@ class DeviceView:
     def backward(self, incoming: list[Tensor | None]) -> dict[str, Tensor]:
         """Return the gradients of the trained tensors, rows of 0 for Gaussians not seen.
 
-        Parameters
-        ----------
-        incoming : list of tensors
-            As for :meth:`params_gradient`.
+        ``incoming`` as for :meth:`params_gradient`.
         """
         with translated_out_of_memory(self.camera):
-            grad_params = self.params_gradient(incoming)
-            return self.gaussian_gradients(grad_params)
+            return self._gaussian_gradients(self.params_gradient(incoming))
 
-    def gaussian_gradients(self, grad_params: Tensor) -> dict[str, Tensor]:
-        """Return the gradients of the trained tensors from those of the screen params (n, 24)."""
+    def _gaussian_gradients(self, grad_params: Tensor) -> dict[str, Tensor]:
         raw = self._raw
         found = {name: torch.zeros_like(getattr(raw.gaussians, name)) for name in TRAINED}
         self._kernels.launch_each(
