@@ -94,17 +94,9 @@ class CameraBins:
 def region_window(
     camera: Camera, bounds: np.ndarray, near_z: float
 ) -> tuple[float, float, float, float, float] | None:
-    """Bound the image area and depth in which a box can be visible.
+    """Bound the image area and depth in which a box, its (2, 3) corners given, can be visible.
 
-    Parameters
-    ----------
-    bounds : (2, 3) float64
-        Lowest and highest corner, scene frame.
-
-    Returns
-    -------
-    tuple or None
-        x0, y0, x1, y1 in pixels and the largest z-depth; ``None`` if the camera cannot see it.
+    Returns x0, y0, x1, y1 in pixels and the largest z-depth; ``None`` if the camera cannot see it.
     """
     corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), -1).reshape(-1, 3)  # (8, 3)
     pixels, depth = camera.project(corners)
@@ -124,17 +116,9 @@ def region_window(
 def footprint_bounds(boxes: np.ndarray, skews: np.ndarray) -> np.ndarray:
     """Bound elliptic footprints by their box and by the narrowest strip that contains them.
 
-    Parameters
-    ----------
-    boxes : (n, 4) float32
-        x0 y0 x1 y1, pixels.
-    skews : (n,) float32
-        x offset from the centre to the ellipse's point of largest y; inf where unbounded.
-
-    Returns
-    -------
-    (n, 8) float32
-        See ``vacancy_kernels.BOUND_COLUMNS``. A strip of infinite width is no constraint.
+    ``boxes (n, 4)`` are x0 y0 x1 y1 in pixels; ``skews (n,)`` the x offset from the centre to the
+    ellipse's point of largest y, inf where unbounded. Returns the (n, 8) float32 columns of
+    ``vacancy_kernels.BOUND_COLUMNS``. A strip of infinite width is no constraint.
     """
     wide = boxes.astype(np.float64)
     middle = 0.5 * (wide[:, :2] + wide[:, 2:])  # (n, 2)
@@ -165,10 +149,7 @@ def bin_camera(
 ) -> CameraBins | None:
     """Project, pack and bin the Gaussians for a camera; ``None`` if it cannot see the region.
 
-    Raises
-    ------
-    ResourceError
-        The tile lists are too long.
+    Raises ResourceError if the tile lists are too long.
     """
     camera = virtual.camera
     window = None if bounds is None else region_window(camera, bounds, near_z)
@@ -269,10 +250,8 @@ def checked_masks(
 ) -> tuple[PackedMask | None, ...]:
     """Validate and pack masks: one or ``None`` per camera, ``None`` also where nothing is masked.
 
-    Raises
-    ------
-    UsageError
-        The numbers of masks and cameras differ, a mask is not an image, or the mode is unknown.
+    Raises UsageError if the numbers of masks and cameras differ, a mask is not an image, or the
+    mode is unknown.
     """
     if mode not in ("ignore", "background"):
         raise UsageError(f"The mask mode is {mode!r}.", 'Use "ignore" or "background".')
@@ -459,15 +438,11 @@ class VacancyField:
         *,
         level: float = limits.ISO_LEVEL,
     ) -> np.ndarray:
-        """Tell whether vacancy exceeds ``level``, without finding its value.
+        """Tell whether vacancy exceeds ``level`` at (n, 3) points, without finding its value.
 
         Equal to ``vacancy(points).vacancy > level`` for levels from 1e-4 to 0.999, but a point is
         finished at the first camera that finds it empty, and the evaluation from a camera stops as
         soon as the point cannot be empty for it.
-
-        Returns
-        -------
-        (n,) bool
         """
         points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
         level32 = np.float32(level)

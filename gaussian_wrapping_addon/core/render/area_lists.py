@@ -61,17 +61,8 @@ class SortedPositions:
 def list_areas(screen: ScreenGaussians, width: int, height: int, threads: int) -> AreaLists:
     """List, for each tile, the visible Gaussians that reach its area.
 
-    Parameters
-    ----------
-    screen : ScreenGaussians
-        Boxes in pixels of an image of ``width`` x ``height``.
-    threads : int
-        Does not affect the result.
-
-    Raises
-    ------
-    ResourceError
-        If the lists would hold more than 2^31 - 1 intersections.
+    The boxes are in pixels of an image of ``width`` x ``height``. Raises ResourceError if the lists
+    would hold more than 2^31 - 1 intersections.
     """
     count = len(screen)
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
@@ -114,12 +105,9 @@ def list_areas(screen: ScreenGaussians, width: int, height: int, threads: int) -
 
 
 def sort_positions(positions: np.ndarray, width: int, height: int) -> SortedPositions:
-    """Sort positions by cell, stable within a cell; drop those outside the image.
+    """Sort (m, 2) positions by cell, stable within a cell; drop those outside the image.
 
-    Parameters
-    ----------
-    positions : (m, 2) array
-        Pixels. The image is ``0 <= x <= width``, ``0 <= y <= height``; NaN counts as outside.
+    In pixels; the image is ``0 <= x <= width``, ``0 <= y <= height``, and NaN counts as outside.
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     shift = 0

@@ -510,10 +510,7 @@ def pack_camera(camera: Camera, near_z: float) -> np.ndarray:
 def used_degree(coefficients: int, options: RenderOptions) -> int:
     """Return the degree of the harmonics that a rendering uses.
 
-    Raises
-    ------
-    UsageError
-        If ``coefficients`` is not 1, 4, 9 or 16.
+    Raises UsageError if ``coefficients`` is not 1, 4, 9 or 16.
     """
     stored = round(coefficients**0.5) - 1
     if (stored + 1) ** 2 != coefficients or not 0 <= stored <= MAX_DEGREE:
@@ -531,22 +528,12 @@ def project_gaussians(
 ) -> ScreenGaussians:
     """Activate and project raw Gaussians, in float64 (docs/method.md, sections 1.5 and 2.3).
 
-    Parameters
-    ----------
-    gaussians : RawArrays
-        Scene frame, scene units.
-    camera : Camera
-        In the scene frame.
-    options : RenderOptions
-        ``near_z``, ``sh_degree`` and ``threads`` are used.
-    out : ScreenGaussians, optional
-        Output arrays of the same length; then only a few kilobytes are allocated.
+    Gaussians and camera are in the scene frame; of the options ``near_z``, ``sh_degree`` and
+    ``threads`` are used. With ``out``, arrays of the same length, only a few kilobytes are
+    allocated.
 
-    Returns
-    -------
-    ScreenGaussians
-        Not visible are Gaussians nearer than ``near_z``, fainter than 1/255, outside the image,
-        between pixel centres, or with non-finite values.
+    Not visible are Gaussians nearer than ``near_z``, fainter than 1/255, outside the image, between
+    pixel centres, or with non-finite values.
     """
     count = len(gaussians)
     screen = ScreenGaussians.allocate(count) if out is None else out
@@ -598,17 +585,10 @@ def project_backward(
 ) -> None:
     """Add the gradient with respect to the raw parameters to ``grads_out``; computed in float64.
 
-    Parameters
-    ----------
-    gaussians, camera, options
-        Arguments of :func:`project_gaussians`.
-    screen : ScreenGaussians
-        Its unmodified result; only rows of visible Gaussians are read. A colour of 0 there was
-        clamped and has no gradient.
-    grad_params : (n, 24) float32 or float64
-        Gradient with respect to ``screen.params``. Column 23 is ignored.
-    grads_out : RawGradients
-        Accumulated into. A direction of length 0 and a degenerate quaternion have gradient 0.
+    ``screen`` is the unmodified result of :func:`project_gaussians`, of which only rows of visible
+    Gaussians are read: a colour of 0 there was clamped and has no gradient. ``grad_params (n, 24)``
+    float32 or float64 is the gradient on its params, whose column 23 is ignored. A direction of
+    length 0 and a degenerate quaternion have gradient 0.
     """
     _backward(gaussians, camera, options, screen, grad_params, None, grads_out)
 
@@ -624,19 +604,10 @@ def project_backward_visible(
 ) -> VisibleGradients:
     """Return the gradient with respect to the raw parameters of some Gaussians, one row each.
 
-    Parameters
-    ----------
-    gaussians, camera, options
-        Arguments of :func:`project_gaussians`.
-    screen : ScreenGaussians
-        Its unmodified result.
-    grad_params : (n, 24) float32 or float64
-        Gradient with respect to ``screen.params``; only the rows ``ids`` are read.
-    ids : (v,) int32
-        Indices of Gaussians, increasing. Those that are not visible get rows of 0, as do
-        coefficients above the degree used.
-    take : callable, optional
-        ``take(name, shape, dtype)`` returns the arrays to write; by default new ones.
+    Arguments as for :func:`project_backward`, of whose ``grad_params`` only the rows
+    ``ids (v,) int32``, increasing, are read. Those that are not visible get rows of 0, as do
+    coefficients above the degree used. ``take(name, shape, dtype)`` returns the arrays to write; by
+    default new ones.
     """
     rows = [
         np.empty(shape, np.float32) if take is None else take(f"grad {name}", shape, np.float32)

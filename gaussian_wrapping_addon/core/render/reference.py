@@ -149,17 +149,9 @@ def _colors(gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
 def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
     """Evaluate real spherical harmonics by recurrence on associated Legendre functions.
 
-    Written unlike the closed forms of the kernels on purpose, so that one checks the other.
-
-    Parameters
-    ----------
-    directions : (n, 3) unit vectors
-    degree : int, 0 to 3
-
-    Returns
-    -------
-    (n, (degree + 1)^2)
-        Order ``m = -l .. l`` within each band, Condon-Shortley phase.
+    Written unlike the closed forms of the kernels on purpose, so that one checks the other. For (n,
+    3) unit vectors and a degree of 0 to 3 it returns (n, (degree + 1)^2) values, of order
+    ``m = -l .. l`` within each band, with the Condon-Shortley phase.
     """
     x, y, z = directions.unbind(1)
     cosines, sines = [torch.ones_like(x)], [torch.zeros_like(x)]  # Re, Im of (x + i y)^m
@@ -223,19 +215,8 @@ def render_reference(
     where the final transmittance exceeds ``options.depth_valid_transmittance`` or where less than
     half of the light reaches t = 0. Its gradient is that of the implicit function.
 
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Scene frame; the images have their float type.
-    camera : Camera
-        In the scene frame.
-    options : RenderOptions
-        ``threads`` is ignored.
-
-    Raises
-    ------
-    UsageError
-        If statistics are requested; only the fast renderer collects them.
+    The images have the float type of the Gaussians. Raises UsageError if statistics are requested:
+    only the fast renderer collects them.
     """
     if options.statistics:
         raise UsageError("The reference renderer collects no statistics.", "Use render() for them.")

@@ -36,24 +36,11 @@ def render(
 ) -> Render:
     """Render as defined by :func:`~.reference.render_reference`, in float32.
 
-    Differentiable with respect to every tensor of ``gaussians`` except ``filter_3d``. Images and
-    gradients are bitwise the same for any number of threads.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Scene frame. CPU tensors, or float32 CUDA tensors, which are rendered on the GPU.
-    camera : Camera
-        In the scene frame; any image size.
-    options : RenderOptions, optional
-    buffers : RenderBuffers, optional
-        Scratch memory to reuse; by default one set is shared by the process.
-
-    Returns
-    -------
-    Render
-        float32 images. With ``options.statistics`` the weights are filled at once, ``grad_px`` and
-        ``grad_abs_px`` by the backward pass.
+    Differentiable with respect to every tensor of ``gaussians`` (scene frame) except ``filter_3d``.
+    Images and gradients are bitwise the same for any number of threads. Float32 CUDA tensors are
+    rendered on the GPU. ``buffers`` is scratch memory to reuse; by default one set is shared by the
+    process. With ``options.statistics`` the weights are filled at once, ``grad_px`` and
+    ``grad_abs_px`` by the backward pass.
 
     Raises
     ------

@@ -200,14 +200,9 @@ class State:
 
 
 class Block:
-    """Emits vector code of one width into a numba intrinsic.
+    """Emits vector code of one width, 8 or 16 lanes, into a numba intrinsic.
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    context, builder
-        Arguments of the code generator of a numba intrinsic.
+    ``context`` and ``builder`` are the arguments of the intrinsic's code generator.
     """
 
     def __init__(self, lanes: int, context: Any, builder: Any) -> None:

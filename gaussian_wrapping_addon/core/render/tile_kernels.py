@@ -38,10 +38,7 @@ def range_pixels(
 ) -> tuple[int, int]:  # fmt: skip
     """Write the pixel ranges of the Gaussians ``begin .. end``.
 
-    Returns
-    -------
-    visible, spans : int
-        Number of visible Gaussians, and of tile rows that they reach in total.
+    Returns the number of visible Gaussians, and of tile rows that they reach in total.
     """
     count = 0
     spans = 0
@@ -71,23 +68,12 @@ def span_tiles(
     from its extent in x. That extent ends at the ellipse's own extreme point if the strip contains
     it, else on the nearer edge of the strip.
 
-    Parameters
-    ----------
-    record, span : int
-        Where writing starts in ``records`` and ``spans``.
-    spans : (s, 2) uint16
-        Receives first and end tile column for each tile row.
-    records : (r, 5) int32
-        Receives one row for each Gaussian that reaches a tile, with its number of intersections
-        instead of the slot.
-    keys : (r,) uint32
-        Receives the bits of the distance, which order positive floats.
-    changes : (tiles_y, tiles_x + 1) int32
-        Receives the change in the number of intersections from each tile to the next in its row.
-
-    Returns
-    -------
-    end_record, intersections, lowest_key, highest_key : int
+    Writing starts at ``record`` in ``records (r, 5) int32``, a row for each Gaussian that reaches a
+    tile, with its number of intersections instead of the slot, and in ``keys (r,) uint32``, the
+    bits of its distance, which order positive floats; and at ``span`` in ``spans (s, 2) uint16``,
+    the first and end tile column of each tile row. ``changes (tiles_y, tiles_x + 1) int32``
+    receives the change in the number of intersections from each tile to the next in its row.
+    Returns the end record, the number of intersections, the lowest and the highest key.
     """
     changes[:] = 0
     all_intersections = 0

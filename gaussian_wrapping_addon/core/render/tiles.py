@@ -97,23 +97,11 @@ def _sort_part(
 def order_by_keys(
     keys: np.ndarray, bounds: np.ndarray, extent: tuple[int, int], threads: int, store: ArrayStore
 ) -> np.ndarray:
-    """Return the indices of keys in increasing order of key, ties by index.
+    """Return the (v,) int32 indices of keys in increasing order of key, ties by index.
 
-    Parameters
-    ----------
-    keys : (r,) uint32
-    bounds : (m, 2) int64
-        The runs of ``keys`` to sort, increasing.
-    extent : (int, int)
-        Smallest and largest key in these runs.
-    threads : int
-    store : ArrayStore
-        Owns the result, which is valid until the next call with this store.
-
-    Returns
-    -------
-    (v,) int32
-        Indices into ``keys``; the same for any number of threads.
+    ``bounds (m, 2)`` are the runs of ``keys (r,) uint32`` to sort, increasing; ``extent`` is the
+    smallest and largest key in them. The result is the same for any number of threads, and belongs
+    to ``store`` until the next call with it.
     """
     count = int((bounds[:, 1] - bounds[:, 0]).sum())
     order = store.take("order", count, np.int32)
@@ -144,15 +132,7 @@ def order_by_keys(
 
 
 def radix_order(depths: np.ndarray, visible: np.ndarray, threads: int = 1) -> np.ndarray:
-    """Return the indices of the visible rows by increasing distance, ties by index (int32).
-
-    Parameters
-    ----------
-    depths : (n,) float32
-        Distances, >= 0 where visible.
-    visible : (n,) bool
-    threads : int
-    """
+    """Return the indices of the visible rows by increasing distance >= 0, ties by index (int32)."""
     ids = np.nonzero(visible)[0].astype(np.int32)
     # Positive floats are ordered like their bit patterns.
     keys = depths[ids].view(np.uint32)
@@ -196,14 +176,9 @@ class TileLists:
 class TileBinning:
     """The tiles that each Gaussian of a view reaches; yields the lists of any band of tiles.
 
-    Attributes
-    ----------
-    ids : (v,) int32
-        The Gaussians that reach a tile, increasing.
-    tile_counts : (tiles,) int64
-        Number of Gaussians that reach each tile.
-    pixel_ranges, tiles_x, tiles_y
-        As in :class:`TileLists`.
+    ``ids (v,) int32`` are the Gaussians that reach a tile, increasing;
+    ``tile_counts (tiles,) int64`` the numbers of Gaussians that reach each tile. Others as in
+    :class:`TileLists`.
     """
 
     def __init__(
@@ -280,10 +255,7 @@ class TileBinning:
     def bands(self, max_intersections: int) -> list[tuple[int, int]]:
         """Split the tiles into runs of at most ``max_intersections``, or of a single tile.
 
-        Returns
-        -------
-        list of (first, end)
-            At least one band, even if nothing is visible.
+        Returns (first, end) of at least one band, even if nothing is visible.
         """
         below = np.concatenate([[0], np.cumsum(self.tile_counts)])
         tiles = len(self.tile_counts)
@@ -300,17 +272,8 @@ class TileBinning:
     def lists(self, first: int, end: int, max_intersections: int | None = None) -> TileLists:
         """Return the lists of the tiles ``first .. end``, overwriting those of the last call.
 
-        Parameters
-        ----------
-        first, end : int
-            Any run of tiles.
-        max_intersections : int, optional
-            Largest number of intersections to reserve memory for ahead of need.
-
-        Raises
-        ------
-        ResourceError
-            If the lists would hold more than 2^31 - 1 intersections.
+        Memory for ``max_intersections`` is reserved ahead of need. Raises ResourceError if the
+        lists would hold more than 2^31 - 1 intersections.
         """
         store, threads = self._store, self.threads
         tiles = len(self.tile_counts)

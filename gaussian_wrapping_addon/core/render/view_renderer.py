@@ -189,16 +189,8 @@ class ViewPass:
     def backward(self, grads: ImageGradients) -> VisibleGradients:
         """Return the gradient with respect to the raw parameters of the visible Gaussians.
 
-        Parameters
-        ----------
-        grads : ImageGradients
-            C-contiguous float32 arrays of the images' shapes.
-
-        Returns
-        -------
-        VisibleGradients
-            One row for every Gaussian that reaches a tile of the image; valid until the renderer is
-            used again.
+        ``grads`` are arrays of the images' shapes. One row for every Gaussian that reaches a tile
+        of the image; valid until the renderer is used again.
 
         Raises
         ------
@@ -266,12 +258,8 @@ class ViewRenderer:
     """Renders one view after the other in the same memory; not thread-safe.
 
     After a view of the largest image and number of Gaussians, no memory that grows with Gaussians,
-    pixels or intersections is allocated any more.
-
-    Parameters
-    ----------
-    buffers : RenderBuffers, optional
-        Scratch memory of the threads; by default its own.
+    pixels or intersections is allocated any more. ``buffers`` is scratch memory of the threads; by
+    default its own.
     """
 
     def __init__(self, buffers: RenderBuffers | None = None) -> None:
@@ -288,25 +276,12 @@ class ViewRenderer:
         options: RenderOptions | None = None,
         images: Images | None = None,
     ) -> ViewPass:
-        """Render like :func:`~.render`, without autograd.
+        """Render like :func:`~.render`, without autograd; Gaussians and camera in the scene frame.
 
         The parameters must not change before :meth:`ViewPass.backward` has run. The result of the
-        previous call is overwritten.
-
-        Parameters
-        ----------
-        gaussians : RawArrays
-            Scene frame.
-        camera : Camera
-            In the scene frame; any image size.
-        options : RenderOptions, optional
-        images : Images, optional
-            Receives the images; by default memory of the renderer.
-
-        Raises
-        ------
-        ResourceError
-            If the tile lists or the contributor lists grow beyond what can be addressed.
+        previous call is overwritten. ``images`` receives the images; by default memory of the
+        renderer. Raises ResourceError if the tile lists or the contributor lists grow beyond what
+        can be addressed.
         """
         options = options or RenderOptions()
         threads = options.threads or default_threads()

@@ -250,18 +250,9 @@ class DeviceStatistics:
 class DeviceView:
     """A rendered view, and what its backward pass needs.
 
-    Parameters
-    ----------
-    kernels : Kernels
-        Of the tensors' device.
-    gaussians : OrientedGaussians
-        float32 tensors on one device, scene frame. They must not change before :meth:`backward`.
-    camera : Camera
-        Scene frame.
-    options : RenderOptions
-        ``threads`` and ``budget_bytes``, which is for the CPU's lists, are not used.
-    budget_bytes : int
-        Device memory for tile intersections.
+    The Gaussians are float32 on one device and must not change before :meth:`backward`.
+    ``budget_bytes`` is device memory for tile intersections; the options' own, and ``threads``, are
+    for the CPU.
 
     Raises
     ------

@@ -216,22 +216,13 @@ _NO_NVRTC_HINT = "Install the package nvidia-cuda-nvrtc of torch's CUDA version.
 def device_kernels(device_index: int) -> DeviceKernels:
     """Return the kernels of a GPU, compiled on the first call of the process.
 
-    Raises
-    ------
-    DeviceError
-        If the compiler or the driver is missing or fails.
+    Raises DeviceError if the compiler or the driver is missing or fails.
     """
     return DeviceKernels(device_index)
 
 
 def cuda_available(device_index: int | None = None) -> tuple[bool, str]:
-    """Return whether the renderer can run on a GPU of this machine, and the reason.
-
-    Parameters
-    ----------
-    device_index : int, optional
-        Device index of torch; by default its current device.
-    """
+    """Return whether the renderer can run on a GPU, by default torch's current one, and why."""
     if torch.version.cuda is None:
         return False, "This PyTorch was built without CUDA."
     if not torch.cuda.is_available():
