@@ -311,11 +311,6 @@ class VacancyResult:
         return np.where(np.isnan(self.vacancy), np.float32(1.0), self.vacancy)
 
 
-def default_cache_bytes() -> int:
-    """Return the default memory for prepared cameras on this machine."""
-    return int(CACHE_SHARE * total_memory_bytes()) or CACHE_BYTES_UNKNOWN
-
-
 class VacancyField:
     """``v(x) = max over cameras c that see x of prod_i (1 - G_i(o_c + min(t, t*_i) w))``.
 
@@ -402,7 +397,9 @@ class VacancyField:
         self._mask_mode = mask_mode
         self._screens = [VirtualScreen.of(camera, near_z) for camera in self.cameras]
         self._cache: dict[int, CameraBins | None] = {}
-        self._cache_left = default_cache_bytes() if cache_bytes is None else cache_bytes
+        if cache_bytes is None:
+            cache_bytes = int(CACHE_SHARE * total_memory_bytes()) or CACHE_BYTES_UNKNOWN
+        self._cache_left = cache_bytes
 
     def prepare(self, progress: Progress | None = None) -> None:
         """Project and bin the Gaussians for all cameras now, as far as memory allows.
@@ -491,14 +488,8 @@ class VacancyField:
     def _passes(self, count: int, progress: Progress) -> list[tuple[int, int, Progress]]:
         self.evaluations += count
         begins = range(0, count, POINTS_PER_PASS)
-        return [
-            (
-                b,
-                min(b + POINTS_PER_PASS, count),
-                progress.span(b / count, min(b + POINTS_PER_PASS, count) / count),
-            )
-            for b in begins
-        ]
+        bounds = [(begin, min(begin + POINTS_PER_PASS, count)) for begin in begins]
+        return [(begin, end, progress.span(begin / count, end / count)) for begin, end in bounds]
 
     def _in_region(self, points: np.ndarray) -> np.ndarray | None:
         if self.region_bounds is None:

@@ -539,39 +539,23 @@ def project_gaussians(
     screen = ScreenGaussians.allocate(count) if out is None else out
     if len(screen) != count:
         raise UsageError(f"The output holds {len(screen)} rows, not {count}.", "Allocate it anew.")
-    packed = pack_camera(camera, options.near_z)
-    degree = used_degree(gaussians.sh.shape[1], options)
-    threads = options.threads or default_threads()
-
-    def run(begin: int, end: int) -> None:
-        project_raw_range(
-            begin, end, *gaussians.arguments(), degree, packed, *screen.arguments(),
-        )  # fmt: skip
-
-    run_chunks(run, even_bounds(count, threads), threads)
+    _run(
+        project_raw_range, count, options.threads, *_raw_arguments(gaussians, camera, options),
+        *screen.arguments(),
+    )  # fmt: skip
     return screen
 
 
 def project_arrays(
-    arrays: GaussianArrays,
-    camera: Camera,
-    near_z: float,
-    *,
-    threads: int = 0,
+    arrays: GaussianArrays, camera: Camera, near_z: float, *, threads: int = 0
 ) -> ScreenGaussians:
     """Project activated Gaussians like :func:`project_gaussians`; the colour columns are 0."""
-    count = len(arrays)
-    screen = ScreenGaussians.allocate(count)
-    packed = pack_camera(camera, near_z)
-    threads = threads or default_threads()
-
-    def run(begin: int, end: int) -> None:
-        project_activated_range(
-            begin, end, arrays.means, arrays.scales, arrays.rotations, arrays.log_opacities,
-            arrays.normals, packed, *screen.arguments(),
-        )  # fmt: skip
-
-    run_chunks(run, even_bounds(count, threads), threads)
+    screen = ScreenGaussians.allocate(len(arrays))
+    _run(
+        project_activated_range, len(arrays), threads, arrays.means, arrays.scales,
+        arrays.rotations, arrays.log_opacities, arrays.normals, pack_camera(camera, near_z),
+        *screen.arguments(),
+    )  # fmt: skip
     return screen
 
 
@@ -632,17 +616,23 @@ def _backward(
     grads_out: RawGradients | VisibleGradients,
 ) -> None:
     """Run the backward kernel: write the rows of ``ids``, or add to those of all Gaussians."""
-    count = len(gaussians) if ids is None else len(ids)
-    packed = pack_camera(camera, options.near_z)
+    _run(
+        backward_range, len(gaussians) if ids is None else len(ids), options.threads,
+        _NO_IDS if ids is None else ids, ids is not None,
+        *_raw_arguments(gaussians, camera, options), screen.params, screen.visible, grad_params,
+        *(getattr(grads_out, name) for name in TRAINED),
+    )  # fmt: skip
+
+
+def _raw_arguments(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> tuple[Any, ...]:
+    """Return what the kernels of raw Gaussians share, in their order."""
     degree = used_degree(gaussians.sh.shape[1], options)
-    threads = options.threads or default_threads()
+    return *gaussians.arguments(), degree, pack_camera(camera, options.near_z)
 
-    def run(begin: int, end: int) -> None:
-        backward_range(
-            begin, end, _NO_IDS if ids is None else ids, ids is not None, *gaussians.arguments(),
-            degree, packed, screen.params, screen.visible, grad_params, grads_out.means,
-            grads_out.log_scales, grads_out.quats, grads_out.opacity_logits, grads_out.sh,
-            grads_out.orientation,
-        )  # fmt: skip
 
-    run_chunks(run, even_bounds(count, threads), threads)
+def _run(kernel: Any, count: int, threads: int, *arguments: Any) -> None:
+    """Run a kernel over ``count`` Gaussians, in chunks; 0 threads use every core."""
+    threads = threads or default_threads()
+    run_chunks(
+        lambda begin, end: kernel(begin, end, *arguments), even_bounds(count, threads), threads
+    )

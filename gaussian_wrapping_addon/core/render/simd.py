@@ -54,8 +54,7 @@ class Vector:
     def __add__(self, other: Vector | float) -> Vector:
         return self._binary("fadd", other)
 
-    def __radd__(self, other: float) -> Vector:
-        return self._binary("fadd", other)
+    __radd__ = __add__
 
     def __sub__(self, other: Vector | float) -> Vector:
         return self._binary("fsub", other)
@@ -66,8 +65,7 @@ class Vector:
     def __mul__(self, other: Vector | float) -> Vector:
         return self._binary("fmul", other)
 
-    def __rmul__(self, other: float) -> Vector:
-        return self._binary("fmul", other)
+    __rmul__ = __mul__
 
     def __truediv__(self, other: Vector | float) -> Vector:
         return self._binary("fdiv", other)
@@ -199,6 +197,12 @@ class State:
         self.block.builder.store(self.block.vector(value).value, self._slot)
 
 
+def shuffle(builder: Any, a: Any, b: Any, order: Sequence[int]) -> Any:
+    """Return the SSA vector of the lanes ``order`` of two vectors in a row."""
+    indices = ir.Constant(ir.VectorType(_WORD, len(order)), [ir.Constant(_WORD, k) for k in order])
+    return builder.shuffle_vector(a, b, indices)
+
+
 class Block:
     """Emits vector code of one width, 8 or 16 lanes, into a numba intrinsic.
 
@@ -288,17 +292,12 @@ class Block:
             first = [g + k for g in range(0, 2 * lanes, group) for k in range(half)]
             second = [k + half for k in first]
             level = [
-                self._shuffle(a, b, first) + self._shuffle(a, b, second)
+                Vector(self, shuffle(self.builder, a.value, b.value, first))
+                + Vector(self, shuffle(self.builder, a.value, b.value, second))
                 for a, b in zip(level[::2], level[1::2], strict=True)
             ]
             group = half
         return level
-
-    def _shuffle(self, a: Vector, b: Vector, order: Sequence[int]) -> Vector:
-        indices = ir.Constant(
-            ir.VectorType(_WORD, self.lanes), [ir.Constant(_WORD, k) for k in order]
-        )
-        return Vector(self, self.builder.shuffle_vector(a.value, b.value, indices))
 
     def walk(
         self, cursor: Any, count: Any, body: Callable[[Any], Any], test: Callable[[Any], Any]

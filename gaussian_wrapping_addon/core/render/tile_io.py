@@ -28,6 +28,7 @@ from .simd import (
     Vector,
     compile_time,
     lowest_bit,
+    shuffle,
 )
 
 # -- Contributor lists of the blocks of a tile, and which blocks are not yet opaque ---------------
@@ -139,7 +140,6 @@ def active_blocks(typingctx, lanes, m, plane):  # type: ignore[no-untyped-def]
 
 
 _CHANNELS = 3
-_MASK_WORD = ir.IntType(32)
 
 
 class _Rows:
@@ -151,19 +151,19 @@ class _Rows:
         self.lanes, self.builder = lanes, builder
         self.block, self.quad = Block(TILE, context, builder), Block(BLOCK_WIDTH, context, builder)
         self.offset, self.at = offset, at
-        self._live = None if live is None else builder.trunc(live, _MASK_WORD)
+        self._live = None if live is None else builder.trunc(live, _WORD)
 
     def plane(self, m: Any, which: int) -> Vector:
         """Return the row of one plane."""
         a, b, c, d = (self.quad.load(m, offset).value for offset in self._offsets(which))
-        left, right = self._shuffle(a, b, range(8)), self._shuffle(c, d, range(8))
-        return Vector(self.block, self._shuffle(left, right, range(TILE)))
+        left, right = shuffle(self.builder, a, b, range(8)), shuffle(self.builder, c, d, range(8))
+        return Vector(self.block, shuffle(self.builder, left, right, range(TILE)))
 
     def set_plane(self, value: Vector, m: Any, which: int) -> None:
         """Write the row of one plane."""
         for column, offset in enumerate(self._offsets(which)):
             order = range(column * BLOCK_WIDTH, (column + 1) * BLOCK_WIDTH)
-            part = self._shuffle(value.value, value.value, order)
+            part = shuffle(self.builder, value.value, value.value, order)
             self.quad.store(Vector(self.quad, part), m, offset)
 
     def _offsets(self, which: int) -> list[Any]:
@@ -188,7 +188,7 @@ class _Rows:
             pixels = [divmod(part * TILE + k, _CHANNELS) for k in range(TILE)]
             two = [pixel + TILE * (channel == 1) for pixel, channel in pixels]
             three = [pixels[k][0] + TILE if pixels[k][1] == 2 else k for k in range(TILE)]
-            value = self._shuffle(self._shuffle(a, b, two), c, three)
+            value = shuffle(self.builder, shuffle(self.builder, a, b, two), c, three)
             self._store(Vector(self.block, value), image, first, part, _CHANNELS)
 
     def load_three(self, image: Any) -> list[Vector]:
@@ -200,7 +200,7 @@ class _Rows:
             indices = [divmod(k * _CHANNELS + channel, TILE) for k in range(TILE)]
             two = [at + TILE * (part == 1) for part, at in indices]
             three = [indices[k][1] + TILE if indices[k][0] == 2 else k for k in range(TILE)]
-            value = self._shuffle(self._shuffle(a, b, two), c, three)
+            value = shuffle(self.builder, shuffle(self.builder, a, b, two), c, three)
             channels.append(Vector(self.block, value))
         return channels
 
@@ -214,21 +214,15 @@ class _Rows:
     def _first_value(self) -> Any:
         return self.builder.mul(self.at, self.block.index(_CHANNELS), flags=("nuw", "nsw"))
 
-    def _shuffle(self, a: Any, b: Any, order: Sequence[int]) -> Any:
-        indices = [ir.Constant(_MASK_WORD, k) for k in order]
-        return self.builder.shuffle_vector(
-            a, b, ir.Constant(ir.VectorType(_MASK_WORD, len(indices)), indices)
-        )
-
     def _mask(self, part: int, channels: int) -> Any:
         """Return which of 16 values of a row lie in the image."""
-        words = ir.VectorType(_MASK_WORD, TILE)
-        values = self.builder.mul(self._live, ir.Constant(_MASK_WORD, channels))
+        words = ir.VectorType(_WORD, TILE)
+        values = self.builder.mul(self._live, ir.Constant(_WORD, channels))
         one = self.builder.insert_element(
-            ir.Constant(words, ir.Undefined), values, ir.Constant(_MASK_WORD, 0)
+            ir.Constant(words, ir.Undefined), values, ir.Constant(_WORD, 0)
         )
         end = self.builder.shuffle_vector(one, one, ir.Constant(words, None))
-        own = ir.Constant(words, [ir.Constant(_MASK_WORD, part * TILE + k) for k in range(TILE)])
+        own = ir.Constant(words, [ir.Constant(_WORD, part * TILE + k) for k in range(TILE)])
         return self.builder.icmp_signed("<", own, end)
 
     def _masked(self, operation: str, result: Any, values: Sequence[Any]) -> Any:
@@ -246,7 +240,7 @@ class _Rows:
         if self._live is None:
             self.builder.store(value.value, pointer, align=4)
             return
-        align = ir.Constant(_MASK_WORD, 4)
+        align = ir.Constant(_WORD, 4)
         mask = self._mask(part, channels)
         self._masked("store", ir.VoidType(), [value.value, pointer, align, mask])
 
@@ -254,7 +248,7 @@ class _Rows:
         pointer = self._pointer(image, first, part)
         if self._live is None:
             return Vector(self.block, self.builder.load(pointer, align=4))
-        align, zeros = ir.Constant(_MASK_WORD, 4), self.block.vector(0.0).value
+        align, zeros = ir.Constant(_WORD, 4), self.block.vector(0.0).value
         mask = self._mask(part, channels)
         values = [pointer, align, mask, zeros]
         return Vector(self.block, self._masked("load", self.block.kind, values))

@@ -11,14 +11,12 @@ import numpy as np
 from llvmlite import ir
 from numba.core import types
 
-from .. import limits
 from ..compiled import inline, kernel
-from .simd import BLOCK_COLUMNS, BLOCK_WIDTH, HALF, TILE, Block, Vector, compile_time
+from .simd import BLOCK_COLUMNS, BLOCK_WIDTH, HALF, TILE, Block, Vector, compile_time, shuffle
 
 # -- Compiled kernels of tile binning: pixel ranges, intersected tiles, slots, scattering ---------
 
 
-_TILE = limits.TILE_PX
 # Margin for the rounding of float32 boxes and skews: relative to the half width, and in pixels.
 _SHARE_MARGIN = 1e-6
 _PIXEL_MARGIN = 0.02
@@ -52,7 +50,7 @@ def range_pixels(
         ranges[i, 2] = int(max(np.ceil(boxes[i, 0] - 0.5), 0.0))
         ranges[i, 3] = int(min(np.floor(boxes[i, 2] - 0.5), width - 1.0))
         count += 1
-        spans += ranges[i, 1] // _TILE - ranges[i, 0] // _TILE + 1
+        spans += ranges[i, 1] // TILE - ranges[i, 0] // TILE + 1
     return count, spans
 
 
@@ -82,8 +80,8 @@ def span_tiles(
     for i in range(begin, end):
         if not visible[i]:
             continue
-        first_row, last_row = ranges[i, 0] // _TILE, ranges[i, 1] // _TILE
-        first, last = ranges[i, 2] // _TILE, ranges[i, 3] // _TILE
+        first_row, last_row = ranges[i, 0] // TILE, ranges[i, 1] // TILE
+        first, last = ranges[i, 2] // TILE, ranges[i, 3] // TILE
         intersections = 0
         x0, x1 = np.float64(boxes[i, 0]), np.float64(boxes[i, 2])
         y0, y1 = np.float64(boxes[i, 1]), np.float64(boxes[i, 3])
@@ -108,8 +106,8 @@ def span_tiles(
             low_px, high_px = np.float64(ranges[i, 2]), np.float64(ranges[i, 3])
             for row in range(first_row, last_row + 1):
                 at = span + row - first_row
-                upper = max(row * _TILE, ranges[i, 0]) + 0.5 - _PIXEL_MARGIN
-                lower = min(row * _TILE + _TILE - 1, ranges[i, 1]) + 0.5 + _PIXEL_MARGIN
+                upper = max(row * TILE, ranges[i, 0]) + 0.5 - _PIXEL_MARGIN
+                lower = min(row * TILE + TILE - 1, ranges[i, 1]) + 0.5 + _PIXEL_MARGIN
                 top = max((upper - center_y) * inverse, -1.0)
                 bottom = min((lower - center_y) * inverse, 1.0)
                 first_tile, end_tile = first, last + 1
@@ -124,8 +122,8 @@ def span_tiles(
                     if first_px > last_px:
                         first_tile = end_tile = 0
                     else:
-                        first_tile = int(first_px) // _TILE
-                        end_tile = int(last_px) // _TILE + 1
+                        first_tile = int(first_px) // TILE
+                        end_tile = int(last_px) // TILE + 1
                 spans[at, 0], spans[at, 1] = first_tile, end_tile
                 changes[row, first_tile] += 1
                 changes[row, end_tile] -= 1
@@ -329,21 +327,16 @@ def _columns(block: Block, ids: Any, at: Any, boxes: Any, skews: Any) -> list[Ve
         rows.append(quad.load(boxes, builder.mul(gaussian, block.index(_BOX))).value)
         number_ = ir.Constant(_WORD, number)
         skew = builder.insert_element(skew, block.scalar(skews, gaussian), number_)
-
-    def shuffle(a: Any, b: Any, order: list[int]) -> Any:
-        indices = [ir.Constant(_WORD, k) for k in order]
-        kind = ir.VectorType(_WORD, len(order))
-        return builder.shuffle_vector(a, b, ir.Constant(kind, indices))
-
     while len(rows) > _BOX:
         both = list(range(2 * rows[0].type.count))
-        rows = [shuffle(a, b, both) for a, b in zip(rows[::2], rows[1::2], strict=True)]
+        rows = [shuffle(builder, a, b, both) for a, b in zip(rows[::2], rows[1::2], strict=True)]
     # Four vectors of four boxes each.
     columns = []
     for column in range(_BOX):
         eight = [column + _BOX * k for k in range(2 * _BOX)]
-        left, right = shuffle(rows[0], rows[1], eight), shuffle(rows[2], rows[3], eight)
-        columns.append(Vector(block, shuffle(left, right, list(range(_GROUP)))))
+        left = shuffle(builder, rows[0], rows[1], eight)
+        right = shuffle(builder, rows[2], rows[3], eight)
+        columns.append(Vector(block, shuffle(builder, left, right, range(_GROUP))))
     return [*columns, Vector(block, skew)]
 
 
