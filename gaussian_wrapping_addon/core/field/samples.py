@@ -114,8 +114,9 @@ def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
     used = np.unique(level)
     level_size = np.ldexp(max(top, 1e-300), -used)  # (levels,)
 
-    table_begin, table_mask, slot_key_parts, slot_cell_parts = [], [], [], []
-    begin_parts, owner_parts = [np.zeros(1, np.int64)], []
+    table_begin, table_mask = [], []
+    slot_key_parts, slot_cell_parts = [np.zeros(0, np.int64)], [np.zeros(0, np.int32)]
+    begin_parts, owner_parts = [np.zeros(1, np.int64)], [np.zeros(0, np.int32)]
     slots = cells = entries = 0
     for size, number in zip(level_size.tolist(), used.tolist(), strict=True):
         rows = np.flatnonzero(level == number)
@@ -143,10 +144,7 @@ def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
         slots, cells, entries = slots + capacity, cells + len(unique_keys), entries + len(keys)
     return BoxGrid(
         origin, level_size, np.asarray(table_begin, np.int64), np.asarray(table_mask, np.int64),
-        np.concatenate(slot_key_parts) if slot_key_parts else np.zeros(0, np.int64),
-        np.concatenate(slot_cell_parts) if slot_cell_parts else np.zeros(0, np.int32),
-        np.concatenate(begin_parts),
-        np.concatenate(owner_parts) if owner_parts else np.zeros(0, np.int32),
+        *map(np.concatenate, (slot_key_parts, slot_cell_parts, begin_parts, owner_parts)),
     )  # fmt: skip
 
 

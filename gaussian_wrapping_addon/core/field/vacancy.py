@@ -328,11 +328,8 @@ class VacancyField:
 
     Parameters
     ----------
-    arrays : GaussianArrays
     cameras : sequence of Camera
         In the scene frame, of any resolution: vacancy does not depend on it.
-    threads : int
-        0 uses every core.
     unseen : {"empty", "occupied", "invalid"}
         Vacancy 1, 0 or NaN of points that no camera sees (docs/method.md, section 5.3). Invalid
         points count as empty in :meth:`is_empty`, and ``unseen_evaluations`` counts them.
@@ -345,8 +342,6 @@ class VacancyField:
         Box that contains all query points, scene frame. Cameras that do not see it and Gaussians
         that cannot affect it are skipped, which saves time and memory and changes no value. Points
         outside it count as unseen.
-    near_z : float
-        Scene units.
     cache_bytes : int, optional
         Memory for projected and binned cameras, by default a quarter of the machine's; other
         cameras are prepared again in each call (about 120 bytes per Gaussian).

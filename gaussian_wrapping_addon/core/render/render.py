@@ -86,16 +86,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.view, ctx.collected = view, collected
         ctx.camera, ctx.options = camera, options
         ctx.set_materialize_grads(False)
-        outputs = tuple(
-            torch.from_numpy(image)
-            for image in (
-                images.color,
-                images.normal,
-                images.geometric,
-                images.alpha,
-                images.depth,
-            )
-        )
+        outputs = tuple(torch.from_numpy(image) for image in images.arguments()[:5])
         # The backward pass reads their memory; saved so that autograd refuses to run after one of
         # them was modified in place.
         ctx.save_for_backward(means, log_scales, quats, opacity_logits, sh, orientation, *outputs)

@@ -18,7 +18,15 @@ from ...gaussians.model import OrientedGaussians
 from ...scene.camera import Camera
 from ..query_kernels import fine_scale
 from ..types import RenderOptions
-from .device_view import MAX_INTERSECTIONS, ROW_VALUES, WARPS, DeviceScreen, RawTensors, offsets
+from .device_view import (
+    MAX_INTERSECTIONS,
+    ROW_VALUES,
+    WARPS,
+    DeviceScreen,
+    RawTensors,
+    offsets,
+    sorted_by_tile,
+)
 from .kernels import Kernels
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits")
@@ -216,11 +224,4 @@ def _list_points(view: DeviceQueryView, points: SortedPoints) -> PointLists:
         "list_areas", count, order, rank_offsets, intersection_offsets, *ellipses, areas, tiles_x,
         tiles_y, *unsorted.unbind(),
     )  # fmt: skip
-    # Short keys need half as many passes of the radix sort.
-    keys = unsorted[0].to(torch.int16 if tiles < 2**15 else torch.int32)
-    by_tile = torch.sort(keys, stable=True)
-    edges = torch.arange(tiles + 1, dtype=keys.dtype, device=device)
-    return PointLists(
-        torch.searchsorted(by_tile.values, edges), unsorted[1][by_tile.indices],
-        unsorted[2][by_tile.indices], intersection_offsets,
-    )  # fmt: skip
+    return PointLists(*sorted_by_tile(unsorted, tiles), intersection_offsets)

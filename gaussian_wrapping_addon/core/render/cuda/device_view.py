@@ -173,15 +173,18 @@ def _list(
         screen.skews, camera.width, camera.height, tiles_x, first_row, end_row, *unsorted.unbind(),
     )  # fmt: skip
     tiles = tiles_x * (end_row - first_row)
+    masks = torch.zeros((intersections, WARPS), dtype=torch.int32, device=device)
+    return Band(first_row, tiles, *sorted_by_tile(unsorted, tiles), intersection_offsets, masks)
+
+
+def sorted_by_tile(unsorted: Tensor, tiles: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Sort (3, p) tiles, Gaussians and slots; return the tiles' starts, Gaussians and slots."""
     # Short keys need half as many passes of the radix sort.
     keys = unsorted[0].to(torch.int16 if tiles < 2**15 else torch.int32)
     by_tile = torch.sort(keys, stable=True)
-    edges = torch.arange(tiles + 1, dtype=keys.dtype, device=device)
-    return Band(
-        first_row, tiles, torch.searchsorted(by_tile.values, edges), unsorted[1][by_tile.indices],
-        unsorted[2][by_tile.indices], intersection_offsets,
-        torch.zeros((intersections, WARPS), dtype=torch.int32, device=device),
-    )  # fmt: skip
+    edges = torch.arange(tiles + 1, dtype=keys.dtype, device=keys.device)
+    start = torch.searchsorted(by_tile.values, edges)
+    return start, unsorted[1][by_tile.indices], unsorted[2][by_tile.indices]
 
 
 def offsets(counts: Tensor) -> Tensor:
