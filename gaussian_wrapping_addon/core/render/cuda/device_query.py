@@ -17,16 +17,9 @@ from ...errors import ResourceError, UsageError
 from ...gaussians.model import OrientedGaussians
 from ...scene.camera import Camera
 from ..query_kernels import fine_scale
+from ..simd import ROW_VALUES
 from ..types import RenderOptions
-from .device_view import (
-    MAX_INTERSECTIONS,
-    ROW_VALUES,
-    WARPS,
-    DeviceScreen,
-    RawTensors,
-    offsets,
-    sorted_by_tile,
-)
+from .device_view import MAX_INTERSECTIONS, WARPS, DeviceScreen, RawTensors, offsets, sorted_by_tile
 from .kernels import Kernels
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits")

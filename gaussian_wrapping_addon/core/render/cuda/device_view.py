@@ -15,6 +15,7 @@ from ...errors import ResourceError, UsageError
 from ...gaussians.model import TRAINED, OrientedGaussians
 from ...scene.camera import Camera
 from ..projection import pack_camera, used_degree
+from ..simd import ROW_VALUES
 from ..types import RenderOptions
 from .kernels import THREADS_PER_BLOCK, CameraValues, Kernels
 
@@ -22,7 +23,6 @@ from .kernels import THREADS_PER_BLOCK, CameraValues, Kernels
 
 
 WARPS = THREADS_PER_BLOCK // 32
-ROW_VALUES = 24
 KEPT_BYTES = 4 + 4 + 4 * WARPS
 """Memory per intersection kept for the backward pass: Gaussian, slot, contribution masks."""
 PASSING_BYTES = 4 * ROW_VALUES
