@@ -184,10 +184,8 @@ def compile_text(
             "Render on the CPU.",
         )
     exact = wanted in known
-    options = ["--std=c++17", "--restrict"]
-    options.append(f"--gpu-architecture={'sm' if exact else 'compute'}_{max(usable)}")
-    if verbose:
-        options.append("--ptxas-options=-v")
+    architecture = f"--gpu-architecture={'sm' if exact else 'compute'}_{max(usable)}"
+    options = ["--std=c++17", "--restrict", architecture, *["--ptxas-options=-v"] * verbose]
     program = ctypes.c_void_p()
     _check_compiler(
         nvrtc,
