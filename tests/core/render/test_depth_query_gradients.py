@@ -9,11 +9,12 @@ import torch
 
 from gaussian_wrapping_addon.core.render.depth_query import query_view, solve_depths
 from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.reference import reference_depth_at
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 
 from .comparisons import leaves, relative_l2
 from .query_autograd import query_depth
-from .query_scenes import EYE, SHAPES, Oracle, random_positions, reference_depth_at, scene
+from .query_scenes import EYE, SHAPES, Oracle, random_positions, scene
 from .scenes import look_at
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.depth_query import query_view
 from gaussian_wrapping_addon.core.render.projection import RawArrays
-from gaussian_wrapping_addon.core.render.reference import reference_projection
+from gaussian_wrapping_addon.core.render.reference import reference_depth_at, reference_projection
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
 
@@ -20,7 +20,6 @@ from .comparisons import leaves, narrowed, relative_l2
 from .depth_scenes import SCENES, WIDE, assert_depth, ball_before_disc, doubled, scene
 from .first_principles import FirstPrinciples
 from .query_autograd import query_depth
-from .query_scenes import reference_depth_at
 from .scenes import front_camera, one_gaussian
 from .test_properties import cameras, steady, wild_gaussians
 

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.parallel import ArrayStore
 from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     RawGradients,
+    allocate_visible,
     project_backward,
     project_backward_visible,
+    project_gaussians,
 )
 from gaussian_wrapping_addon.core.render.reference import reference_projection
 from gaussian_wrapping_addon.core.render.types import RenderOptions
@@ -87,21 +89,29 @@ def test_compact_rows_are_the_dense_ones() -> None:
     project_backward(raw, CAMERA, options, screen, grad_params, dense)
     seen = np.flatnonzero(screen.visible).astype(np.int32)
     assert 50 < len(seen) < 290
-    store = ArrayStore()
+    scratch = allocate_visible(raw, 300)
     for ids in (seen, seen[3:50], seen[:1], seen[:0], np.arange(300, dtype=np.int32)):
         for name in TRAINED:
-            store.take(f"grad {name}", getattr(raw, name).shape, np.float32)[:] = np.nan
+            getattr(scratch, name)[:] = np.nan
         for threads in (1, 3):
             chosen = dataclasses.replace(options, threads=threads)
-            part = project_backward_visible(
-                raw, CAMERA, chosen, screen, grad_params, ids, store.take
-            )
+            part = project_backward_visible(raw, CAMERA, chosen, screen, grad_params, ids, scratch)
             assert part.ids is ids
             for name in TRAINED:
                 got = getattr(part, name)
                 np.testing.assert_array_equal(got, getattr(dense, name)[ids], err_msg=name)
-                reused = store.take(f"grad {name}", getattr(raw, name).shape, np.float32)
-                assert np.isnan(reused[len(ids) :]).all()
-                assert np.shares_memory(got, reused) or not len(ids)
+                assert np.isnan(getattr(scratch, name)[len(ids) :]).all()
+                assert np.shares_memory(got, getattr(scratch, name)) or not len(ids)
             # Coefficients above the degree used.
             assert not part.sh[:, 4:].any()
+
+
+def test_scratch_of_another_shape_is_refused() -> None:
+    raw = RawArrays.from_gaussians(random_gaussians(9, 4, dtype=torch.float32))
+    screen = project_gaussians(raw, CAMERA, OPTIONS)
+    ids, grad = np.arange(9, dtype=np.int32), np.zeros((9, 24), np.float32)
+    small = allocate_visible(raw, 8)
+    other = allocate_visible(dataclasses.replace(raw, sh=raw.sh[:, :4]), 9)
+    for scratch in (small, other):
+        with pytest.raises(UsageError, match="scratch"):
+            project_backward_visible(raw, CAMERA, OPTIONS, screen, grad, ids, scratch)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.vacancy_scale import log_gaussian, log_one_minus
+from gaussian_wrapping_addon.core.field.vacancy_kernels import log_gaussian, log_one_minus
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 
 LOGITS = [-30.0, -20.0, -5.0, -0.7, 0.0, 0.3, 2.0, 8.0, 15.0, 20.0, 30.0, 40.0]

@@ -10,11 +10,12 @@ import numba
 import numpy as np
 import pytest
 
-from benchmarks.vacancy_scale import brute_force_vacancy, log_transmittance
 from gaussian_wrapping_addon.core.errors import Cancelled, UsageError
 from gaussian_wrapping_addon.core.field.vacancy import (
     SETTLED,
     VacancyField,
+    brute_force_vacancy,
+    log_transmittance,
 )
 from gaussian_wrapping_addon.core.field.vacancy_kernels import transmittance_of_cells
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays

@@ -12,10 +12,10 @@ import torch
 
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.parallel import ArrayStore
 from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     ScreenGaussians,
+    allocate_visible,
     project_arrays,
     project_backward_visible,
     project_gaussians,
@@ -163,11 +163,11 @@ def test_reused_output_allocates_no_arrays() -> None:
     screen = project_gaussians(raw, CAMERA, OPTIONS)
     ids = np.flatnonzero(screen.visible).astype(np.int32)
     grad_params = np.ones((20_000, 24), np.float32)
-    store = ArrayStore()
-    project_backward_visible(raw, CAMERA, OPTIONS, screen, grad_params, ids, store.take)
+    scratch = allocate_visible(raw, 20_000)
+    project_backward_visible(raw, CAMERA, OPTIONS, screen, grad_params, ids, scratch)
     tracemalloc.start()
     project_gaussians(raw, CAMERA, OPTIONS, screen)
-    project_backward_visible(raw, CAMERA, OPTIONS, screen, grad_params, ids, store.take)
+    project_backward_visible(raw, CAMERA, OPTIONS, screen, grad_params, ids, scratch)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20_000  # bytes: less than one for each Gaussian

@@ -11,8 +11,9 @@ from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.projection import RawArrays, project_gaussians
 from gaussian_wrapping_addon.core.render.tile_kernels import mask_kernel
+from gaussian_wrapping_addon.core.render.tiles import bin_gaussians
 from gaussian_wrapping_addon.core.render.types import RenderOptions
-from tests.core.render.scenes import bin_gaussians, look_at, random_gaussians
+from tests.core.render.scenes import look_at, random_gaussians
 
 TILE, WIDTH = limits.TILE_PX, 4
 

@@ -21,11 +21,12 @@ from gaussian_wrapping_addon.core.render.reference import reference_projection
 from gaussian_wrapping_addon.core.render.tiles import (
     TileBinning,
     TileLists,
+    bin_gaussians,
     order_by_keys,
     radix_order,
 )
 from gaussian_wrapping_addon.core.render.types import RenderOptions
-from tests.core.render.scenes import bin_gaussians, look_at, random_gaussians
+from tests.core.render.scenes import look_at, random_gaussians
 
 OPTIONS = RenderOptions(threads=1)
 CAMERA = look_at((2.2, 0.5, 0.8), width=75, height=52, focal=80.0)
