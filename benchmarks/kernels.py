@@ -36,12 +36,11 @@ from gaussian_wrapping_addon.core.render.raster import (
     Images,
     RenderBuffers,
     blend,
-    blend_backward,
     write_intersection_gradients,
 )
 from gaussian_wrapping_addon.core.render.render import project_view
 from gaussian_wrapping_addon.core.render.simd import ROW_VALUES, vector_lanes
-from gaussian_wrapping_addon.core.render.tiles import bin_gaussians
+from gaussian_wrapping_addon.core.render.tiles import TileBinning
 from gaussian_wrapping_addon.core.render.types import ImageGradients, RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewPass, ViewRenderer
 from gaussian_wrapping_addon.core.scene.camera import Camera
@@ -144,16 +143,23 @@ def render_parts(
         random.normal(size=image.shape).astype(np.float32)
         for image in (images.color, images.normal, images.geometric, images.alpha, images.depth)
     ]
-    grad_params, _, _ = blend_backward(prepared, images, incoming, buffers, absolute=False)
     screen, threads = prepared.screen, prepared.threads
     renderer, grads = ViewRenderer(), ImageGradients(*incoming)
+    grad_params = ViewRenderer().render(raw, camera, options).params_gradient(grads)
+    intersections = np.zeros((len(prepared.lists.gaussian_ids), ROW_VALUES), np.float32)
 
     def backward(prepared: Any, absolute: bool) -> Callable[[], object]:
-        return lambda: blend_backward(prepared, images, incoming, buffers, absolute=absolute)
+        return lambda: write_intersection_gradients(
+            prepared, images, incoming, buffers, intersections, depth=True, absolute=absolute
+        )
+
+    def binning() -> object:
+        found = TileBinning(screen, camera.width, camera.height, threads, ArrayStore())
+        return found.lists(0, len(found.tile_counts))
 
     return [
         ("projection forward", lambda: project_gaussians(raw, camera, options)),
-        ("binning", lambda: bin_gaussians(screen, camera.width, camera.height, threads)),
+        ("binning", binning),
         ("projection, binning, rows", lambda: project_view(raw, camera, options)),
         ("raster forward, no depth", lambda: blend(flat, images, buffers)),
         ("raster forward, isosurface", lambda: blend(prepared, images, buffers)),

@@ -17,8 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.field.cuda_vacancy import CudaVacancyField
-from gaussian_wrapping_addon.core.field.vacancy import SETTLED, VacancyField, brute_force_vacancy
+from gaussian_wrapping_addon.core.field.vacancy import SETTLED, VacancyField
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
 from gaussian_wrapping_addon.core.parallel import default_threads
@@ -33,6 +34,115 @@ NEAR_SHARE = 0.5
 """Share of the points that lie about the Gaussians; the others fill the scene's box."""
 NEAR_SPREAD = 0.03
 """Standard deviation of their distance from a mean, scene units: a few thicknesses."""
+
+
+# -- Numerically stable log G and log(1 - G) ------------------------------------------------------
+
+
+LOG_HALF = -0.6931471805599453
+
+
+def log_gaussian(log_alpha: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return ``log G = log alpha - q / 2`` from the squared Mahalanobis distance q."""
+    return np.asarray(log_alpha, np.float64) - 0.5 * np.asarray(q, np.float64)
+
+
+def log_one_minus(log_g: np.ndarray) -> np.ndarray:
+    """Return ``log(1 - G)`` of ``log G``: -inf where it is 0 (docs/method.md, section 5.4)."""
+    log_g = np.asarray(log_g, np.float64)
+    # Both forms are computed and one is chosen: for small G, 1 - G rounds, which log1p avoids; for
+    # G near 1, exp(log G) rounds, which expm1 avoids.
+    with np.errstate(divide="ignore"):
+        near_zero = np.log1p(-np.exp(log_g))
+        near_one = np.log(-np.expm1(log_g))
+    return np.where(log_g < LOG_HALF, near_zero, near_one)
+
+
+# -- Vacancy by its definition, every Gaussian at every point; tests compare with it too -----------
+
+
+PAIRS_PER_BLOCK = 2_000_000
+
+
+def log_transmittance(arrays: GaussianArrays, center: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the log transmittance between a camera centre and points.
+
+    See docs/method.md, section 5.1. The cost is Gaussians x points.
+
+    Parameters
+    ----------
+    arrays : GaussianArrays
+        All ``m`` Gaussians are included, also those beside or behind the camera (which contribute
+        their value at the camera, docs/method.md, section 5.4).
+    center : (3,) float64
+        Camera centre, scene frame.
+    points : (n, 3) float64
+        Scene frame.
+
+    Returns
+    -------
+    (n,) float64
+        ``sum_i log(1 - G_i(o + min(t, t*_i) w))``.
+    """
+    points = np.ascontiguousarray(points, np.float64)
+    # L = S^-1 R^T; the difference is taken before whitening, where it is exact.
+    whiten = arrays.rotations.transpose(0, 2, 1) / arrays.scales[:, :, None]  # (m, 3, 3)
+    offset = np.einsum("mij,mj->mi", whiten, arrays.means - center)  # (m, 3)
+    out = np.empty(len(points))
+    block = max(1, PAIRS_PER_BLOCK // max(1, len(arrays)))
+    for begin in range(0, len(points), block):
+        ray = points[begin : begin + block] - center  # (b, 3), the point is at parameter 1
+        step = np.einsum("mij,bj->bmi", whiten, ray)  # (b, m, 3)
+        length_sq = np.einsum("bmi,bmi->bm", step, step)
+        peak = np.einsum("bmi,mi->bm", step, offset) / np.maximum(length_sq, 1e-300)  # (b, m)
+        at = np.clip(peak, 0.0, 1.0)
+        residual = offset - at[:, :, None] * step  # (b, m, 3)
+        q = np.einsum("bmi,bmi->bm", residual, residual)
+        out[begin : begin + block] = log_one_minus(log_gaussian(arrays.log_opacities, q)).sum(1)
+    return out
+
+
+def brute_force_vacancy(
+    arrays: GaussianArrays,
+    cameras: Sequence[Camera],
+    points: np.ndarray,
+    *,
+    near_z: float = limits.NEAR_Z,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return vacancy and arg-max camera in float64, without culling, cut-off or early exit.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Scene frame.
+    near_z : float
+        A camera sees a point that lies in its image and deeper than this (scene units).
+
+    Returns
+    -------
+    vacancy : (n,) float64
+        Largest transmittance over the cameras that see the point; NaN where none does.
+    camera : (n,) int32
+        The first camera that attains it, or -1.
+    """
+    points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
+    best = np.full(len(points), -np.inf)
+    camera_index = np.full(len(points), -1, np.int32)
+    for index, camera in enumerate(cameras):
+        pixels, depth = camera.project(points)
+        seen = (depth > near_z) & (pixels >= 0.0).all(1)
+        seen &= (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height)
+        rows = np.flatnonzero(seen)
+        if len(rows) == 0:
+            continue
+        value = np.exp(log_transmittance(arrays, camera.center, points[rows]))
+        better = value > best[rows]
+        best[rows[better]] = value[better]
+        camera_index[rows[better]] = index
+    return np.where(camera_index >= 0, best, np.nan), camera_index
+
+
+# -- The measurement ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

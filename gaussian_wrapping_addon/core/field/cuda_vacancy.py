@@ -111,17 +111,10 @@ class CudaVacancyField(VacancyField):
     depend on how points are split into calls, except where vacancy exceeds 0.999. The processor
     prepares the cameras.
 
-    Parameters
-    ----------
-    arrays, cameras, **options
-        As for :class:`VacancyField`.
-    device : str or torch.device
-        ``"cuda"`` selects torch's current GPU.
-    kernels : Kernels, optional
-        Loaded kernels; by default those of the GPU.
-    device_cache_bytes : int, optional
-        GPU memory for prepared cameras, by default a quarter of the free memory; other cameras are
-        transferred in each call.
+    ``device`` is torch's: ``"cuda"`` selects its current GPU, whose kernels are the default.
+    ``device_cache_bytes`` is GPU memory for prepared cameras, by default a quarter of the free
+    memory; other cameras are transferred in each call. Other arguments as for
+    :class:`VacancyField`.
 
     Raises
     ------

@@ -20,16 +20,9 @@ from .vector_field import MIN_SLOPE, VectorFieldResult
 
 
 def isosurface_residuals(vacancy: Any, points: np.ndarray) -> dict[str, Any]:
-    """Measure ``|v - 0.5|`` at points that should lie on the isosurface; empty without points.
+    """Measure ``|v - 0.5|`` at (n, 3) scene points of the isosurface; empty without points.
 
-    The keys ``level_error_*`` are those of reports.
-
-    Parameters
-    ----------
-    vacancy : VacancyField
-        Or any object with ``vacancy(points)``.
-    points : (n, 3) float64
-        Scene frame.
+    ``vacancy`` has ``vacancy(points)``. The keys ``level_error_*`` are those of reports.
     """
     if len(points) == 0:
         return {}
@@ -135,9 +128,8 @@ def project_to_isosurface(
     *,
     tolerance: float = TOLERANCE,
     max_steps: int = MAX_ROUNDS,
-    max_travel_sigmas: float = MAX_TRAVEL_SIGMAS,
 ) -> ProjectionResult:
-    """Project points onto the surface ``vacancy = 0.5`` (docs/method.md, section 5.6).
+    """Project (n, 3) scene points onto the surface ``vacancy = 0.5`` (docs/method.md, section 5.6).
 
     Newton steps on ``log v`` along V, at most one local sigma long, are taken while they reduce
     ``|v - 0.5|`` and are halved once where they do not. As soon as a bracket, two points on
@@ -148,31 +140,16 @@ def project_to_isosurface(
     that sees the point best, on which transmittance must rise to 1. All lengths are in local
     sigmas, so the result scales with the scene.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Scene frame.
-    vacancy_field : VacancyField
-    vector_field : VectorField
-    progress : Progress, optional
-    tolerance : float
-        Largest ``|v - 0.5|`` of accepted points; sensible values are 1e-3 to 2e-2. Iterations
-        continue to :data:`TARGET_RESIDUAL` where possible.
-    max_steps : int
-        Largest number of batches of vacancy evaluations; points still active then are dropped.
-    max_travel_sigmas : float
-        Largest distance of a point from its start, in local sigmas.
-
-    Returns
-    -------
-    ProjectionResult
+    ``tolerance`` is the largest ``|v - 0.5|`` of accepted points, sensibly 1e-3 to 2e-2; iterations
+    continue to :data:`TARGET_RESIDUAL` where possible. Points still active after ``max_steps``
+    batches of vacancy evaluations are dropped.
     """
     progress = progress or Progress()
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
     centers = np.array([camera.center for camera in vacancy_field.cameras]).reshape(-1, 3)
     vectors = vector_field.evaluate(points)
     evaluated = vacancy_field.vacancy(points)
-    search = _Search(points, evaluated, vectors, centers, tolerance, max_travel_sigmas)
+    search = _Search(points, evaluated, vectors, centers, tolerance)
     rounds, evaluations = 1, len(points)
     while len(search.rows) and rounds < max_steps:
         share = 1.0 - len(search.rows) / max(1, len(points))
@@ -200,14 +177,13 @@ class _Search:
         vectors: VectorFieldResult,
         centers: np.ndarray,
         tolerance: float,
-        max_travel_sigmas: float,
     ) -> None:
         n = len(points)
         self.centers = centers
         self.tolerance = tolerance
         self.target = min(TARGET_RESIDUAL, tolerance)
         self.sigma = vectors.sigma_local
-        self.max_travel = max_travel_sigmas * self.sigma
+        self.max_travel = MAX_TRAVEL_SIGMAS * self.sigma
         self.start = points
         # Newton's current point, from which the march starts.
         self.x = points.copy()
@@ -250,13 +226,9 @@ class _Search:
         self.status[close & newton] = ProjectionStatus.CONVERGED
         self.status[close & ~newton] = ProjectionStatus.BISECTED
         return ProjectionResult(
-            self.best_x,
-            self.best_v.astype(np.float32),
-            self.status,
-            residual.astype(np.float32),
-            self.best_camera,
-            evaluations,
-        )
+            self.best_x, self.best_v.astype(np.float32), self.status, residual.astype(np.float32),
+            self.best_camera, evaluations,
+        )  # fmt: skip
 
     # -- next positions ---------------------------------------------------------------------------
 

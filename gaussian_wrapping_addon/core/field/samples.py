@@ -95,17 +95,12 @@ class BoxGrid:
 
 
 def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
-    """Build a grid that lists boxes in cells of about their own size.
+    """Build a grid that lists boxes, from (n, 3) low to high corners, in cells of their own size.
 
     Each box is listed in the cells that it touches (at most 27) of the level whose cell edge is
     between half and all of its longest side; so a query reads one cell per level, and neither huge
     nor tiny boxes lengthen the lists of others. Cells twice as large make vector field queries 40 %
     slower, cells half as large need four times the memory without any gain.
-
-    Parameters
-    ----------
-    low, high : (n, 3) float64
-        Corners of the boxes.
     """
     count = len(low)
     origin = low.mean(0) if count else np.zeros(3)
@@ -119,8 +114,9 @@ def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
     used = np.unique(level)
     level_size = np.ldexp(max(top, 1e-300), -used)  # (levels,)
 
-    table_begin, table_mask, slot_key_parts, slot_cell_parts = [], [], [], []
-    begin_parts, owner_parts = [np.zeros(1, np.int64)], []
+    table_begin, table_mask = [], []
+    slot_key_parts, slot_cell_parts = [np.zeros(0, np.int64)], [np.zeros(0, np.int32)]
+    begin_parts, owner_parts = [np.zeros(1, np.int64)], [np.zeros(0, np.int32)]
     slots = cells = entries = 0
     for size, number in zip(level_size.tolist(), used.tolist(), strict=True):
         rows = np.flatnonzero(level == number)
@@ -147,15 +143,9 @@ def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
         owner_parts.append(rows[owners[order]].astype(np.int32))
         slots, cells, entries = slots + capacity, cells + len(unique_keys), entries + len(keys)
     return BoxGrid(
-        origin,
-        level_size,
-        np.asarray(table_begin, np.int64),
-        np.asarray(table_mask, np.int64),
-        np.concatenate(slot_key_parts) if slot_key_parts else np.zeros(0, np.int64),
-        np.concatenate(slot_cell_parts) if slot_cell_parts else np.zeros(0, np.int32),
-        np.concatenate(begin_parts),
-        np.concatenate(owner_parts) if owner_parts else np.zeros(0, np.int32),
-    )
+        origin, level_size, np.asarray(table_begin, np.int64), np.asarray(table_mask, np.int64),
+        *map(np.concatenate, (slot_key_parts, slot_cell_parts, begin_parts, owner_parts)),
+    )  # fmt: skip
 
 
 # -- Surface samples from the cameras' depth maps, and point pairs across the surface from them
@@ -212,21 +202,12 @@ def sample_depth_maps(
     threads: int = 0,
     renderer: Renderer | None = None,
 ) -> DepthSamples:
-    """Sample the cameras' depth maps inside a volume, thinned evenly.
+    """Sample the cameras' depth maps inside a volume, thinned evenly; all in the scene frame.
 
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Scene frame.
-    cameras : sequence of Camera
-        Cameras in the same frame.
-    contains : callable
-        Tells which points lie in the volume.
-    most : int
-        Largest number of samples. One is kept per cell and octant of viewing directions, with cells
-        as small as this number allows, but not smaller than a pixel.
-    renderer : Renderer, optional
-        By default that of the processor, which ``threads`` is for.
+    ``contains`` tells which points lie in the volume. At most ``most`` samples: one is kept per
+    cell and octant of viewing directions, with cells as small as this number allows, but not
+    smaller than a pixel. The renderer is by default that of the processor, which ``threads`` is
+    for.
     """
     renderer, raw = renderer or ViewRenderer(), RawArrays.from_gaussians(gaussians)
     options = RenderOptions(depth=True, sh_degree=0, near_z=near_z, threads=threads)
@@ -285,12 +266,7 @@ def bracket_pairs(
     """Return pairs of points (k, 3) outside and inside the solid, across its surface.
 
     Samples without an occupied point behind them are dropped: what is opaque for one camera may be
-    transparent for another.
-
-    Parameters
-    ----------
-    is_empty : callable
-        Maps (n, 3) points to (n,) bool, over all cameras.
+    transparent for another. ``is_empty`` maps (n, 3) points to (n,) bool, over all cameras.
     """
     step = depth_samples.directions * depth_samples.footprints[:, None]  # (n, 3) one pixel
     inner = depth_samples.points.copy()

@@ -23,8 +23,6 @@ from .vacancy_kernels import (
     BOUND_COLUMNS,
     ROW_COLUMNS,
     list_tiles,
-    log_gaussian,
-    log_one_minus,
     project_points,
     sort_by_cell,
     transmittance_of_cells,
@@ -96,17 +94,9 @@ class CameraBins:
 def region_window(
     camera: Camera, bounds: np.ndarray, near_z: float
 ) -> tuple[float, float, float, float, float] | None:
-    """Bound the image area and depth in which a box can be visible.
+    """Bound the image area and depth in which a box, its (2, 3) corners given, can be visible.
 
-    Parameters
-    ----------
-    bounds : (2, 3) float64
-        Lowest and highest corner, scene frame.
-
-    Returns
-    -------
-    tuple or None
-        x0, y0, x1, y1 in pixels and the largest z-depth; ``None`` if the camera cannot see it.
+    Returns x0, y0, x1, y1 in pixels and the largest z-depth; ``None`` if the camera cannot see it.
     """
     corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), -1).reshape(-1, 3)  # (8, 3)
     pixels, depth = camera.project(corners)
@@ -126,17 +116,9 @@ def region_window(
 def footprint_bounds(boxes: np.ndarray, skews: np.ndarray) -> np.ndarray:
     """Bound elliptic footprints by their box and by the narrowest strip that contains them.
 
-    Parameters
-    ----------
-    boxes : (n, 4) float32
-        x0 y0 x1 y1, pixels.
-    skews : (n,) float32
-        x offset from the centre to the ellipse's point of largest y; inf where unbounded.
-
-    Returns
-    -------
-    (n, 8) float32
-        See ``vacancy_kernels.BOUND_COLUMNS``. A strip of infinite width is no constraint.
+    ``boxes (n, 4)`` are x0 y0 x1 y1 in pixels; ``skews (n,)`` the x offset from the centre to the
+    ellipse's point of largest y, inf where unbounded. Returns the (n, 8) float32 columns of
+    ``vacancy_kernels.BOUND_COLUMNS``. A strip of infinite width is no constraint.
     """
     wide = boxes.astype(np.float64)
     middle = 0.5 * (wide[:, :2] + wide[:, 2:])  # (n, 2)
@@ -167,10 +149,7 @@ def bin_camera(
 ) -> CameraBins | None:
     """Project, pack and bin the Gaussians for a camera; ``None`` if it cannot see the region.
 
-    Raises
-    ------
-    ResourceError
-        The tile lists are too long.
+    Raises ResourceError if the tile lists are too long.
     """
     camera = virtual.camera
     window = None if bounds is None else region_window(camera, bounds, near_z)
@@ -271,10 +250,8 @@ def checked_masks(
 ) -> tuple[PackedMask | None, ...]:
     """Validate and pack masks: one or ``None`` per camera, ``None`` also where nothing is masked.
 
-    Raises
-    ------
-    UsageError
-        The numbers of masks and cameras differ, a mask is not an image, or the mode is unknown.
+    Raises UsageError if the numbers of masks and cameras differ, a mask is not an image, or the
+    mode is unknown.
     """
     if mode not in ("ignore", "background"):
         raise UsageError(f"The mask mode is {mode!r}.", 'Use "ignore" or "background".')
@@ -298,94 +275,6 @@ def checked_masks(
         assert packed is not None
         out.append(None if packed.unpacked().all() else packed)
     return tuple(out)
-
-
-# -- Brute-force vacancy, every Gaussian at every point: for tests and benchmarks only ------------
-
-
-PAIRS_PER_BLOCK = 2_000_000
-
-
-def log_transmittance(arrays: GaussianArrays, center: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the log transmittance between a camera centre and points.
-
-    See docs/method.md, section 5.1.
-
-    Only for tests and benchmarks, since the cost is Gaussians x points.
-
-    Parameters
-    ----------
-    arrays : GaussianArrays
-        All ``m`` Gaussians are included, also those beside or behind the camera (which contribute
-        their value at the camera, docs/method.md, section 5.4).
-    center : (3,) float64
-        Camera centre, scene frame.
-    points : (n, 3) float64
-        Scene frame.
-
-    Returns
-    -------
-    (n,) float64
-        ``sum_i log(1 - G_i(o + min(t, t*_i) w))``.
-    """
-    points = np.ascontiguousarray(points, np.float64)
-    # L = S^-1 R^T; the difference is taken before whitening, where it is exact.
-    whiten = arrays.rotations.transpose(0, 2, 1) / arrays.scales[:, :, None]  # (m, 3, 3)
-    offset = np.einsum("mij,mj->mi", whiten, arrays.means - center)  # (m, 3)
-    out = np.empty(len(points))
-    block = max(1, PAIRS_PER_BLOCK // max(1, len(arrays)))
-    for begin in range(0, len(points), block):
-        ray = points[begin : begin + block] - center  # (b, 3), the point is at parameter 1
-        step = np.einsum("mij,bj->bmi", whiten, ray)  # (b, m, 3)
-        length_sq = np.einsum("bmi,bmi->bm", step, step)
-        peak = np.einsum("bmi,mi->bm", step, offset) / np.maximum(length_sq, 1e-300)  # (b, m)
-        at = np.clip(peak, 0.0, 1.0)
-        residual = offset - at[:, :, None] * step  # (b, m, 3)
-        q = np.einsum("bmi,bmi->bm", residual, residual)
-        out[begin : begin + block] = log_one_minus(log_gaussian(arrays.log_opacities, q)).sum(1)
-    return out
-
-
-def brute_force_vacancy(
-    arrays: GaussianArrays,
-    cameras: Sequence[Camera],
-    points: np.ndarray,
-    *,
-    near_z: float = limits.NEAR_Z,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return vacancy and arg-max camera in float64, without culling, cut-off or early exit.
-
-    For tests and benchmarks only (see :func:`log_transmittance`).
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Scene frame.
-    near_z : float
-        A camera sees a point that lies in its image and deeper than this (scene units).
-
-    Returns
-    -------
-    vacancy : (n,) float64
-        Largest transmittance over the cameras that see the point; NaN where none does.
-    camera : (n,) int32
-        The first camera that attains it, or -1.
-    """
-    points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
-    best = np.full(len(points), -np.inf)
-    camera_index = np.full(len(points), -1, np.int32)
-    for index, camera in enumerate(cameras):
-        pixels, depth = camera.project(points)
-        seen = (depth > near_z) & (pixels >= 0.0).all(1)
-        seen &= (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height)
-        rows = np.flatnonzero(seen)
-        if len(rows) == 0:
-            continue
-        value = np.exp(log_transmittance(arrays, camera.center, points[rows]))
-        better = value > best[rows]
-        best[rows[better]] = value[better]
-        camera_index[rows[better]] = index
-    return np.where(camera_index >= 0, best, np.nan), camera_index
 
 
 # -- Vacancy field: the largest transmittance to a point from any camera that sees it -------------
@@ -422,11 +311,6 @@ class VacancyResult:
         return np.where(np.isnan(self.vacancy), np.float32(1.0), self.vacancy)
 
 
-def default_cache_bytes() -> int:
-    """Return the default memory for prepared cameras on this machine."""
-    return int(CACHE_SHARE * total_memory_bytes()) or CACHE_BYTES_UNKNOWN
-
-
 class VacancyField:
     """``v(x) = max over cameras c that see x of prod_i (1 - G_i(o_c + min(t, t*_i) w))``.
 
@@ -444,11 +328,8 @@ class VacancyField:
 
     Parameters
     ----------
-    arrays : GaussianArrays
     cameras : sequence of Camera
         In the scene frame, of any resolution: vacancy does not depend on it.
-    threads : int
-        0 uses every core.
     unseen : {"empty", "occupied", "invalid"}
         Vacancy 1, 0 or NaN of points that no camera sees (docs/method.md, section 5.3). Invalid
         points count as empty in :meth:`is_empty`, and ``unseen_evaluations`` counts them.
@@ -461,8 +342,6 @@ class VacancyField:
         Box that contains all query points, scene frame. Cameras that do not see it and Gaussians
         that cannot affect it are skipped, which saves time and memory and changes no value. Points
         outside it count as unseen.
-    near_z : float
-        Scene units.
     cache_bytes : int, optional
         Memory for projected and binned cameras, by default a quarter of the machine's; other
         cameras are prepared again in each call (about 120 bytes per Gaussian).
@@ -513,7 +392,9 @@ class VacancyField:
         self._mask_mode = mask_mode
         self._screens = [VirtualScreen.of(camera, near_z) for camera in self.cameras]
         self._cache: dict[int, CameraBins | None] = {}
-        self._cache_left = default_cache_bytes() if cache_bytes is None else cache_bytes
+        if cache_bytes is None:
+            cache_bytes = int(CACHE_SHARE * total_memory_bytes()) or CACHE_BYTES_UNKNOWN
+        self._cache_left = cache_bytes
 
     def prepare(self, progress: Progress | None = None) -> None:
         """Project and bin the Gaussians for all cameras now, as far as memory allows.
@@ -549,15 +430,11 @@ class VacancyField:
         *,
         level: float = limits.ISO_LEVEL,
     ) -> np.ndarray:
-        """Tell whether vacancy exceeds ``level``, without finding its value.
+        """Tell whether vacancy exceeds ``level`` at (n, 3) points, without finding its value.
 
         Equal to ``vacancy(points).vacancy > level`` for levels from 1e-4 to 0.999, but a point is
         finished at the first camera that finds it empty, and the evaluation from a camera stops as
         soon as the point cannot be empty for it.
-
-        Returns
-        -------
-        (n,) bool
         """
         points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
         level32 = np.float32(level)
@@ -606,14 +483,8 @@ class VacancyField:
     def _passes(self, count: int, progress: Progress) -> list[tuple[int, int, Progress]]:
         self.evaluations += count
         begins = range(0, count, POINTS_PER_PASS)
-        return [
-            (
-                b,
-                min(b + POINTS_PER_PASS, count),
-                progress.span(b / count, min(b + POINTS_PER_PASS, count) / count),
-            )
-            for b in begins
-        ]
+        bounds = [(begin, min(begin + POINTS_PER_PASS, count)) for begin in begins]
+        return [(begin, end, progress.span(begin / count, end / count)) for begin, end in bounds]
 
     def _in_region(self, points: np.ndarray) -> np.ndarray | None:
         if self.region_bounds is None:

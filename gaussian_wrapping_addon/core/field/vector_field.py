@@ -147,16 +147,9 @@ class VectorField:
     The sum is over all Gaussians with a value of at least :data:`TAIL` at the point, whatever their
     distance or size; each of the others would add less than ``TAIL / (1 - TAIL)`` times its
     ``|Sigma^-1 (x - mu)|``. A Gaussian with a normal shorter than
-    ``limits.ORIENTED_MIN_NORM`` is not oriented: it acts on both sides.
-
-    Parameters
-    ----------
-    arrays : GaussianArrays
-    threads : int
-        0 uses every core. The result does not depend on it.
-    oriented : bool
-        ``False`` lets every Gaussian act on both sides: then V is the gradient of
-        ``sum_i log(1 - G_i)``.
+    ``limits.ORIENTED_MIN_NORM`` is not oriented: it acts on both sides. Without ``oriented`` every
+    Gaussian does: then V is the gradient of ``sum_i log(1 - G_i)``. The result does not depend on
+    ``threads``, 0 for every core.
     """
 
     def __init__(self, arrays: GaussianArrays, *, threads: int = 0, oriented: bool = True) -> None:

@@ -61,17 +61,8 @@ class SortedPositions:
 def list_areas(screen: ScreenGaussians, width: int, height: int, threads: int) -> AreaLists:
     """List, for each tile, the visible Gaussians that reach its area.
 
-    Parameters
-    ----------
-    screen : ScreenGaussians
-        Boxes in pixels of an image of ``width`` x ``height``.
-    threads : int
-        Does not affect the result.
-
-    Raises
-    ------
-    ResourceError
-        If the lists would hold more than 2^31 - 1 intersections.
+    The boxes are in pixels of an image of ``width`` x ``height``. Raises ResourceError if the lists
+    would hold more than 2^31 - 1 intersections.
     """
     count = len(screen)
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
@@ -114,12 +105,9 @@ def list_areas(screen: ScreenGaussians, width: int, height: int, threads: int) -
 
 
 def sort_positions(positions: np.ndarray, width: int, height: int) -> SortedPositions:
-    """Sort positions by cell, stable within a cell; drop those outside the image.
+    """Sort (m, 2) positions by cell, stable within a cell; drop those outside the image.
 
-    Parameters
-    ----------
-    positions : (m, 2) array
-        Pixels. The image is ``0 <= x <= width``, ``0 <= y <= height``; NaN counts as outside.
+    In pixels; the image is ``0 <= x <= width``, ``0 <= y <= height``, and NaN counts as outside.
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     shift = 0
@@ -167,18 +155,10 @@ def strip_span(x0: float, y0: float, x1: float, y1: float, skew: float, top: flo
 
 @kernel(fast=False)
 def scan_areas(
-    begin: int,
-    end: int,
-    order: np.ndarray,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    tiles_x: int,
-    tiles_y: int,
-    heads: np.ndarray,
-    intersection_offsets: np.ndarray,
-    gaussian_ids: np.ndarray,
+    begin: int, end: int, order: np.ndarray, boxes: np.ndarray, skews: np.ndarray, tiles_x: int,
+    tiles_y: int, heads: np.ndarray, intersection_offsets: np.ndarray, gaussian_ids: np.ndarray,
     intersection_slots: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Count the intersections of ``order[begin .. end]``; write them if ``gaussian_ids`` has room.
 
     Counting adds to ``heads (tiles,)`` and writes the number of intersections of Gaussian i to
@@ -219,15 +199,9 @@ def scan_areas(
 
 @kernel(fast=False)
 def find_cells(
-    coordinates: np.ndarray,
-    width: int,
-    height: int,
-    tiles_x: int,
-    tiles_y: int,
-    shift: int,
-    cells: np.ndarray,
-    start: np.ndarray,
-) -> None:
+    coordinates: np.ndarray, width: int, height: int, tiles_x: int, tiles_y: int, shift: int,
+    cells: np.ndarray, start: np.ndarray,
+) -> None:  # fmt: skip
     """Write the cell of each position, or -1; count the positions of cell c in ``start[c + 1]``."""
     mask = (1 << shift) - 1
     cell_px = np.float32(TILE >> shift)

@@ -105,34 +105,16 @@ def _span_gradient(span: Any, x: Any, y: Any, t: Any, weight: Any, stop: Any) ->
 
 @kernel(fast=True)
 def query_gradient_range(
-    first_tile: int,
-    end_tile: int,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    start: np.ndarray,
-    gaussian_ids: np.ndarray,
-    intersection_slots: np.ndarray,
-    tiles_x: int,
-    shift: int,
-    cell_start: np.ndarray,
-    coordinates: np.ndarray,
-    depths: np.ndarray,
-    weights: np.ndarray,
-    stops: np.ndarray,
-    intersection_grads: np.ndarray,
+    first_tile: int, end_tile: int, params: np.ndarray, boxes: np.ndarray, skews: np.ndarray,
+    start: np.ndarray, gaussian_ids: np.ndarray, intersection_slots: np.ndarray, tiles_x: int,
+    shift: int, cell_start: np.ndarray, coordinates: np.ndarray, depths: np.ndarray,
+    weights: np.ndarray, stops: np.ndarray, intersection_grads: np.ndarray,
     grad_coordinates: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Write the gradient of ``sum weights * log T(depths)`` for the positions of tiles.
 
-    Parameters
-    ----------
-    depths, weights : (k,) float32
-    stops : (k,) int32
-        As :func:`~.query_kernels.query_range` wrote them.
-    intersection_grads : (intersections, 13) float32
-        Zero on entry; each intersection accumulates at its slot, cell by cell.
-    grad_coordinates : (k, 2) float32
+    ``stops`` are those of :func:`~.query_kernels.query_range`. ``intersection_grads
+    (intersections, 13)`` is zero on entry; each intersection accumulates at its slot, cell by cell.
     """
     longest = longest_list(first_tile, end_tile, start, shift, cell_start)
     room = (longest + SPAN - 1) // SPAN
@@ -246,19 +228,9 @@ class QueryResult:
 def query_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> QueryView:
     """Project Gaussians for queries only, including those between pixel centres.
 
-    Parameters
-    ----------
-    gaussians : RawArrays
-        Scene frame.
-    camera : Camera
-        In the scene frame.
-    options : RenderOptions
-        ``near_z``, ``depth_valid_transmittance`` and ``threads`` are used.
-
-    Raises
-    ------
-    ResourceError
-        If the tile lists are too long to be indexed.
+    Gaussians and camera in the scene frame; of the options ``near_z``,
+    ``depth_valid_transmittance`` and ``threads`` are used. Raises ResourceError if the tile lists
+    are too long to be indexed.
     """
     threads = options.threads or default_threads()
     # Colours are not needed.
@@ -276,21 +248,8 @@ def solve_depths(view: QueryView, positions: np.ndarray) -> QueryResult:
     the final transmittance exceeds ``depth_valid_transmittance`` or where the transmittance at
     depth 0 is below one half.
 
-    Parameters
-    ----------
-    view : QueryView
-    positions : (m, 2) array
-        Pixels; rounded to float32.
-
-    Returns
-    -------
-    QueryResult
-        z-depths; 0 where there is none, outside ``[0, width] x [0, height]`` and for NaN.
-
-    Raises
-    ------
-    UsageError
-        If the positions are not (m, 2).
+    ``positions (m, 2)`` are pixels, rounded to float32; UsageError if their shape differs. The
+    result is 0 where there is no depth, outside ``[0, width] x [0, height]`` and for NaN.
     """
     coordinates = np.asarray(positions)
     if coordinates.ndim != 2 or coordinates.shape[1] != 2:
@@ -324,20 +283,8 @@ def add_query_gradients(
     The gradient of a depth is that of the implicit function, with the floored slope of
     docs/method.md, section 2.5. Bitwise the same for any number of threads.
 
-    Parameters
-    ----------
-    view : QueryView
-        The view of the query.
-    result : QueryResult
-    grads : (m,) array
-        On ``result.values``; ignored for positions without a result.
-    grad_params : (n, 24) float32
-        Accumulated into; columns from 13 on are unchanged.
-
-    Returns
-    -------
-    (m, 2) float32
-        The gradient on the positions.
+    ``grads (m,)`` are ignored for positions without a result; columns of ``grad_params (n, 24)
+    float32`` from 13 on are unchanged. Returns the (m, 2) float32 gradient on the positions.
     """
     positions, lists = result.positions, view.lists
     incoming = np.asarray(grads)[positions.order].astype(np.float32)  # (k,)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numba.core import cgutils, types
-from numba.extending import intrinsic
 
 from .. import limits
 from ..compiled import inline
@@ -26,6 +25,7 @@ from .simd import (
     Mask,
     State,
     Vector,
+    compile_time,
     copy_run,
     simd_math_exp_wide,
 )
@@ -127,7 +127,7 @@ class _Solver:
 
     def __init__(self, lanes: int, context: Any, builder: Any, sig: Any, args: Any) -> None:
         self.block = Block(lanes, context, builder)
-        self.state = self.block.data(sig.args[0], args[0])
+        self.state = self.block.data(sig.args[1], args[1])
 
     def read(self, plane: int) -> Vector:
         """Return a vector of the solver's state."""
@@ -154,44 +154,39 @@ class _Solver:
         return is_open.bits()
 
 
-def _evaluate_intrinsic(lanes: int) -> Any:
-    @intrinsic
-    def evaluate(typingctx, m, lists, count, factor):  # type: ignore[no-untyped-def]
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            solver = _Solver(lanes, context, builder, sig, args)
-            block, entries = solver.block, solver.block.data(sig.args[1], args[1])
-            t = solver.read(AT_DEPTH) * block.splat(args[3])
-            product, slope, curvature = (
-                State(block, solver.read(_PREFIX)),
-                State(block, 0.0),
-                State(block, 0.0),
+@compile_time
+def _evaluate(typingctx, lanes, m, lists, count, factor):  # type: ignore[no-untyped-def]
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        solver = _Solver(lanes.literal_value, context, builder, sig, args)
+        block, entries = solver.block, solver.block.data(sig.args[2], args[2])
+        t = solver.read(AT_DEPTH) * block.splat(args[4])
+        product, slope, curvature = (
+            State(block, solver.read(_PREFIX)), State(block, 0.0), State(block, 0.0),
+        )  # fmt: skip
+
+        def multiply(n: Any) -> None:
+            _, (alpha, peak, sharpness) = solver.entry(entries, n)
+            ahead = (peak - t).max(0.0)
+            log_slope = sharpness * ahead
+            density = (alpha * simd_math_exp_wide(log_slope * ahead, 0.5)).min(
+                float(constants.ALPHA_MAX)
             )
+            keep = 1.0 - density
+            rise = density * log_slope  # d(density) / dt
+            growth = density * (log_slope * log_slope - (ahead > 0.0).select(sharpness, 0.0))
+            p, d = product.get(), slope.get()
+            curvature.set(curvature.get() * keep - (d * 2.0 * rise + p * growth))
+            slope.set(d * keep - p * rise)
+            product.set(p * keep)
 
-            def multiply(n: Any) -> None:
-                _, (alpha, peak, sharpness) = solver.entry(entries, n)
-                ahead = (peak - t).max(0.0)
-                log_slope = sharpness * ahead
-                density = (alpha * simd_math_exp_wide(log_slope * ahead, 0.5)).min(
-                    float(constants.ALPHA_MAX)
-                )
-                keep = 1.0 - density
-                rise = density * log_slope  # d(density) / dt
-                growth = density * (log_slope * log_slope - (ahead > 0.0).select(sharpness, 0.0))
-                p, d = product.get(), slope.get()
-                curvature.set(curvature.get() * keep - (d * 2.0 * rise + p * growth))
-                slope.set(d * keep - p * rise)
-                product.set(p * keep)
+        block.repeat(args[3], multiply)
+        solver.write(product.get(), _PRODUCT)
+        solver.write(slope.get(), _FIRST)
+        solver.write(curvature.get(), _SECOND)
+        return context.get_dummy_value()
 
-            block.repeat(args[2], multiply)
-            solver.write(product.get(), _PRODUCT)
-            solver.write(slope.get(), _FIRST)
-            solver.write(curvature.get(), _SECOND)
-            return context.get_dummy_value()
-
-        index = types.intp
-        return types.void(m, lists, index, types.float32), generate
-
-    return evaluate
+    index = types.intp
+    return types.void(lanes, m, lists, index, types.float32), generate
 
 
 def _log_of_twice(product: Vector) -> Vector:
@@ -202,180 +197,155 @@ def _log_of_twice(product: Vector) -> Vector:
     return y * ((square * (2 / 5) + 2 / 3) * square + 2.0)
 
 
-def _approach_intrinsic(lanes: int) -> Any:
-    @intrinsic
-    def approach(typingctx, m, lists, count):  # type: ignore[no-untyped-def]
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            solver = _Solver(lanes, context, builder, sig, args)
-            block, entries = solver.block, solver.block.data(sig.args[1], args[1])
-            guess, sharpest = State(block, solver.read(AT_DEPTH)), solver.read(_SHARPEST)
-            low, high = State(block, solver.read(_LOW)), State(block, solver.read(_HIGH))
-            product, slope = State(block, 1.0), State(block, 0.0)
+@compile_time
+def _approach(typingctx, lanes, m, lists, count):  # type: ignore[no-untyped-def]
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        solver = _Solver(lanes.literal_value, context, builder, sig, args)
+        block, entries = solver.block, solver.block.data(sig.args[2], args[2])
+        guess, sharpest = State(block, solver.read(AT_DEPTH)), solver.read(_SHARPEST)
+        low, high = State(block, solver.read(_LOW)), State(block, solver.read(_HIGH))
+        product, slope = State(block, 1.0), State(block, 0.0)
 
-            def multiply(n: Any) -> None:
-                _, (alpha, peak, sharpness) = solver.entry(entries, n)
-                ahead = (peak - guess.get()).max(0.0)
-                log_slope = sharpness * ahead
-                # (1 - x / 8)^8 approximates exp(-x).
-                fall = (1.0 - log_slope * ahead * (0.5 / 8.0)).max(0.0)
-                fall = fall * fall
-                fall = fall * fall
-                density = (alpha * (fall * fall)).min(float(constants.ALPHA_MAX))
-                keep = 1.0 - density
-                slope.set(slope.get() * keep - product.get() * (density * log_slope))
-                product.set(product.get() * keep)
+        def multiply(n: Any) -> None:
+            _, (alpha, peak, sharpness) = solver.entry(entries, n)
+            ahead = (peak - guess.get()).max(0.0)
+            log_slope = sharpness * ahead
+            # (1 - x / 8)^8 approximates exp(-x).
+            fall = (1.0 - log_slope * ahead * (0.5 / 8.0)).max(0.0)
+            fall = fall * fall
+            fall = fall * fall
+            density = (alpha * (fall * fall)).min(float(constants.ALPHA_MAX))
+            keep = 1.0 - density
+            slope.set(slope.get() * keep - product.get() * (density * log_slope))
+            product.set(product.get() * keep)
 
-            def iterate(_: Any) -> None:
-                product.set(1.0)
-                slope.set(0.0)
-                block.repeat(args[2], multiply)
-                t, light = guess.get(), product.get().max(_TINY)
-                above = light > constants.ISO_LEVEL
-                low.set(above.select(t, low.get()))
-                high.set(above.select(high.get(), t))
-                excess = _log_of_twice(light)
-                moved = t + excess * light / (slope.get() * -1.0).max(
-                    sharpest * light * _NEWTON_FLOOR
-                )
-                inside = (moved > low.get()) & (moved < high.get())
-                guess.set(inside.select(moved, (low.get() + high.get()) * 0.5))
+        def iterate(_: Any) -> None:
+            product.set(1.0)
+            slope.set(0.0)
+            block.repeat(args[3], multiply)
+            t, light = guess.get(), product.get().max(_TINY)
+            above = light > constants.ISO_LEVEL
+            low.set(above.select(t, low.get()))
+            high.set(above.select(high.get(), t))
+            excess = _log_of_twice(light)
+            moved = t + excess * light / (slope.get() * -1.0).max(sharpest * light * _NEWTON_FLOOR)
+            inside = (moved > low.get()) & (moved < high.get())
+            guess.set(inside.select(moved, (low.get() + high.get()) * 0.5))
 
-            block.repeat(block.index(_APPROXIMATE_STEPS), iterate)
-            solver.write(solver.is_open().select(guess.get(), 0.0), AT_DEPTH)
-            return context.get_dummy_value()
+        block.repeat(block.index(_APPROXIMATE_STEPS), iterate)
+        solver.write(solver.is_open().select(guess.get(), 0.0), AT_DEPTH)
+        return context.get_dummy_value()
 
-        return types.void(m, lists, types.intp), generate
-
-    return approach
+    return types.void(lanes, m, lists, types.intp), generate
 
 
-def _compact_intrinsic(lanes: int) -> Any:
-    @intrinsic
-    def compact(typingctx, m, lists, count):  # type: ignore[no-untyped-def]
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            solver = _Solver(lanes, context, builder, sig, args)
-            block, entries = solver.block, solver.block.data(sig.args[1], args[1])
-            low, high, is_open = solver.read(_LOW), solver.read(_HIGH), solver.is_open()
-            prefix = State(block, solver.read(_PREFIX))
-            kept = cgutils.alloca_once_value(builder, block.index(0))
+@compile_time
+def _compact(typingctx, lanes, m, lists, count):  # type: ignore[no-untyped-def]
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        solver = _Solver(lanes.literal_value, context, builder, sig, args)
+        block, entries = solver.block, solver.block.data(sig.args[2], args[2])
+        low, high, is_open = solver.read(_LOW), solver.read(_HIGH), solver.is_open()
+        prefix = State(block, solver.read(_PREFIX))
+        kept = cgutils.alloca_once_value(builder, block.index(0))
 
-            def move(n: Any) -> None:
-                _, (alpha, peak, sharpness) = solver.entry(entries, n)
-                behind = (peak - high).max(0.0)
-                changes = (peak > low) & (alpha > 0.0) & (sharpness * behind * behind < NEGLIGIBLE)
-                matters = (changes & is_open).any()
-                target = builder.load(kept)
-                offsets, _ = solver.entry(entries, target)
-                for offset, value in zip(offsets, (alpha, peak, sharpness), strict=True):
-                    block.store(value, entries, offset)
-                builder.store(builder.add(target, builder.zext(matters, target.type)), kept)
-                passed = (peak <= low).select(1.0 - alpha.min(float(constants.ALPHA_MAX)), 1.0)
-                factor = builder.select(matters, block.vector(1.0).value, passed.value)
-                prefix.set(prefix.get() * Vector(block, factor))
+        def move(n: Any) -> None:
+            _, (alpha, peak, sharpness) = solver.entry(entries, n)
+            behind = (peak - high).max(0.0)
+            changes = (peak > low) & (alpha > 0.0) & (sharpness * behind * behind < NEGLIGIBLE)
+            matters = (changes & is_open).any()
+            target = builder.load(kept)
+            offsets, _ = solver.entry(entries, target)
+            for offset, value in zip(offsets, (alpha, peak, sharpness), strict=True):
+                block.store(value, entries, offset)
+            builder.store(builder.add(target, builder.zext(matters, target.type)), kept)
+            passed = (peak <= low).select(1.0 - alpha.min(float(constants.ALPHA_MAX)), 1.0)
+            factor = builder.select(matters, block.vector(1.0).value, passed.value)
+            prefix.set(prefix.get() * Vector(block, factor))
 
-            block.repeat(args[2], move)
-            solver.write(prefix.get(), _PREFIX)
-            return builder.load(kept)
+        block.repeat(args[3], move)
+        solver.write(prefix.get(), _PREFIX)
+        return builder.load(kept)
 
-        index = types.intp
-        return types.intp(m, lists, index), generate
-
-    return compact
+    index = types.intp
+    return types.intp(lanes, m, lists, index), generate
 
 
-def _drop_occluded_intrinsic(lanes: int) -> Any:
-    @intrinsic
-    def drop_occluded(typingctx, m):  # type: ignore[no-untyped-def]
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            solver = _Solver(lanes, context, builder, sig, args)
-            is_open = solver.is_open() & (solver.read(_PRODUCT) > constants.ISO_LEVEL)
-            solver.write(is_open.select(solver.read(AT_DEPTH), 0.0), AT_DEPTH)
-            return solver.set_open(is_open)
+@compile_time
+def _drop_occluded(typingctx, lanes, m):  # type: ignore[no-untyped-def]
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        solver = _Solver(lanes.literal_value, context, builder, sig, args)
+        is_open = solver.is_open() & (solver.read(_PRODUCT) > constants.ISO_LEVEL)
+        solver.write(is_open.select(solver.read(AT_DEPTH), 0.0), AT_DEPTH)
+        return solver.set_open(is_open)
 
-        return types.uint64(m), generate
-
-    return drop_occluded
+    return types.uint64(lanes, m), generate
 
 
-def _open_intrinsic(lanes: int) -> Any:
-    @intrinsic
-    def open_pixels(typingctx, m):  # type: ignore[no-untyped-def]
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            return _Solver(lanes, context, builder, sig, args).is_open().bits()
+@compile_time
+def _open_pixels(typingctx, lanes, m):  # type: ignore[no-untyped-def]
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return _Solver(lanes.literal_value, context, builder, sig, args).is_open().bits()
 
-        return types.uint64(m), generate
-
-    return open_pixels
+    return types.uint64(lanes, m), generate
 
 
-def _step_intrinsic(lanes: int) -> Any:
-    @intrinsic
-    def step(typingctx, m, bisect):  # type: ignore[no-untyped-def]
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            solver = _Solver(lanes, context, builder, sig, args)
-            block, is_open = solver.block, solver.is_open()
-            t, low, high = solver.read(AT_DEPTH), solver.read(_LOW), solver.read(_HIGH)
-            sharpest, product = solver.read(_SHARPEST), solver.read(_PRODUCT).max(_TINY)
-            excess = _log_of_twice(product)
-            # First and second derivative of -log T, and Halley's correction of the Newton step.
-            inverse = 1.0 / product
-            slope = solver.read(_FIRST) * inverse * -1.0
-            growth = slope * slope - solver.read(_SECOND) * inverse
-            floored = slope.max(sharpest * _NEWTON_FLOOR)
-            inverse_slope = 1.0 / floored
-            newton = excess * inverse_slope
-            move = newton / (newton * growth * inverse_slope * 0.5 + 1.0).max(_MIN_CORRECTION).min(
-                _MAX_CORRECTION
-            )
-            above = excess > 0.0
-            low = above.select(t, low)
-            high = above.select(high, t)
-            moved = t + move
-            size = move.abs()
-            inside = (moved > low) & (moved < high) & (block.splat(args[1]) <= 0.0)
-            sigmas = size * sharpest
-            small = (sigmas < _STEP_SIGMAS) & (t * sharpest < _COARSE)
-            done = small & (sigmas * sigmas * size <= t * _CUBE_SHARE)
-            level = excess.abs()
-            done = done | (sigmas < _STEP_SIGMAS_ALONE)
-            done = done | ((size <= t * _STEP_SHARE) & (level < _LEVEL_NEAR))
-            done = done | (level <= _LEVEL_MARGIN) | (high - low <= high * _STEP_SHARE)
-            # A small last step is taken and the slope extrapolated over it: log(-log T) is a
-            # parabola in front of a single Gaussian. Otherwise, or if the depth's rounding error is
-            # a large part of a sigma, the pixel stays where the slope is known, because the
-            # gradient must be that of the stored depth. Rounding may put the step on the bracket's
-            # end, hence no test for inside.
-            settled = small.select(moved.max(low).min(high), t)
-            moved = done.select(settled, inside.select(moved, (low + high) * 0.5))
-            over = settled - t
-            depth = (_LOG_2 - excess).max(_MIN_OPTICAL_DEPTH)
-            ratio = slope / depth
-            ratio_change = (growth / depth - ratio * ratio) * over
-            gain = (ratio + ratio_change * 0.5) * over
-            final = (ratio + ratio_change) * depth * ((gain * 0.5 + 1.0) * gain + 1.0)
-            final = small.select(final, slope)
-            # For a layer thinner than the depth's rounding error, T jumps past 0.5 from a flat part
-            # and the gradient is lost: too small is better than a thousand times too large.
-            alone = solver.read(_AT_CROSSING)
-            lost = (level > _LEVEL_FAR) & (slope < alone * _FLAT)
-            final = lost.select(alone * 2.0, final.max(alone * limits.SLOPE_FLOOR))
-            solver.write(low, _LOW)
-            solver.write(high, _HIGH)
-            solver.write(is_open.select(moved, t), AT_DEPTH)
-            solver.write(is_open.select(final, solver.read(SLOPES)), SLOPES)
-            return solver.set_open(is_open & ~done)
+@compile_time
+def _step(typingctx, lanes, m, bisect):  # type: ignore[no-untyped-def]
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        solver = _Solver(lanes.literal_value, context, builder, sig, args)
+        block, is_open = solver.block, solver.is_open()
+        t, low, high = solver.read(AT_DEPTH), solver.read(_LOW), solver.read(_HIGH)
+        sharpest, product = solver.read(_SHARPEST), solver.read(_PRODUCT).max(_TINY)
+        excess = _log_of_twice(product)
+        # First and second derivative of -log T, and Halley's correction of the Newton step.
+        inverse = 1.0 / product
+        slope = solver.read(_FIRST) * inverse * -1.0
+        growth = slope * slope - solver.read(_SECOND) * inverse
+        floored = slope.max(sharpest * _NEWTON_FLOOR)
+        inverse_slope = 1.0 / floored
+        newton = excess * inverse_slope
+        move = newton / (newton * growth * inverse_slope * 0.5 + 1.0).max(_MIN_CORRECTION).min(
+            _MAX_CORRECTION
+        )
+        above = excess > 0.0
+        low = above.select(t, low)
+        high = above.select(high, t)
+        moved = t + move
+        size = move.abs()
+        inside = (moved > low) & (moved < high) & (block.splat(args[2]) <= 0.0)
+        sigmas = size * sharpest
+        small = (sigmas < _STEP_SIGMAS) & (t * sharpest < _COARSE)
+        done = small & (sigmas * sigmas * size <= t * _CUBE_SHARE)
+        level = excess.abs()
+        done = done | (sigmas < _STEP_SIGMAS_ALONE)
+        done = done | ((size <= t * _STEP_SHARE) & (level < _LEVEL_NEAR))
+        done = done | (level <= _LEVEL_MARGIN) | (high - low <= high * _STEP_SHARE)
+        # A small last step is taken and the slope extrapolated over it: log(-log T) is a
+        # parabola in front of a single Gaussian. Otherwise, or if the depth's rounding error is
+        # a large part of a sigma, the pixel stays where the slope is known, because the
+        # gradient must be that of the stored depth. Rounding may put the step on the bracket's
+        # end, hence no test for inside.
+        settled = small.select(moved.max(low).min(high), t)
+        moved = done.select(settled, inside.select(moved, (low + high) * 0.5))
+        over = settled - t
+        depth = (_LOG_2 - excess).max(_MIN_OPTICAL_DEPTH)
+        ratio = slope / depth
+        ratio_change = (growth / depth - ratio * ratio) * over
+        gain = (ratio + ratio_change * 0.5) * over
+        final = (ratio + ratio_change) * depth * ((gain * 0.5 + 1.0) * gain + 1.0)
+        final = small.select(final, slope)
+        # For a layer thinner than the depth's rounding error, T jumps past 0.5 from a flat part
+        # and the gradient is lost: too small is better than a thousand times too large.
+        alone = solver.read(_AT_CROSSING)
+        lost = (level > _LEVEL_FAR) & (slope < alone * _FLAT)
+        final = lost.select(alone * 2.0, final.max(alone * limits.SLOPE_FLOOR))
+        solver.write(low, _LOW)
+        solver.write(high, _HIGH)
+        solver.write(is_open.select(moved, t), AT_DEPTH)
+        solver.write(is_open.select(final, solver.read(SLOPES)), SLOPES)
+        return solver.set_open(is_open & ~done)
 
-        return types.uint64(m, types.float32), generate
-
-    return step
-
-
-approach_8, approach_16 = _approach_intrinsic(8), _approach_intrinsic(16)
-evaluate_8, evaluate_16 = _evaluate_intrinsic(8), _evaluate_intrinsic(16)
-compact_8, compact_16 = _compact_intrinsic(8), _compact_intrinsic(16)
-open_8, open_16 = _open_intrinsic(8), _open_intrinsic(16)
-drop_occluded_8, drop_occluded_16 = _drop_occluded_intrinsic(8), _drop_occluded_intrinsic(16)
-step_8, step_16 = _step_intrinsic(8), _step_intrinsic(16)
+    return types.uint64(lanes, m, types.float32), generate
 
 
 # -- Compiled solver of the 0.5-isosurface depth of a block of pixels, from its contributor list
@@ -397,48 +367,26 @@ _NO_PIXELS = np.uint64(0)
 def solve_block(lanes: Any, m: Any, b: Any, lists: Any, count: Any) -> None:
     """Solve one block: z-depth (0 where there is none) and floored slope of its pixels.
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    m : (n,) float32
-        The tile's scratch, with brackets and initial guesses from blending; depth and slope are
-        written.
-    b : int
-        Start of the block in each plane.
-    lists : (n,) float32
-        Entries of the block, ``count`` of them; none if no pixel has an isosurface. Reordered.
+    The tile's scratch ``m`` holds brackets and initial guesses from blending, and receives both
+    from ``b`` on, the start of the block in each plane. ``lists`` has ``count`` entries, none if no
+    pixel has an isosurface; they are reordered.
     """
     is_open = _NO_PIXELS
     if count > 0:
-        is_open = open_16(m) if lanes == 16 else open_8(m)
+        is_open = _open_pixels(lanes, m)
     if is_open != _NO_PIXELS and m[NEAREST] <= ZERO:
         # Some Gaussian may reach the camera: a crossing needs T > 0.5 at depth 0.
-        if lanes == 16:
-            evaluate_16(m, lists, count, ZERO)
-            is_open = drop_occluded_16(m)
-        else:
-            evaluate_8(m, lists, count, ZERO)
-            is_open = drop_occluded_8(m)
+        _evaluate(lanes, m, lists, count, ZERO)
+        is_open = _drop_occluded(lanes, m)
     if is_open != _NO_PIXELS:
-        if lanes == 16:
-            approach_16(m, lists, count)
-        else:
-            approach_8(m, lists, count)
+        _approach(lanes, m, lists, count)
     steps = 0
     while is_open != _NO_PIXELS and steps < _MAX_STEPS:
         bisect = ONE if steps >= _NEWTON_STEPS and steps & 1 else ZERO
-        narrowed = steps > 0 and steps & 1 == 0
-        if lanes == 16:
-            if narrowed:
-                count = compact_16(m, lists, count)
-            evaluate_16(m, lists, count, ONE)
-            is_open = step_16(m, bisect)
-        else:
-            if narrowed:
-                count = compact_8(m, lists, count)
-            evaluate_8(m, lists, count, ONE)
-            is_open = step_8(m, bisect)
+        if steps > 0 and steps & 1 == 0:
+            count = _compact(lanes, m, lists, count)
+        _evaluate(lanes, m, lists, count, ONE)
+        is_open = _step(lanes, m, bisect)
         steps += 1
     copy_run(lanes, m, DEPTH * STRIDE + b, m, AT_DEPTH)
     copy_run(lanes, m, SLOPE * STRIDE + b, m, SLOPES)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch import Tensor
 from .. import limits
 from ..compiled import inline, kernel, part
 from ..errors import UsageError
-from ..gaussians.model import GaussianArrays, OrientedGaussians
+from ..gaussians.model import TRAINED, GaussianArrays, OrientedGaussians
 from ..parallel import default_threads, even_bounds, run_chunks
 from ..scene.camera import Camera
 from .projection_kernels import (
@@ -123,17 +124,13 @@ def _shape_gradients(m: Any, camera: Any) -> None:
             c, m[ROTATION + lane], m[ROTATION + 3 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
         )
         b = in_camera(
-            c,
-            m[ROTATION + BLOCK + lane],
-            m[ROTATION + 4 * BLOCK + lane],
+            c, m[ROTATION + BLOCK + lane], m[ROTATION + 4 * BLOCK + lane],
             m[ROTATION + 7 * BLOCK + lane],
-        )
+        )  # fmt: skip
         d = in_camera(
-            c,
-            m[ROTATION + 2 * BLOCK + lane],
-            m[ROTATION + 5 * BLOCK + lane],
+            c, m[ROTATION + 2 * BLOCK + lane], m[ROTATION + 5 * BLOCK + lane],
             m[ROTATION + 8 * BLOCK + lane],
-        )
+        )  # fmt: skip
         var0, var1, var2 = m[SCALE + lane], m[SCALE + BLOCK + lane], m[SCALE + 2 * BLOCK + lane]
         w0, w1, w2 = 1.0 / var0, 1.0 / var1, 1.0 / var2
         others0, others1, others2 = w1 * w2, w2 * w0, w0 * w1
@@ -176,17 +173,14 @@ def _shape_gradients(m: Any, camera: Any) -> None:
         flip = 1.0 / math.sqrt(hx * hx + hy * hy + hz * hz)
         nx, ny, nz = hx * flip, hy * flip, hz * flip
         gx, gy, gz = in_camera(
-            c,
-            m[_GRAD + 19 * BLOCK + lane],
-            m[_GRAD + 20 * BLOCK + lane],
+            c, m[_GRAD + 19 * BLOCK + lane], m[_GRAD + 20 * BLOCK + lane],
             m[_GRAD + 21 * BLOCK + lane],
-        )
+        )  # fmt: skip
         along = gx * nx + gy * ny + gz * nz
         g_h = (
-            g_hx - (gx - along * nx) * flip,
-            g_hy - (gy - along * ny) * flip,
+            g_hx - (gx - along * nx) * flip, g_hy - (gy - along * ny) * flip,
             (along * nz - gz) * flip,
-        )
+        )  # fmt: skip
         g_b, g_f = (g_bxx, g_bxy, g_byy), (g_fxx, g_fxy, g_fyy)
         g_cov = 0.5 * m[_GRAD + 22 * BLOCK + lane] / math.sqrt(cov_zz)
 
@@ -236,10 +230,8 @@ def _raw_gradients(m: Any) -> None:
         inverse = 0.0 if degenerate else inverse
         w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
         g00, g11, g22 = (
-            m[ROTATION + lane],
-            m[ROTATION + 4 * BLOCK + lane],
-            m[ROTATION + 8 * BLOCK + lane],
-        )
+            m[ROTATION + lane], m[ROTATION + 4 * BLOCK + lane], m[ROTATION + 8 * BLOCK + lane],
+        )  # fmt: skip
         g01, g10 = m[ROTATION + BLOCK + lane], m[ROTATION + 3 * BLOCK + lane]
         g02, g20 = m[ROTATION + 2 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
         g12, g21 = m[ROTATION + 5 * BLOCK + lane], m[ROTATION + 7 * BLOCK + lane]
@@ -260,10 +252,8 @@ def _raw_gradients(m: Any) -> None:
         g = m[_GRAD + 11 * BLOCK + lane] * m[OPACITY + lane]
         m[_GRAD_LOGIT + lane] = g * m[TRANSPARENCY + lane]
         k0, k1, k2 = (
-            m[RAW_SHARE + lane],
-            m[RAW_SHARE + BLOCK + lane],
-            m[RAW_SHARE + 2 * BLOCK + lane],
-        )
+            m[RAW_SHARE + lane], m[RAW_SHARE + BLOCK + lane], m[RAW_SHARE + 2 * BLOCK + lane],
+        )  # fmt: skip
         m[_GRAD_SCALE + lane] = k0 * m[_GRAD_SCALE + lane] + (1.0 - k0) * g
         m[_GRAD_SCALE + BLOCK + lane] = k1 * m[_GRAD_SCALE + BLOCK + lane] + (1.0 - k1) * g
         m[_GRAD_SCALE + 2 * BLOCK + lane] = k2 * m[_GRAD_SCALE + 2 * BLOCK + lane] + (1.0 - k2) * g
@@ -309,29 +299,13 @@ def _drop_overflows(m: Any) -> None:
 
 @kernel(fast=False, fused=True)
 def backward_range(
-    begin: int,
-    end: int,
-    ids: np.ndarray,
-    compact: bool,
-    means: np.ndarray,
-    log_scales: np.ndarray,
-    quats: np.ndarray,
-    opacity_logits: np.ndarray,
-    sh: np.ndarray,
-    orientation: np.ndarray,
-    filter_3d: np.ndarray,
-    degree: int,
-    camera: np.ndarray,
-    params: np.ndarray,
-    visible: np.ndarray,
-    grad_params: np.ndarray,
-    grad_means: np.ndarray,
-    grad_log_scales: np.ndarray,
-    grad_quats: np.ndarray,
-    grad_opacity_logits: np.ndarray,
-    grad_sh: np.ndarray,
+    begin: int, end: int, ids: np.ndarray, compact: bool, means: np.ndarray, log_scales: np.ndarray,
+    quats: np.ndarray, opacity_logits: np.ndarray, sh: np.ndarray, orientation: np.ndarray,
+    filter_3d: np.ndarray, degree: int, camera: np.ndarray, params: np.ndarray, visible: np.ndarray,
+    grad_params: np.ndarray, grad_means: np.ndarray, grad_log_scales: np.ndarray,
+    grad_quats: np.ndarray, grad_opacity_logits: np.ndarray, grad_sh: np.ndarray,
     grad_orientation: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Write the gradients of the Gaussians ``begin .. end``, or of ``ids[begin .. end]``.
 
     The gradient is 0 for Gaussians that are not visible or if it overflows float32. With
@@ -479,8 +453,7 @@ class RawGradients:
     @classmethod
     def zeros(cls, gaussians: RawArrays) -> RawGradients:
         """Return zero gradients of the Gaussians' shapes and float type."""
-        names = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
-        return cls(**{name: np.zeros_like(getattr(gaussians, name)) for name in names})
+        return cls(*(np.zeros_like(getattr(gaussians, name)) for name in TRAINED))
 
 
 @dataclass(frozen=True)
@@ -513,12 +486,10 @@ class ScreenGaussians:
     def allocate(cls, count: int) -> ScreenGaussians:
         """Return arrays for ``count`` Gaussians, none visible; pass them as ``out`` to reuse."""
         return cls(
-            np.zeros((count, PARAM_COLUMNS), np.float32),
-            np.zeros((count, 4), np.float32),
-            np.zeros(count, np.bool_),
-            np.full(count, np.inf, np.float32),
+            np.zeros((count, PARAM_COLUMNS), np.float32), np.zeros((count, 4), np.float32),
+            np.zeros(count, np.bool_), np.full(count, np.inf, np.float32),
             np.zeros(count, np.float32),
-        )
+        )  # fmt: skip
 
     def arguments(self) -> tuple[np.ndarray, ...]:
         """Return the arrays in the argument order of the kernels."""
@@ -539,10 +510,7 @@ def pack_camera(camera: Camera, near_z: float) -> np.ndarray:
 def used_degree(coefficients: int, options: RenderOptions) -> int:
     """Return the degree of the harmonics that a rendering uses.
 
-    Raises
-    ------
-    UsageError
-        If ``coefficients`` is not 1, 4, 9 or 16.
+    Raises UsageError if ``coefficients`` is not 1, 4, 9 or 16.
     """
     stored = round(coefficients**0.5) - 1
     if (stored + 1) ** 2 != coefficients or not 0 <= stored <= MAX_DEGREE:
@@ -560,71 +528,34 @@ def project_gaussians(
 ) -> ScreenGaussians:
     """Activate and project raw Gaussians, in float64 (docs/method.md, sections 1.5 and 2.3).
 
-    Parameters
-    ----------
-    gaussians : RawArrays
-        Scene frame, scene units.
-    camera : Camera
-        In the scene frame.
-    options : RenderOptions
-        ``near_z``, ``sh_degree`` and ``threads`` are used.
-    out : ScreenGaussians, optional
-        Output arrays of the same length; then only a few kilobytes are allocated.
+    Gaussians and camera are in the scene frame; of the options ``near_z``, ``sh_degree`` and
+    ``threads`` are used. With ``out``, arrays of the same length, only a few kilobytes are
+    allocated.
 
-    Returns
-    -------
-    ScreenGaussians
-        Not visible are Gaussians nearer than ``near_z``, fainter than 1/255, outside the image,
-        between pixel centres, or with non-finite values.
+    Not visible are Gaussians nearer than ``near_z``, fainter than 1/255, outside the image, between
+    pixel centres, or with non-finite values.
     """
     count = len(gaussians)
-    screen = _output(count, out)
-    packed = pack_camera(camera, options.near_z)
-    degree = used_degree(gaussians.sh.shape[1], options)
-    threads = options.threads or default_threads()
-
-    def run(begin: int, end: int) -> None:
-        project_raw_range(
-            begin,
-            end,
-            *gaussians.arguments(),
-            degree,
-            packed,
-            *screen.arguments(),
-        )
-
-    run_chunks(run, even_bounds(count, threads), threads)
+    screen = ScreenGaussians.allocate(count) if out is None else out
+    if len(screen) != count:
+        raise UsageError(f"The output holds {len(screen)} rows, not {count}.", "Allocate it anew.")
+    _run(
+        project_raw_range, count, options.threads, *_raw_arguments(gaussians, camera, options),
+        *screen.arguments(),
+    )  # fmt: skip
     return screen
 
 
 def project_arrays(
-    arrays: GaussianArrays,
-    camera: Camera,
-    near_z: float,
-    *,
-    threads: int = 0,
-    out: ScreenGaussians | None = None,
+    arrays: GaussianArrays, camera: Camera, near_z: float, *, threads: int = 0
 ) -> ScreenGaussians:
     """Project activated Gaussians like :func:`project_gaussians`; the colour columns are 0."""
-    count = len(arrays)
-    screen = _output(count, out)
-    packed = pack_camera(camera, near_z)
-    threads = threads or default_threads()
-
-    def run(begin: int, end: int) -> None:
-        project_activated_range(
-            begin,
-            end,
-            arrays.means,
-            arrays.scales,
-            arrays.rotations,
-            arrays.log_opacities,
-            arrays.normals,
-            packed,
-            *screen.arguments(),
-        )
-
-    run_chunks(run, even_bounds(count, threads), threads)
+    screen = ScreenGaussians.allocate(len(arrays))
+    _run(
+        project_activated_range, len(arrays), threads, arrays.means, arrays.scales,
+        arrays.rotations, arrays.log_opacities, arrays.normals, pack_camera(camera, near_z),
+        *screen.arguments(),
+    )  # fmt: skip
     return screen
 
 
@@ -638,33 +569,12 @@ def project_backward(
 ) -> None:
     """Add the gradient with respect to the raw parameters to ``grads_out``; computed in float64.
 
-    Parameters
-    ----------
-    gaussians, camera, options
-        Arguments of :func:`project_gaussians`.
-    screen : ScreenGaussians
-        Its unmodified result; only rows of visible Gaussians are read. A colour of 0 there was
-        clamped and has no gradient.
-    grad_params : (n, 24) float32 or float64
-        Gradient with respect to ``screen.params``. Column 23 is ignored.
-    grads_out : RawGradients
-        Accumulated into. A direction of length 0 and a degenerate quaternion have gradient 0.
+    ``screen`` is the unmodified result of :func:`project_gaussians`, of which only rows of visible
+    Gaussians are read: a colour of 0 there was clamped and has no gradient. ``grad_params (n, 24)``
+    float32 or float64 is the gradient on its params, whose column 23 is ignored. A direction of
+    length 0 and a degenerate quaternion have gradient 0.
     """
     _backward(gaussians, camera, options, screen, grad_params, None, grads_out)
-
-
-def allocate_visible(gaussians: RawArrays, count: int) -> VisibleGradients:
-    """Return arrays for the gradients of up to ``count`` visible Gaussians."""
-    coefficients = gaussians.sh.shape[1]
-    return VisibleGradients(
-        np.zeros(count, np.int32),
-        np.zeros((count, 3), np.float32),
-        np.zeros((count, 3), np.float32),
-        np.zeros((count, 4), np.float32),
-        np.zeros(count, np.float32),
-        np.zeros((count, coefficients, 3), np.float32),
-        np.zeros((count, 4), np.float32),
-    )
 
 
 def project_backward_visible(
@@ -674,53 +584,23 @@ def project_backward_visible(
     screen: ScreenGaussians,
     grad_params: np.ndarray,
     ids: np.ndarray,
-    out: VisibleGradients | None = None,
+    take: Callable[[str, tuple[int, ...], Any], np.ndarray] | None = None,
 ) -> VisibleGradients:
-    """Write the gradient with respect to the raw parameters of some Gaussians, one row each.
+    """Return the gradient with respect to the raw parameters of some Gaussians, one row each.
 
-    Parameters
-    ----------
-    gaussians, camera, options
-        Arguments of :func:`project_gaussians`.
-    screen : ScreenGaussians
-        Its unmodified result.
-    grad_params : (n, 24) float32 or float64
-        Gradient with respect to ``screen.params``; only the rows ``ids`` are read.
-    ids : (v,) int32
-        Indices of Gaussians, increasing. Those that are not visible get rows of 0.
-    out : VisibleGradients, optional
-        Arrays of at least v rows (:func:`allocate_visible`); overwritten.
-
-    Returns
-    -------
-    VisibleGradients
-        Views of the first v rows of ``out``. Coefficients above the degree used get 0.
-
-    Raises
-    ------
-    UsageError
-        If ``out`` has fewer than v rows or another number of harmonics coefficients.
+    Arguments as for :func:`project_backward`, of whose ``grad_params`` only the rows
+    ``ids (v,) int32``, increasing, are read. Those that are not visible get rows of 0, as do
+    coefficients above the degree used. ``take(name, shape, dtype)`` returns the arrays to write; by
+    default new ones.
     """
-    count = len(ids)
-    if out is None:
-        out = allocate_visible(gaussians, count)
-    if len(out.means) < count or out.sh.shape[1] != gaussians.sh.shape[1]:
-        raise UsageError(
-            f"The scratch holds {len(out.means)} rows of {out.sh.shape[1]} coefficients, not "
-            f"{count} of {gaussians.sh.shape[1]}.",
-            "Allocate it anew.",
-        )
-    part = VisibleGradients(
-        ids,
-        out.means[:count],
-        out.log_scales[:count],
-        out.quats[:count],
-        out.opacity_logits[:count],
-        out.sh[:count],
-        out.orientation[:count],
-    )
-    _backward(gaussians, camera, options, screen, grad_params, ids, part)
-    return part
+    rows = [
+        np.empty(shape, np.float32) if take is None else take(f"grad {name}", shape, np.float32)
+        for name in TRAINED
+        for shape in [(len(ids), *getattr(gaussians, name).shape[1:])]
+    ]
+    out = VisibleGradients(ids, *rows)
+    _backward(gaussians, camera, options, screen, grad_params, ids, out)
+    return out
 
 
 _NO_IDS = np.zeros(0, np.int32)
@@ -736,37 +616,23 @@ def _backward(
     grads_out: RawGradients | VisibleGradients,
 ) -> None:
     """Run the backward kernel: write the rows of ``ids``, or add to those of all Gaussians."""
-    count = len(gaussians) if ids is None else len(ids)
-    packed = pack_camera(camera, options.near_z)
+    _run(
+        backward_range, len(gaussians) if ids is None else len(ids), options.threads,
+        _NO_IDS if ids is None else ids, ids is not None,
+        *_raw_arguments(gaussians, camera, options), screen.params, screen.visible, grad_params,
+        *(getattr(grads_out, name) for name in TRAINED),
+    )  # fmt: skip
+
+
+def _raw_arguments(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> tuple[Any, ...]:
+    """Return what the kernels of raw Gaussians share, in their order."""
     degree = used_degree(gaussians.sh.shape[1], options)
-    threads = options.threads or default_threads()
-
-    def run(begin: int, end: int) -> None:
-        backward_range(
-            begin,
-            end,
-            _NO_IDS if ids is None else ids,
-            ids is not None,
-            *gaussians.arguments(),
-            degree,
-            packed,
-            screen.params,
-            screen.visible,
-            grad_params,
-            grads_out.means,
-            grads_out.log_scales,
-            grads_out.quats,
-            grads_out.opacity_logits,
-            grads_out.sh,
-            grads_out.orientation,
-        )
-
-    run_chunks(run, even_bounds(count, threads), threads)
+    return *gaussians.arguments(), degree, pack_camera(camera, options.near_z)
 
 
-def _output(count: int, out: ScreenGaussians | None) -> ScreenGaussians:
-    if out is None:
-        return ScreenGaussians.allocate(count)
-    if len(out) != count:
-        raise UsageError(f"The output holds {len(out)} rows, not {count}.", "Allocate it anew.")
-    return out
+def _run(kernel: Any, count: int, threads: int, *arguments: Any) -> None:
+    """Run a kernel over ``count`` Gaussians, in chunks; 0 threads use every core."""
+    threads = threads or default_threads()
+    run_chunks(
+        lambda begin, end: kernel(begin, end, *arguments), even_bounds(count, threads), threads
+    )

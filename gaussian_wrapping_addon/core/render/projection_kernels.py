@@ -230,16 +230,9 @@ _SIGN_END = 20.0
 
 @inline
 def load_raw(
-    m: Any,
-    lane: Any,
-    i: Any,
-    means: Any,
-    log_scales: Any,
-    quats: Any,
-    opacity_logits: Any,
-    orientation: Any,
-    filter_3d: Any,
-) -> None:
+    m: Any, lane: Any, i: Any, means: Any, log_scales: Any, quats: Any, opacity_logits: Any,
+    orientation: Any, filter_3d: Any,
+) -> None:  # fmt: skip
     """Load all raw parameters of Gaussian i except its harmonics."""
     m[MEAN + lane] = means[i, 0]
     m[MEAN + BLOCK + lane] = means[i, 1]
@@ -291,10 +284,8 @@ def activate_block(m: np.ndarray, camera: np.ndarray) -> None:
     for lane in range(BLOCK):
         filter_sq = m[FILTER + lane] * m[FILTER + lane]
         raw0, raw1, raw2 = (
-            m[RAW_SHARE + lane],
-            m[RAW_SHARE + BLOCK + lane],
-            m[RAW_SHARE + 2 * BLOCK + lane],
-        )
+            m[RAW_SHARE + lane], m[RAW_SHARE + BLOCK + lane], m[RAW_SHARE + 2 * BLOCK + lane],
+        )  # fmt: skip
         variance0, variance1, variance2 = raw0 + filter_sq, raw1 + filter_sq, raw2 + filter_sq
         m[SCALE + lane] = variance0
         m[SCALE + BLOCK + lane] = variance1
@@ -396,10 +387,9 @@ def load_camera_axes(camera: Any) -> Any:
 def in_camera(c: Any, a: Any, b: Any, d: Any) -> Any:
     """Return the vector (a, b, d) rotated by ``c``."""
     return (
-        c[0] * a + c[1] * b + c[2] * d,
-        c[3] * a + c[4] * b + c[5] * d,
+        c[0] * a + c[1] * b + c[2] * d, c[3] * a + c[4] * b + c[5] * d,
         c[6] * a + c[7] * b + c[8] * d,
-    )
+    )  # fmt: skip
 
 
 @inline
@@ -429,17 +419,13 @@ def _project_shapes(m: Any, camera: Any) -> None:
             c, m[ROTATION + lane], m[ROTATION + 3 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
         )
         r01, r11, r21 = in_camera(
-            c,
-            m[ROTATION + BLOCK + lane],
-            m[ROTATION + 4 * BLOCK + lane],
+            c, m[ROTATION + BLOCK + lane], m[ROTATION + 4 * BLOCK + lane],
             m[ROTATION + 7 * BLOCK + lane],
-        )
+        )  # fmt: skip
         r02, r12, r22 = in_camera(
-            c,
-            m[ROTATION + 2 * BLOCK + lane],
-            m[ROTATION + 5 * BLOCK + lane],
+            c, m[ROTATION + 2 * BLOCK + lane], m[ROTATION + 5 * BLOCK + lane],
             m[ROTATION + 8 * BLOCK + lane],
-        )
+        )  # fmt: skip
         var0, var1, var2 = m[SCALE + lane], m[SCALE + BLOCK + lane], m[SCALE + 2 * BLOCK + lane]
         w0, w1, w2 = 1.0 / var0, 1.0 / var1, 1.0 / var2
         others0, others1, others2 = w1 * w2, w2 * w0, w0 * w1
@@ -576,23 +562,11 @@ def _write_row(
 
 @kernel(fast=False, fused=True)
 def project_raw_range(
-    begin: int,
-    end: int,
-    means: np.ndarray,
-    log_scales: np.ndarray,
-    quats: np.ndarray,
-    opacity_logits: np.ndarray,
-    sh: np.ndarray,
-    orientation: np.ndarray,
-    filter_3d: np.ndarray,
-    degree: int,
-    camera: np.ndarray,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    visible: np.ndarray,
-    depths: np.ndarray,
-    skews: np.ndarray,
-) -> None:
+    begin: int, end: int, means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray,
+    opacity_logits: np.ndarray, sh: np.ndarray, orientation: np.ndarray, filter_3d: np.ndarray,
+    degree: int, camera: np.ndarray, params: np.ndarray, boxes: np.ndarray, visible: np.ndarray,
+    depths: np.ndarray, skews: np.ndarray,
+) -> None:  # fmt: skip
     """Project the raw Gaussians ``begin .. end``; hidden ones only get visibility and depth."""
     m = block_scratch(_PLANES)
     queue = np.empty(QUEUE + BLOCK, np.int64)
@@ -663,20 +637,10 @@ def project_raw_range(
 
 @kernel(fast=False, fused=True)
 def project_activated_range(
-    begin: int,
-    end: int,
-    means: np.ndarray,
-    scales: np.ndarray,
-    rotations: np.ndarray,
-    log_opacities: np.ndarray,
-    normals: np.ndarray,
-    camera: np.ndarray,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    visible: np.ndarray,
-    depths: np.ndarray,
-    skews: np.ndarray,
-) -> None:
+    begin: int, end: int, means: np.ndarray, scales: np.ndarray, rotations: np.ndarray,
+    log_opacities: np.ndarray, normals: np.ndarray, camera: np.ndarray, params: np.ndarray,
+    boxes: np.ndarray, visible: np.ndarray, depths: np.ndarray, skews: np.ndarray,
+) -> None:  # fmt: skip
     """Project the activated Gaussians ``begin .. end``; the colour columns are 0."""
     m = block_scratch(_PLANES)
     for lane in range(BLOCK):

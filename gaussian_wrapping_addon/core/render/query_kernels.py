@@ -61,19 +61,8 @@ def fine_scale(camera: Camera) -> int:
 def project_finely(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> ScreenGaussians:
     """Project onto a screen finer by a power of two, and scale the rows back to pixels.
 
-    Parameters
-    ----------
-    gaussians : RawArrays
-        Scene frame.
-    camera : Camera
-        In the scene frame.
-    options : RenderOptions
-        As for :func:`~.projection.project_gaussians`.
-
-    Returns
-    -------
-    ScreenGaussians
-        In pixels of ``camera``; Gaussians that rendering hides at that size are hidden.
+    Arguments as for :func:`~.projection.project_gaussians`. The result is in pixels of ``camera``;
+    Gaussians that rendering hides at that size are hidden.
     """
     threads = options.threads or default_threads()
     scale = fine_scale(camera)
@@ -123,16 +112,9 @@ def _add_distant(
 
 @kernel(fast=False)
 def _shrink_range(
-    begin: int,
-    end: int,
-    scale: float,
-    width: int,
-    height: int,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    visible: np.ndarray,
-) -> None:
+    begin: int, end: int, scale: float, width: int, height: int, params: np.ndarray,
+    boxes: np.ndarray, skews: np.ndarray, visible: np.ndarray,
+) -> None:  # fmt: skip
     """Scale the rows ``begin .. end`` of a screen ``scale`` times as fine to pixels.
 
     Rows that the image of ``width`` x ``height`` hides because rendering them would overflow
@@ -196,15 +178,9 @@ _FLOAT_MARGIN = np.float32(4e-6)
 
 @part(fast=False)
 def fill_tile(
-    tile: int,
-    tiles_x: int,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    start: np.ndarray,
-    gaussian_ids: np.ndarray,
-    spans: np.ndarray,
-) -> None:
+    tile: int, tiles_x: int, params: np.ndarray, boxes: np.ndarray, skews: np.ndarray,
+    start: np.ndarray, gaussian_ids: np.ndarray, spans: np.ndarray,
+) -> None:  # fmt: skip
     """Store the Gaussians of a tile and their ellipses in ``spans (s, 22 * 32) float32``."""
     left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
     count = start[tile + 1] - start[tile]
@@ -263,34 +239,15 @@ def _mark_intersecting(span: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> None:
 
 @part(fast=True)
 def fill_cell(
-    columns: int,
-    part: int,
-    shift: int,
-    count: int,
-    tile_spans: np.ndarray,
-    spans: np.ndarray,
-    nearest_depths: np.ndarray,
-    members: np.ndarray,
-) -> int:
+    columns: int, part: int, shift: int, count: int, tile_spans: np.ndarray, spans: np.ndarray,
+    nearest_depths: np.ndarray, members: np.ndarray,
+) -> int:  # fmt: skip
     """Store the Gaussians of a tile that reach one of its cells; return their number.
 
-    Parameters
-    ----------
-    columns : int
-        Columns of ``spans``.
-    part : int
-        Index of the cell within its tile.
-    count : int
-        Gaussians of the tile.
-    tile_spans : (t, 22 * 32) float32
-        From :func:`fill_tile`.
-    spans : (s, columns * 32) float32
-        The last span is padded with Gaussians of opacity 0.
-    nearest_depths : (s + 1,) float32
-        Receives the z-depth in front of which every Gaussian of this span and later ones has
-        negligible density.
-    members : (g,) int64
-        Receives the index of each Gaussian in the tile's list.
+    ``part`` is the cell within its tile, whose ``count`` Gaussians :func:`fill_tile` wrote to
+    ``tile_spans``. ``spans (s, columns * 32)`` is padded with Gaussians of opacity 0;
+    ``nearest_depths (s + 1,)`` receives the z-depth in front of which every Gaussian of a span and
+    later ones has negligible density, ``members`` each Gaussian's index in the tile's list.
     """
     cell_px = TILE >> shift
     margin = np.float32(PIXEL_MARGIN)
@@ -487,22 +444,11 @@ def _evaluate_span(span: Any, x: Any, y: Any) -> None:
 
 @kernel(fast=True)
 def query_range(
-    first_tile: int,
-    end_tile: int,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    start: np.ndarray,
-    gaussian_ids: np.ndarray,
-    tiles_x: int,
-    shift: int,
-    cell_start: np.ndarray,
-    coordinates: np.ndarray,
-    limit: float,
-    values: np.ndarray,
-    slopes: np.ndarray,
+    first_tile: int, end_tile: int, params: np.ndarray, boxes: np.ndarray, skews: np.ndarray,
+    start: np.ndarray, gaussian_ids: np.ndarray, tiles_x: int, shift: int, cell_start: np.ndarray,
+    coordinates: np.ndarray, limit: float, values: np.ndarray, slopes: np.ndarray,
     stops: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Write the depth of the isosurface and the slope of ``-log T`` at the positions of tiles.
 
     ``values (k,)`` are 0 where there is no depth. ``stops (k,) int32`` receives the number of

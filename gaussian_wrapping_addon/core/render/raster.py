@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..compiled import inline, kernel
-from ..parallel import empty_array, even_bounds, run_chunks
+from ..parallel import run_chunks
 from ..scene.camera import Camera
 from .isosurface import LIST_VALUES, SOLVER_VALUES, solve_block
 from .projection import RawArrays, ScreenGaussians
@@ -110,45 +110,22 @@ def _write_intersection(
 
 @functools.cache
 def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
-    """Return the gradient kernel for blocks of ``lanes`` pixels, compiled on first call.
+    """Return the gradient kernel for blocks of 8 or 16 pixels, compiled on first call.
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    depth : bool
-        Include the gradient of the depth image.
-    absolute : bool
-        Also sum the absolute gradients on (u, v) per pixel (AbsGS).
+    ``depth`` includes the gradient of the depth image; ``absolute`` also sums the absolute
+    gradients on (u, v) per pixel (AbsGS).
     """
     block_height = lanes // BLOCK_WIDTH
 
     @kernel(fast=True)
     def backward_range(
-        first_tile: int,
-        end_tile: int,
-        params: np.ndarray,
-        start: np.ndarray,
-        gaussian_ids: np.ndarray,
-        intersection_slots: np.ndarray,
-        masks: np.ndarray,
-        tiles_x: int,
-        width: int,
-        height: int,
-        color: np.ndarray,
-        normal: np.ndarray,
-        geometric: np.ndarray,
-        alpha_image: np.ndarray,
-        depth_image: np.ndarray,
-        slope_image: np.ndarray,
-        g_color: np.ndarray,
-        g_normal: np.ndarray,
-        g_geometric: np.ndarray,
-        g_alpha: np.ndarray,
-        g_depth: np.ndarray,
-        m: np.ndarray,
-        intersections: np.ndarray,
-    ) -> None:
+        first_tile: int, end_tile: int, params: np.ndarray, start: np.ndarray,
+        gaussian_ids: np.ndarray, intersection_slots: np.ndarray, masks: np.ndarray, tiles_x: int,
+        width: int, height: int, color: np.ndarray, normal: np.ndarray, geometric: np.ndarray,
+        alpha_image: np.ndarray, depth_image: np.ndarray, slope_image: np.ndarray,
+        g_color: np.ndarray, g_normal: np.ndarray, g_geometric: np.ndarray, g_alpha: np.ndarray,
+        g_depth: np.ndarray, m: np.ndarray, intersections: np.ndarray,
+    ) -> None:  # fmt: skip
         """Write the gradients of the tiles' intersections to their slots, (p, 24)."""
         images = (color, normal, geometric, alpha_image, depth_image, slope_image)
         grads = (g_color, g_normal, g_geometric, g_alpha, g_depth)
@@ -188,48 +165,14 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
     return backward_range
 
 
-@kernel(fast=False)
-def sum_intersections(
-    first: int,
-    end: int,
-    intersections: np.ndarray,
-    intersection_offsets: np.ndarray,
-    grad_params: np.ndarray,
-    grad_px: np.ndarray,
-    grad_abs_px: np.ndarray,
-) -> None:
-    """Sum the intersection gradients of the Gaussians ``first .. end`` into ``grad_params``.
-
-    Columns 22 and 23 of ``grad_params (n, 24)`` become 0; ``grad_px (n,)`` and ``grad_abs_px (n,)``
-    receive the norms of the gradient on (u, v) and of its sum of absolute values.
-    """
-    total = np.zeros(ROW_VALUES, np.float32)
-    for i in range(first, end):
-        total[:] = ZERO
-        for slot in range(intersection_offsets[i], intersection_offsets[i + 1]):
-            for column in range(ROW_VALUES):
-                total[column] += intersections[slot, column]
-        grad_px[i] = math.sqrt(total[0] * total[0] + total[1] * total[1])
-        grad_abs_px[i] = math.sqrt(total[ABS_U] * total[ABS_U] + total[ABS_V] * total[ABS_V])
-        total[ABS_U] = ZERO
-        total[ABS_V] = ZERO
-        for column in range(ROW_VALUES):
-            grad_params[i, column] = total[column]
-
-
 # -- Compiled reduction of per-intersection values of one band to the visible Gaussians -----------
 
 
 @kernel(fast=False)
 def add_intersection_gradients(
-    begin: int,
-    end: int,
-    ids: np.ndarray,
-    intersections: np.ndarray,
-    intersection_offsets: np.ndarray,
-    fresh: bool,
-    grad_params: np.ndarray,
-) -> None:
+    begin: int, end: int, ids: np.ndarray, intersections: np.ndarray,
+    intersection_offsets: np.ndarray, fresh: bool, grad_params: np.ndarray,
+) -> None:  # fmt: skip
     """Add the intersection gradients of the Gaussians ``ids[begin .. end]`` to ``grad_params``.
 
     With ``fresh`` the rows of ``grad_params (n, 24)`` start at 0, whatever their content. The last
@@ -252,13 +195,9 @@ def add_intersection_gradients(
 
 @kernel(fast=False)
 def write_screen_gradients(
-    begin: int,
-    end: int,
-    ids: np.ndarray,
-    grad_params: np.ndarray,
-    grad_px: np.ndarray,
+    begin: int, end: int, ids: np.ndarray, grad_params: np.ndarray, grad_px: np.ndarray,
     grad_abs_px: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Write the norms of the gradient on (u, v) and of its sum of absolute values.
 
     The columns of the absolute values are then set to 0, as params have none there, and so are rows
@@ -282,14 +221,9 @@ def write_screen_gradients(
 
 @kernel(fast=False)
 def add_intersection_weights(
-    begin: int,
-    end: int,
-    ids: np.ndarray,
-    intersection_weights: np.ndarray,
-    intersection_offsets: np.ndarray,
-    weight_sum: np.ndarray,
-    weight_max: np.ndarray,
-) -> None:
+    begin: int, end: int, ids: np.ndarray, intersection_weights: np.ndarray,
+    intersection_offsets: np.ndarray, weight_sum: np.ndarray, weight_max: np.ndarray,
+) -> None:  # fmt: skip
     """Reduce the blending weights of the Gaussians ``ids[begin .. end]`` over intersections."""
     for k in range(begin, end):
         i = ids[k]
@@ -302,13 +236,9 @@ def add_intersection_weights(
 
 @kernel(fast=False)
 def mark_visible(
-    begin: int,
-    end: int,
-    ids: np.ndarray,
-    boxes: np.ndarray,
-    visible: np.ndarray,
+    begin: int, end: int, ids: np.ndarray, boxes: np.ndarray, visible: np.ndarray,
     radii_px: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Mark the Gaussians ``ids[begin .. end]`` visible; write half their boxes' longer side."""
     for k in range(begin, end):
         i = ids[k]
@@ -329,46 +259,23 @@ FORWARD_SCRATCH = FORWARD_PLANES * STRIDE + SOLVER_VALUES
 
 @functools.cache
 def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
-    """Return the blending kernel for blocks of ``lanes`` pixels, compiled on first call.
+    """Return the blending kernel for blocks of 8 or 16 pixels, compiled on first call.
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    depth : bool
-        Also solve the isosurface.
-    weights : bool
-        Also collect the blending weights per intersection and the strongest Gaussian per pixel.
+    ``depth`` also solves the isosurface; ``weights`` also collects the blending weights per
+    intersection and the strongest Gaussian per pixel.
     """
     blocks = PLANE // lanes
     block_height = lanes // BLOCK_WIDTH
 
     @kernel(fast=True)
     def forward_range(
-        first_tile: int,
-        end_tile: int,
-        params: np.ndarray,
-        start: np.ndarray,
-        gaussian_ids: np.ndarray,
-        intersection_slots: np.ndarray,
-        masks: np.ndarray,
-        tiles_x: int,
-        width: int,
-        height: int,
-        background: np.ndarray,
-        limit: float,
-        m: np.ndarray,
-        lists: np.ndarray,
-        contributors: np.ndarray,
-        color: np.ndarray,
-        normal: np.ndarray,
-        geometric: np.ndarray,
-        alpha_image: np.ndarray,
-        depth_image: np.ndarray,
-        slope_image: np.ndarray,
-        intersection_weights: np.ndarray,
-        strongest: np.ndarray,
-    ) -> None:
+        first_tile: int, end_tile: int, params: np.ndarray, start: np.ndarray,
+        gaussian_ids: np.ndarray, intersection_slots: np.ndarray, masks: np.ndarray, tiles_x: int,
+        width: int, height: int, background: np.ndarray, limit: float, m: np.ndarray,
+        lists: np.ndarray, contributors: np.ndarray, color: np.ndarray, normal: np.ndarray,
+        geometric: np.ndarray, alpha_image: np.ndarray, depth_image: np.ndarray,
+        slope_image: np.ndarray, intersection_weights: np.ndarray, strongest: np.ndarray,
+    ) -> None:  # fmt: skip
         """Render tiles.
 
         ``lists`` and, for each block, ``contributors`` have room for the longest tile list.
@@ -455,13 +362,19 @@ _MOST_BLOCKS = 32
 """Blocks of a tile if a block has eight pixels."""
 
 
+def _int32_zeros(count: int) -> np.ndarray:
+    return np.zeros(count, np.int32)
+
+
 def _take(pool: list[np.ndarray], count: int, make: Callable[[int], np.ndarray]) -> np.ndarray:
     """Return an array of at least ``count`` values from a pool, or a new, larger one."""
     try:
         kept = pool.pop()
+        if len(kept) >= count:
+            return kept
     except IndexError:
-        return make(count * 5 // 4)
-    return kept if len(kept) >= count else make(count * 5 // 4)
+        pass
+    return make(count * 5 // 4)
 
 
 @dataclass
@@ -475,7 +388,6 @@ class RenderBuffers:
     scratch: list[np.ndarray] = field(default_factory=list)
     lists: list[np.ndarray] = field(default_factory=list)
     contributors: list[np.ndarray] = field(default_factory=list)
-    intersections: list[np.ndarray] = field(default_factory=list)
     renderers: list[Any] = field(default_factory=list)
     """Idle :class:`~.view_renderer.ViewRenderer` with their memory."""
 
@@ -484,17 +396,14 @@ class RenderBuffers:
 
         ``longest`` is the largest number of intersections of a tile; only depth needs lists.
         """
-        spare = [
-            (self.scratch, self.take_scratch()),
-            (self.lists, self.take_lists(longest if depth else 0)),
-            (self.contributors, self.take_contributors(longest)),
-        ]
-        for pool, array in spare:
+        for pool, array, make in (
+            (self.scratch, self.take_scratch(), aligned_zeros),
+            (self.lists, self.take_lists(longest if depth else 0), aligned_zeros),
+            (self.contributors, self.take_contributors(longest), _int32_zeros),
+        ):
             pool.append(array)
             while len(pool) < threads:
-                pool.append(
-                    array.copy() if pool is self.contributors else aligned_zeros(len(array))
-                )
+                pool.append(make(len(array)))
 
     def take_scratch(self) -> np.ndarray:
         """Return the uninitialised state of one thread's tile."""
@@ -507,17 +416,7 @@ class RenderBuffers:
     def take_contributors(self, longest: int) -> np.ndarray:
         """Return uninitialised contributor lists for all blocks of such a tile."""
         count = _MOST_BLOCKS * (longest + CONTRIBUTORS_PADDING)
-        return _take(self.contributors, count, lambda size: np.zeros(size, np.int32))
-
-    def take_intersections(self, count: int) -> np.ndarray:
-        """Return at least ``count`` uninitialised rows of intersection gradients."""
-        try:
-            kept = self.intersections.pop()
-        except IndexError:
-            kept = np.zeros((0, ROW_VALUES), np.float32)
-        if len(kept) >= count:
-            return kept
-        return empty_array(count * 5 // 4 * ROW_VALUES, np.float32).reshape(-1, ROW_VALUES)
+        return _take(self.contributors, count, _int32_zeros)
 
 
 @dataclass(frozen=True)
@@ -572,18 +471,15 @@ class Images:
             def take(name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
                 return np.zeros(shape, dtype)
 
-        one = (camera.height, camera.width)
+        one, no_image = (camera.height, camera.width), (0, 0)
         three = (*one, 3)
-        no_image = (0, 0)
         images = cls(
-            color=take("color", three, np.float32),
-            normal=take("normal", three, np.float32),
-            geometric=take("geometric", three, np.float32),
-            alpha=take("alpha", one, np.float32),
+            color=take("color", three, np.float32), normal=take("normal", three, np.float32),
+            geometric=take("geometric", three, np.float32), alpha=take("alpha", one, np.float32),
             depth=take("depth", one, np.float32),
             slope=take("slope", one if options.depth else no_image, np.float32),
             strongest=take("strongest", one if options.statistics else no_image, np.int32),
-        )
+        )  # fmt: skip
         if not options.depth:
             images.depth.fill(0.0)
         return images
@@ -601,16 +497,8 @@ def blend(
 ) -> np.ndarray:
     """Blend the tiles of a view into ``images`` and solve the isosurface depth.
 
-    Parameters
-    ----------
-    intersection_weights : (intersections, 2) float32, optional
-        Receives the weights; by default a new array.
-
-    Returns
-    -------
-    (intersections, 2) float32
-        Sum and maximum of the blending weight of each intersection, by slot; (0, 2) without
-        statistics.
+    Returns (intersections, 2) float32, ``intersection_weights`` or a new array: sum and maximum of
+    the blending weight of each intersection, by slot; (0, 2) without statistics.
     """
     options, lists = view.options, view.lists
     depth, weights = options.depth, options.statistics
@@ -627,18 +515,9 @@ def blend(
         entries = buffers.take_lists(longest if depth else 0)
         contributors = buffers.take_contributors(longest)
         forward(
-            first,
-            end,
-            *view.arguments(),
-            background,
-            limit,
-            scratch,
-            entries,
-            contributors,
-            *images.arguments(),
-            intersection_weights,
-            images.strongest,
-        )
+            first, end, *view.arguments(), background, limit, scratch, entries, contributors,
+            *images.arguments(), intersection_weights, images.strongest,
+        )  # fmt: skip
         buffers.scratch.append(scratch)
         buffers.lists.append(entries)
         buffers.contributors.append(contributors)
@@ -667,43 +546,8 @@ def write_intersection_gradients(
     def run(first: int, end: int) -> None:
         scratch = buffers.take_scratch()
         backward(
-            first,
-            end,
-            *view.arguments(),
-            *images.arguments(),
-            *grads,
-            scratch,
-            intersections,
-        )
+            first, end, *view.arguments(), *images.arguments(), *grads, scratch, intersections,
+        )  # fmt: skip
         buffers.scratch.append(scratch)
 
     run_chunks(run, view.bounds, view.threads)
-
-
-def blend_backward(
-    view: ScreenView,
-    images: Images,
-    grads: list[np.ndarray],
-    buffers: RenderBuffers,
-    *,
-    absolute: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the gradient on params (n, 24), and its signed and absolute norms on (u, v), (n,)."""
-    lists, count = view.lists, len(view.screen)
-    intersections = buffers.take_intersections(len(lists.gaussian_ids))
-    depth = bool(grads[4].any())
-    write_intersection_gradients(
-        view, images, grads, buffers, intersections, depth=depth, absolute=absolute
-    )
-    grad_params = np.zeros((count, ROW_VALUES), np.float32)
-    grad_px = np.zeros(count, np.float32)
-    grad_abs_px = np.zeros(count, np.float32)
-
-    def combine(first: int, end: int) -> None:
-        sum_intersections(
-            first, end, intersections, lists.intersection_offsets, grad_params, grad_px, grad_abs_px
-        )
-
-    run_chunks(combine, even_bounds(count, view.threads), view.threads)
-    buffers.intersections.append(intersections)
-    return grad_params, grad_px, grad_abs_px

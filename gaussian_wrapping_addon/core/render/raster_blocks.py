@@ -9,9 +9,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic
 
-from ..compiled import inline
 from . import simd as constants
 from .isosurface import LIST_VALUES, NEGLIGIBLE, Crossing, entry_index, start_solver
 from .simd import (
@@ -28,6 +26,7 @@ from .simd import (
     RayEvaluation,
     State,
     Vector,
+    compile_time,
     evaluate_rays,
     first_pixel,
     peak_depth,
@@ -123,193 +122,117 @@ class _Weights:
         builder.store(builder.select(more, now, before), largest)
 
 
-def _blend_intrinsic(lanes: int, depth: bool, weights: bool) -> Any:
-    @intrinsic
-    def blend(  # type: ignore[no-untyped-def]
-        typingctx, m, number, params, gaussian_ids, intersection_slots, contributors, first, count,
-        begin, x, y, lists, nearest_depths, limit, intersection_weights,
-    ):  # fmt: skip
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            block = Block(lanes, context, builder)
-            m_data, params_data, ids, slots, contributor_list, entries, nearest_data, sums = (
-                block.data(sig.args[k], args[k]) for k in (0, 2, 3, 4, 5, 11, 12, 14)
-            )
-            number_, first_, count_, begin_, x_, y_, limit_ = (
-                args[k] for k in (1, 6, 7, 8, 9, 10, 13)
-            )
-            left, top = first_pixel(block, number_, x_, y_)
-            planes = builder.mul(number_, block.index(lanes), flags=("nuw", "nsw"))
-
-            def plane(which: int) -> Any:
-                return block.offset(planes, which * STRIDE)
-
-            def contributor_at(n: Any) -> Any:
-                pointer = builder.gep(contributor_list, [builder.add(first_, n)], inbounds=True)
-                return builder.sext(builder.load(pointer), first_.type)
-
-            transmittance = State(block, block.load(m_data, plane(TRANSMITTANCE)))
-            features = [State(block, 0.0) for _ in range(FEATURES)]
-            gathered = (
-                _Weights(sums, slots, begin_, State(block, 0.0), State(block, 0.0))
-                if weights
-                else None
-            )
-
-            def blend_one(n: Any) -> tuple[RayEvaluation, Mask, Vector, Vector]:
-                """Blend one Gaussian; return also the transmittance before and behind it."""
-                intersection = contributor_at(n)
-                which = builder.load(builder.gep(ids, [intersection], inbounds=True))
-                rays = evaluate_rays(
-                    block, params_data, builder.sext(which, intersection.type), left, top
-                )
-                before = transmittance.get()
-                contributes = (rays.alpha >= float(ALPHA_MIN)) & (
-                    before >= float(TRANSMITTANCE_MIN)
-                )
-                weight = contributes.select(rays.alpha.times(before), 0.0)
-                after = before - weight
-                transmittance.set(after)
-                for feature, state in enumerate(features):
-                    state.set(state.get() + weight * rays.row[_COLOR_COLUMN + feature])
-                if gathered is not None:
-                    gathered.add(block, weight, intersection)
-                return rays, contributes, before, after
-
-            always = ir.Constant(ir.IntType(1), 1)
-            cursor = cgutils.alloca_once_value(builder, block.index(0))
-            record = _DepthRecord(block, entries) if depth else None
-            if record is not None:
-
-                def cross(n: Any) -> Any:
-                    rays, contributes, before, after = blend_one(n)
-                    record.add_before(rays, contributes, before, after)
-                    return (after > constants.ISO_LEVEL).any()
-
-                def trail(n: Any) -> Any:
-                    rays, contributes, _, _ = blend_one(n)
-                    record.add_behind(rays, contributes)
-                    return always
-
-                block.walk(cursor, count_, cross, lambda n: always)
-                # Stop recording once no later intersection reaches back to the last bracket.
-                deepest = record.high.get().largest()
-
-                def reaches_back(n: Any) -> Any:
-                    offset = builder.sub(contributor_at(n), begin_)
-                    front = builder.load(builder.gep(nearest_data, [offset], inbounds=True))
-                    return builder.fcmp_ordered("<", front, deepest)
-
-                block.walk(cursor, count_, trail, reaches_back)
-
-            def finish(n: Any) -> Any:
-                _, _, _, after = blend_one(n)
-                return (after >= float(TRANSMITTANCE_MIN)).any()
-
-            block.walk(cursor, count_, finish, lambda n: always)
-            block.store(transmittance.get(), m_data, plane(TRANSMITTANCE))
-            for feature, state in enumerate(features):
-                block.store(state.get(), m_data, plane(F0 + feature))
-            if gathered is not None:
-                block.store(gathered.best.get(), m_data, plane(BEST))
-                block.store(gathered.best_at.get(), m_data, plane(BEST_AT))
-            if record is None:
-                return block.index(0)
-            before, alpha, peak, sharpness = (kept.get() for kept in record.crossing)
-            crossing = Crossing(
-                before, alpha, peak, sharpness, transmittance.get(), record.high.get()
-            )
-            nearest = builder.load(nearest_data)
-            opened = start_solver(block, m_data, crossing, record.sharpest.get(), nearest, limit_)
-            # Without a pixel to solve there are no entries.
-            none_open = builder.icmp_unsigned("==", opened, block.index(0))
-            return builder.select(none_open, block.index(0), builder.load(record.count))
-
-        index, single = types.intp, types.float32
-        signature = types.intp(
-            m, index, params, gaussian_ids, intersection_slots, contributors, index, index,
-            index, single, single, lists, nearest_depths, single, intersection_weights,
-        )  # fmt: skip
-        return signature, generate
-
-    return blend
-
-
-_forward_base_16 = _blend_intrinsic(16, False, False)
-_forward_depth_16 = _blend_intrinsic(16, True, False)
-_weights_16 = _blend_intrinsic(16, False, True)
-_both_16 = _blend_intrinsic(16, True, True)
-_forward_base_8 = _blend_intrinsic(8, False, False)
-_forward_depth_8 = _blend_intrinsic(8, True, False)
-_weights_8 = _blend_intrinsic(8, False, True)
-_both_8 = _blend_intrinsic(8, True, True)
-
-
-@inline
-def blend_block(
-    lanes: Any, depth: Any, weights: Any, m: Any, block: Any, params: Any, ids: Any, slots: Any,
-    contributors: Any, first: Any, count: Any, begin: Any, x: Any, y: Any, lists: Any,
-    nearest_depths: Any, limit: Any, intersection_weights: Any,
-) -> Any:  # fmt: skip
+@compile_time
+def blend_block(  # type: ignore[no-untyped-def]
+    typingctx, lanes, depth, weights, m, number, params, gaussian_ids, intersection_slots,
+    contributors, first, count, begin, x, y, lists, nearest_depths, limit, intersection_weights,
+):  # fmt: skip
     """Blend ``contributors[first .. first + count]`` into a block; return its list's length.
 
-    Parameters
-    ----------
-    lanes : int
-    depth, weights : bool
-        Write the list and initialise the solver; collect blending weights.
-    m : (n,) float32
-        The tile's scratch.
-    block : int
-    begin : int
-        First intersection of the tile; indices of the strongest Gaussians are relative to it.
-    x, y : float32
-        Centre of the tile's first pixel, pixels.
-    lists : (n,) float32
-        Receives the entries.
-    nearest_depths : (n,) float32
-        For each intersection of the tile, the nearest z-depth that it or a later one reaches.
-    limit : float32
-        Largest final transmittance of a pixel that has a depth.
+    ``lanes``, ``depth`` (write the entries to ``lists`` and initialise the solver) and ``weights``
+    (collect blending weights) are literals. ``m`` is the tile's scratch, ``begin`` its first
+    intersection, to which indices of the strongest Gaussians are relative, and ``x, y`` the centre
+    of its first pixel. ``nearest_depths`` holds, for each of its intersections, the nearest z-depth
+    that it or a later one reaches; ``limit`` is the largest final transmittance with a depth.
     """
-    if lanes == 16:
-        if depth:
-            if weights:
-                return _both_16(
-                    m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
-                    nearest_depths, limit, intersection_weights,
-                )  # fmt: skip
-            return _forward_depth_16(
-                m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
-                nearest_depths, limit, intersection_weights,
-            )  # fmt: skip
-        if weights:
-            return _weights_16(
-                m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
-                nearest_depths, limit, intersection_weights,
-            )  # fmt: skip
-        return _forward_base_16(
-            m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
-            nearest_depths, limit, intersection_weights,
-        )  # fmt: skip
-    if depth:
-        if weights:
-            return _both_8(
-                m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
-                nearest_depths, limit, intersection_weights,
-            )  # fmt: skip
-        return _forward_depth_8(
-            m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
-            nearest_depths, limit, intersection_weights,
-        )  # fmt: skip
-    if weights:
-        return _weights_8(
-            m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
-            nearest_depths, limit, intersection_weights,
-        )  # fmt: skip
-    return _forward_base_8(
-        m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
-        nearest_depths, limit, intersection_weights,
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        block = Block(lanes.literal_value, context, builder)
+        m_data, params_data, ids, slots, contributor_list, entries, nearest_data, sums = (
+            block.data(sig.args[k], args[k]) for k in (3, 5, 6, 7, 8, 14, 15, 17)
+        )
+        number_, first_, count_, begin_, x_, y_, limit_ = (
+            args[k] for k in (4, 9, 10, 11, 12, 13, 16)
+        )
+        left, top = first_pixel(block, number_, x_, y_)
+        planes = builder.mul(number_, block.index(block.lanes), flags=("nuw", "nsw"))
+
+        def plane(which: int) -> Any:
+            return block.offset(planes, which * STRIDE)
+
+        def contributor_at(n: Any) -> Any:
+            pointer = builder.gep(contributor_list, [builder.add(first_, n)], inbounds=True)
+            return builder.sext(builder.load(pointer), first_.type)
+
+        transmittance = State(block, block.load(m_data, plane(TRANSMITTANCE)))
+        features = [State(block, 0.0) for _ in range(FEATURES)]
+        gathered = (
+            _Weights(sums, slots, begin_, State(block, 0.0), State(block, 0.0))
+            if weights.literal_value
+            else None
+        )
+
+        def blend_one(n: Any) -> tuple[RayEvaluation, Mask, Vector, Vector]:
+            """Blend one Gaussian; return also the transmittance before and behind it."""
+            intersection = contributor_at(n)
+            which = builder.load(builder.gep(ids, [intersection], inbounds=True))
+            rays = evaluate_rays(
+                block, params_data, builder.sext(which, intersection.type), left, top
+            )
+            before = transmittance.get()
+            contributes = (rays.alpha >= float(ALPHA_MIN)) & (before >= float(TRANSMITTANCE_MIN))
+            weight = contributes.select(rays.alpha.times(before), 0.0)
+            after = before - weight
+            transmittance.set(after)
+            for feature, state in enumerate(features):
+                state.set(state.get() + weight * rays.row[_COLOR_COLUMN + feature])
+            if gathered is not None:
+                gathered.add(block, weight, intersection)
+            return rays, contributes, before, after
+
+        always = ir.Constant(ir.IntType(1), 1)
+        cursor = cgutils.alloca_once_value(builder, block.index(0))
+        record = _DepthRecord(block, entries) if depth.literal_value else None
+        if record is not None:
+
+            def cross(n: Any) -> Any:
+                rays, contributes, before, after = blend_one(n)
+                record.add_before(rays, contributes, before, after)
+                return (after > constants.ISO_LEVEL).any()
+
+            def trail(n: Any) -> Any:
+                rays, contributes, _, _ = blend_one(n)
+                record.add_behind(rays, contributes)
+                return always
+
+            block.walk(cursor, count_, cross, lambda n: always)
+            # Stop recording once no later intersection reaches back to the last bracket.
+            deepest = record.high.get().largest()
+
+            def reaches_back(n: Any) -> Any:
+                offset = builder.sub(contributor_at(n), begin_)
+                front = builder.load(builder.gep(nearest_data, [offset], inbounds=True))
+                return builder.fcmp_ordered("<", front, deepest)
+
+            block.walk(cursor, count_, trail, reaches_back)
+
+        def finish(n: Any) -> Any:
+            _, _, _, after = blend_one(n)
+            return (after >= float(TRANSMITTANCE_MIN)).any()
+
+        block.walk(cursor, count_, finish, lambda n: always)
+        block.store(transmittance.get(), m_data, plane(TRANSMITTANCE))
+        for feature, state in enumerate(features):
+            block.store(state.get(), m_data, plane(F0 + feature))
+        if gathered is not None:
+            block.store(gathered.best.get(), m_data, plane(BEST))
+            block.store(gathered.best_at.get(), m_data, plane(BEST_AT))
+        if record is None:
+            return block.index(0)
+        before, alpha, peak, sharpness = (kept.get() for kept in record.crossing)
+        crossing = Crossing(before, alpha, peak, sharpness, transmittance.get(), record.high.get())
+        nearest = builder.load(nearest_data)
+        opened = start_solver(block, m_data, crossing, record.sharpest.get(), nearest, limit_)
+        # Without a pixel to solve there are no entries.
+        none_open = builder.icmp_unsigned("==", opened, block.index(0))
+        return builder.select(none_open, block.index(0), builder.load(record.count))
+
+    index, single = types.intp, types.float32
+    signature = types.intp(
+        lanes, depth, weights, m, index, params, gaussian_ids, intersection_slots, contributors,
+        index, index, index, single, single, lists, nearest_depths, single, intersection_weights,
     )  # fmt: skip
+    return signature, generate
 
 
 # -- Vector code of the backward pass: one Gaussian and one block of pixels, with its sums --------
@@ -335,32 +258,6 @@ DEPTH_SUMS = ALONG + 1
 def sum_count(depth: bool, absolute: bool) -> int:
     """Return the number of sums per intersection."""
     return (DEPTH_SUMS if depth else BASE_SUMS) + (2 if absolute else 0)
-
-
-def _gradient_intrinsic(lanes: int, depth: bool, absolute: bool) -> Any:
-    @intrinsic
-    def gradient(typingctx, m, bits, params, gaussian, x, y, sums):  # type: ignore[no-untyped-def]
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            block = Block(lanes, context, builder)
-            state, params_data = block.data(sig.args[0], args[0]), block.data(sig.args[2], args[2])
-            totals = [State(block, 0.0) for _ in range(sum_count(depth, absolute))]
-
-            def process_block(number: Any) -> None:
-                left, top = first_pixel(block, number, args[4], args[5])
-                rays = evaluate_rays(block, params_data, args[3], left, top)
-                at = builder.mul(number, block.index(lanes), flags=("nuw", "nsw"))
-                for which, value in _sums_of_block(block, state, at, rays, depth, absolute):
-                    totals[which].set(totals[which].get() + value)
-
-            block.each_bit(args[1], process_block)
-            for number, total in enumerate(block.totals([total.get() for total in totals])):
-                block.store(total, state, block.offset(args[6], number * lanes))
-            return context.get_dummy_value()
-
-        index, single = types.intp, types.float32
-        return types.void(m, types.uint64, params, index, single, single, index), generate
-
-    return gradient
 
 
 def _sums_of_block(
@@ -435,47 +332,36 @@ def _sums_of_block(
         yield first + 1, g_v.abs()
 
 
-_backward_base_16 = _gradient_intrinsic(16, False, False)
-_backward_depth_16 = _gradient_intrinsic(16, True, False)
-_absolute_16 = _gradient_intrinsic(16, False, True)
-_depth_absolute_16 = _gradient_intrinsic(16, True, True)
-_backward_base_8 = _gradient_intrinsic(8, False, False)
-_backward_depth_8 = _gradient_intrinsic(8, True, False)
-_absolute_8 = _gradient_intrinsic(8, False, True)
-_depth_absolute_8 = _gradient_intrinsic(8, True, True)
+@compile_time
+def sum_intersection_gradient(  # type: ignore[no-untyped-def]
+    typingctx, lanes, depth, absolute, m, bits, params, gaussian, x, y, sums
+):
+    """Advance the blocks with ``bits`` set past a Gaussian; write its sums to ``m[sums ..]``.
 
-
-@inline
-def sum_intersection_gradient(
-    lanes: Any, depth: Any, absolute: Any, m: Any, bits: Any, params: Any, i: Any, x: Any, y: Any,
-    sums: Any,
-) -> None:  # fmt: skip
-    """Advance the blocks with ``bits`` set past Gaussian ``i``; write its sums to ``m[sums]``.
-
-    Parameters
-    ----------
-    lanes : int
-    depth, absolute : bool
-        Include the gradient of the depth; include sums of absolute values.
-    x, y : float32
-        Centre of the tile's first pixel, pixels.
+    ``lanes``, ``depth`` (include its gradient) and ``absolute`` (include sums of absolute values)
+    are literals; ``x, y`` is the centre of the tile's first pixel.
     """
-    if lanes == 16:
-        if depth:
-            if absolute:
-                _depth_absolute_16(m, bits, params, i, x, y, sums)
-            else:
-                _backward_depth_16(m, bits, params, i, x, y, sums)
-        elif absolute:
-            _absolute_16(m, bits, params, i, x, y, sums)
-        else:
-            _backward_base_16(m, bits, params, i, x, y, sums)
-    elif depth:
-        if absolute:
-            _depth_absolute_8(m, bits, params, i, x, y, sums)
-        else:
-            _backward_depth_8(m, bits, params, i, x, y, sums)
-    elif absolute:
-        _absolute_8(m, bits, params, i, x, y, sums)
-    else:
-        _backward_base_8(m, bits, params, i, x, y, sums)
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        block = Block(lanes.literal_value, context, builder)
+        state, params_data = block.data(sig.args[3], args[3]), block.data(sig.args[5], args[5])
+        wanted = depth.literal_value, absolute.literal_value
+        totals = [State(block, 0.0) for _ in range(sum_count(*wanted))]
+
+        def process_block(number: Any) -> None:
+            left, top = first_pixel(block, number, args[7], args[8])
+            rays = evaluate_rays(block, params_data, args[6], left, top)
+            at = builder.mul(number, block.index(block.lanes), flags=("nuw", "nsw"))
+            for which, value in _sums_of_block(block, state, at, rays, *wanted):
+                totals[which].set(totals[which].get() + value)
+
+        block.each_bit(args[4], process_block)
+        for number, total in enumerate(block.totals([total.get() for total in totals])):
+            block.store(total, state, block.offset(args[9], number * block.lanes))
+        return context.get_dummy_value()
+
+    index, single = types.intp, types.float32
+    signature = types.void(
+        lanes, depth, absolute, m, types.uint64, params, index, single, single, index
+    )
+    return signature, generate

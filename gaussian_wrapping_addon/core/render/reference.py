@@ -149,17 +149,9 @@ def _colors(gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
 def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
     """Evaluate real spherical harmonics by recurrence on associated Legendre functions.
 
-    Written unlike the closed forms of the kernels on purpose, so that one checks the other.
-
-    Parameters
-    ----------
-    directions : (n, 3) unit vectors
-    degree : int, 0 to 3
-
-    Returns
-    -------
-    (n, (degree + 1)^2)
-        Order ``m = -l .. l`` within each band, Condon-Shortley phase.
+    Written unlike the closed forms of the kernels on purpose, so that one checks the other. For (n,
+    3) unit vectors and a degree of 0 to 3 it returns (n, (degree + 1)^2) values, of order
+    ``m = -l .. l`` within each band, with the Condon-Shortley phase.
     """
     x, y, z = directions.unbind(1)
     cosines, sines = [torch.ones_like(x)], [torch.zeros_like(x)]  # Re, Im of (x + i y)^m
@@ -223,19 +215,8 @@ def render_reference(
     where the final transmittance exceeds ``options.depth_valid_transmittance`` or where less than
     half of the light reaches t = 0. Its gradient is that of the implicit function.
 
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Scene frame; the images have their float type.
-    camera : Camera
-        In the scene frame.
-    options : RenderOptions
-        ``threads`` is ignored.
-
-    Raises
-    ------
-    UsageError
-        If statistics are requested; only the fast renderer collects them.
+    The images have the float type of the Gaussians. Raises UsageError if statistics are requested:
+    only the fast renderer collects them.
     """
     if options.statistics:
         raise UsageError("The reference renderer collects no statistics.", "Use render() for them.")
@@ -251,48 +232,9 @@ def render_reference(
     ]
     image = torch.cat(chunks).reshape(camera.height, camera.width, 11)
     return Render(
-        color=image[..., 0:3],
-        normal=image[..., 3:6],
-        geometric_normal=image[..., 6:9],
-        alpha=image[..., 9],
-        depth=image[..., 10],
-    )
-
-
-def reference_depth_at(
-    gaussians: OrientedGaussians, camera: Camera, positions: Tensor, options: RenderOptions
-) -> Tensor:
-    """Return the depth of :func:`render_reference` at any positions of the image.
-
-    The definition of :func:`~.depth_query.solve_depths`; only tests compare with it.
-
-    Parameters
-    ----------
-    gaussians, camera, options
-        As for :func:`render_reference`.
-    positions : (m, 2) tensor
-        Pixels, the Gaussians' float type; differentiable.
-
-    Returns
-    -------
-    (m,) tensor
-        z-depth in scene units; 0 where there is none and off ``[0, width] x [0, height]``.
-    """
-    rays, seen = _evaluate_rays_at(gaussians, camera, positions, options)
-    return positions.new_zeros(len(positions)).index_put((seen,), _depth(rays, options))
-
-
-def _evaluate_rays_at(
-    gaussians: OrientedGaussians, camera: Camera, positions: Tensor, options: RenderOptions
-) -> tuple[_RayEvaluation, Tensor]:
-    """Evaluate the rays of the positions on the image; return also these positions' indices."""
-    screen = reference_projection(gaussians, camera, options)
-    chosen = torch.nonzero(screen.usable)[:, 0]
-    order = chosen[torch.argsort(screen.depths[chosen].float(), stable=True)]
-    size = positions.new_tensor([camera.width, camera.height])
-    seen = torch.nonzero(((positions >= 0.0) & (positions <= size)).all(1))[:, 0]
-    x, y = positions[seen].unbind(1)
-    return _evaluate_rays(screen.params[order], x, y), seen
+        color=image[..., 0:3], normal=image[..., 3:6], geometric_normal=image[..., 6:9],
+        alpha=image[..., 9], depth=image[..., 10],
+    )  # fmt: skip
 
 
 def _render_rows(
@@ -330,13 +272,9 @@ def _evaluate_rays(params: Tensor, x: Tensor, y: Tensor) -> _RayEvaluation:
     alpha = torch.where(contributes, alpha, 0.0)
     before = _transmittance_before(alpha)
     return _RayEvaluation(
-        log_alpha,
-        alpha * before,
-        contributes,
-        torch.prod(1.0 - alpha, dim=1),
-        z * (1.0 + shift) / denominator,
-        a0 * denominator,
-    )
+        log_alpha, alpha * before, contributes, torch.prod(1.0 - alpha, dim=1),
+        z * (1.0 + shift) / denominator, a0 * denominator,
+    )  # fmt: skip
 
 
 def _transmittance_before(alpha: Tensor) -> Tensor:

@@ -36,24 +36,11 @@ def render(
 ) -> Render:
     """Render as defined by :func:`~.reference.render_reference`, in float32.
 
-    Differentiable with respect to every tensor of ``gaussians`` except ``filter_3d``. Images and
-    gradients are bitwise the same for any number of threads.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        Scene frame. CPU tensors, or float32 CUDA tensors, which are rendered on the GPU.
-    camera : Camera
-        In the scene frame; any image size.
-    options : RenderOptions, optional
-    buffers : RenderBuffers, optional
-        Scratch memory to reuse; by default one set is shared by the process.
-
-    Returns
-    -------
-    Render
-        float32 images. With ``options.statistics`` the weights are filled at once, ``grad_px`` and
-        ``grad_abs_px`` by the backward pass.
+    Differentiable with respect to every tensor of ``gaussians`` (scene frame) except ``filter_3d``.
+    Images and gradients are bitwise the same for any number of threads. Float32 CUDA tensors are
+    rendered on the GPU. ``buffers`` is scratch memory to reuse; by default one set is shared by the
+    process. With ``options.statistics`` the weights are filled at once, ``grad_px`` and
+    ``grad_abs_px`` by the backward pass.
 
     Raises
     ------
@@ -99,16 +86,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.view, ctx.collected = view, collected
         ctx.camera, ctx.options = camera, options
         ctx.set_materialize_grads(False)
-        outputs = tuple(
-            torch.from_numpy(image)
-            for image in (
-                images.color,
-                images.normal,
-                images.geometric,
-                images.alpha,
-                images.depth,
-            )
-        )
+        outputs = tuple(torch.from_numpy(image) for image in images.arguments()[:5])
         # The backward pass reads their memory; saved so that autograd refuses to run after one of
         # them was modified in place.
         ctx.save_for_backward(means, log_scales, quats, opacity_logits, sh, orientation, *outputs)

@@ -54,8 +54,7 @@ class Vector:
     def __add__(self, other: Vector | float) -> Vector:
         return self._binary("fadd", other)
 
-    def __radd__(self, other: float) -> Vector:
-        return self._binary("fadd", other)
+    __radd__ = __add__
 
     def __sub__(self, other: Vector | float) -> Vector:
         return self._binary("fsub", other)
@@ -66,8 +65,7 @@ class Vector:
     def __mul__(self, other: Vector | float) -> Vector:
         return self._binary("fmul", other)
 
-    def __rmul__(self, other: float) -> Vector:
-        return self._binary("fmul", other)
+    __rmul__ = __mul__
 
     def __truediv__(self, other: Vector | float) -> Vector:
         return self._binary("fdiv", other)
@@ -199,15 +197,16 @@ class State:
         self.block.builder.store(self.block.vector(value).value, self._slot)
 
 
-class Block:
-    """Emits vector code of one width into a numba intrinsic.
+def shuffle(builder: Any, a: Any, b: Any, order: Sequence[int]) -> Any:
+    """Return the SSA vector of the lanes ``order`` of two vectors in a row."""
+    indices = ir.Constant(ir.VectorType(_WORD, len(order)), [ir.Constant(_WORD, k) for k in order])
+    return builder.shuffle_vector(a, b, indices)
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    context, builder
-        Arguments of the code generator of a numba intrinsic.
+
+class Block:
+    """Emits vector code of one width, 8 or 16 lanes, into a numba intrinsic.
+
+    ``context`` and ``builder`` are the arguments of the intrinsic's code generator.
     """
 
     def __init__(self, lanes: int, context: Any, builder: Any) -> None:
@@ -293,17 +292,12 @@ class Block:
             first = [g + k for g in range(0, 2 * lanes, group) for k in range(half)]
             second = [k + half for k in first]
             level = [
-                self._shuffle(a, b, first) + self._shuffle(a, b, second)
+                Vector(self, shuffle(self.builder, a.value, b.value, first))
+                + Vector(self, shuffle(self.builder, a.value, b.value, second))
                 for a, b in zip(level[::2], level[1::2], strict=True)
             ]
             group = half
         return level
-
-    def _shuffle(self, a: Vector, b: Vector, order: Sequence[int]) -> Vector:
-        indices = ir.Constant(
-            ir.VectorType(_WORD, self.lanes), [ir.Constant(_WORD, k) for k in order]
-        )
-        return Vector(self, self.builder.shuffle_vector(a.value, b.value, indices))
 
     def walk(
         self, cursor: Any, count: Any, body: Callable[[Any], Any], test: Callable[[Any], Any]
@@ -588,45 +582,47 @@ def _run_pointer(lanes: int, context: Any, builder: Any, kind: Any, array: Any, 
     return builder.bitcast(builder.gep(data, [at]), vector.as_pointer())
 
 
-def _copy_intrinsic(lanes: int) -> Any:
-    """Make a function that copies ``lanes`` float32 as one vector.
+def compile_time(function: Callable[..., Any]) -> Any:
+    """Make an intrinsic that gets integers and booleans known when compiling as literal types."""
+    return intrinsic(prefer_literal=True)(function)
+
+
+@compile_time
+def copy_run(typingctx, lanes, target, target_at, source, source_at):  # type: ignore[no-untyped-def]
+    """Copy one run of ``lanes`` (8 or 16) float32 as one vector.
 
     Instead of a loop: between two arrays, or two variable offsets of one array, LLVM cannot prove
     that the runs do not overlap, and falls back to scalar code.
     """
 
-    @intrinsic
-    def copy(typingctx, target, target_at, source, source_at):  # type: ignore[no-untyped-def]
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            source_run = _run_pointer(lanes, context, builder, sig.args[2], args[2], args[3])
-            target_run = _run_pointer(lanes, context, builder, sig.args[0], args[0], args[1])
-            builder.store(builder.load(source_run, align=4), target_run, align=4)
-            return context.get_dummy_value()
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        width = lanes.literal_value
+        source_run = _run_pointer(width, context, builder, sig.args[3], args[3], args[4])
+        target_run = _run_pointer(width, context, builder, sig.args[1], args[1], args[2])
+        builder.store(builder.load(source_run, align=4), target_run, align=4)
+        return context.get_dummy_value()
 
-        return types.void(target, types.intp, source, types.intp), generate
-
-    return copy
+    return types.void(lanes, target, types.intp, source, types.intp), generate
 
 
-def _mask_intrinsic(lanes: int) -> Any:
-    """Make a function that returns as bits which of ``lanes`` float32 are positive."""
+@compile_time
+def positive_run(typingctx, lanes, source, source_at):  # type: ignore[no-untyped-def]
+    """Return as bits which values of one run of ``lanes`` (8 or 16) float32 are positive."""
 
-    @intrinsic
-    def positive(typingctx, source, source_at):  # type: ignore[no-untyped-def]
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            run = _run_pointer(lanes, context, builder, sig.args[0], args[0], args[1])
-            zeros = ir.Constant(ir.VectorType(ir.FloatType(), lanes), None)
-            above = builder.fcmp_ordered(">", builder.load(run, align=4), zeros)
-            bits = builder.bitcast(above, ir.IntType(lanes))
-            return builder.zext(bits, ir.IntType(64))
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        width = lanes.literal_value
+        run = _run_pointer(width, context, builder, sig.args[1], args[1], args[2])
+        zeros = ir.Constant(ir.VectorType(ir.FloatType(), width), None)
+        above = builder.fcmp_ordered(">", builder.load(run, align=4), zeros)
+        return builder.zext(builder.bitcast(above, ir.IntType(width)), ir.IntType(64))
 
-        return types.uint64(source, types.intp), generate
-
-    return positive
+    return types.uint64(lanes, source, types.intp), generate
 
 
-@intrinsic
-def _lowest_bit(typingctx, bits):  # type: ignore[no-untyped-def]
+@compile_time
+def lowest_bit(typingctx, bits):  # type: ignore[no-untyped-def]
+    """Return the index of the lowest set bit of a uint64 other than 0."""
+
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
@@ -634,7 +630,11 @@ def _lowest_bit(typingctx, bits):  # type: ignore[no-untyped-def]
 
 
 def _prefetch_intrinsic(locality: int) -> Any:
-    """Make a function that prefetches a row: locality 3 for the L1 cache, 2 for L2."""
+    """Make a function that prefetches a row of a C-contiguous (n, 24) float32 array.
+
+    Tiles access rows in an order that the processor cannot predict; waiting for them took a third
+    of the time.
+    """
 
     @intrinsic
     def prefetch(typingctx, rows, row):  # type: ignore[no-untyped-def]
@@ -655,43 +655,5 @@ def _prefetch_intrinsic(locality: int) -> Any:
     return prefetch
 
 
-_prefetch_near, _prefetch_far = _prefetch_intrinsic(3), _prefetch_intrinsic(2)
-_copy_8, _copy_16 = _copy_intrinsic(8), _copy_intrinsic(16)
-_positive_8, _positive_16 = _mask_intrinsic(8), _mask_intrinsic(16)
-
-
-@inline
-def copy_run(lanes: Any, target: Any, target_at: Any, source: Any, source_at: Any) -> None:
-    """Copy one run of 8 or 16 float32."""
-    if lanes == 16:
-        _copy_16(target, target_at, source, source_at)
-    else:
-        _copy_8(target, target_at, source, source_at)
-
-
-@inline
-def lowest_bit(bits: Any) -> Any:
-    """Return the index of the lowest set bit of a uint64 other than 0."""
-    return _lowest_bit(bits)  # type: ignore[call-arg]
-
-
-@inline
-def prefetch_row(rows: Any, row: Any) -> None:
-    """Prefetch one row of a C-contiguous (n, 24) float32 array.
-
-    Tiles access rows in an order that the processor cannot predict; waiting for them took a third
-    of the time.
-    """
-    _prefetch_near(rows, row)
-
-
-@inline
-def prefetch_row_early(rows: Any, row: Any) -> None:
-    """Prefetch a row that is read much later into the second-level cache."""
-    _prefetch_far(rows, row)
-
-
-@inline
-def positive_run(lanes: Any, source: Any, source_at: Any) -> Any:
-    """Return as bits which values of one run of 8 or 16 float32 are positive."""
-    return _positive_16(source, source_at) if lanes == 16 else _positive_8(source, source_at)
+prefetch_row, prefetch_row_early = _prefetch_intrinsic(3), _prefetch_intrinsic(2)
+"""Into the first-level cache; into the second-level cache, for a row that is read much later."""

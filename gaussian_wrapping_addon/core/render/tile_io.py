@@ -26,7 +26,9 @@ from .simd import (
     TRANSMITTANCE_MIN,
     Block,
     Vector,
+    compile_time,
     lowest_bit,
+    shuffle,
 )
 
 # -- Contributor lists of the blocks of a tile, and which blocks are not yet opaque ---------------
@@ -86,17 +88,9 @@ def list_contributors(
 ) -> None:
     """List, for each block, which intersections ``begin .. begin + count`` of a tile reach it.
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    masks : (intersections,) uint32
-    capacity : int
-        Values of ``contributors`` per block, at least ``count + CONTRIBUTORS_PADDING``.
-    contributors : (blocks * capacity,) int32
-        Receives the intersections of block b, increasing, from ``b * capacity`` on.
-    counts : (blocks,) int64
-        Receives the length of each list.
+    ``contributors (blocks * capacity,) int32`` receives those of block b, increasing, from
+    ``b * capacity`` on, and ``counts (blocks,) int64`` their number. The capacity is at least
+    ``count + CONTRIBUTORS_PADDING``.
     """
     blocks = PLANE // lanes
     if lanes == TILE:
@@ -121,30 +115,20 @@ def list_contributors(
                 bits &= bits - np.uint64(1)
 
 
-def _active_intrinsic(lanes: int) -> Any:
-    @intrinsic
-    def active(typingctx, m, plane):  # type: ignore[no-untyped-def]
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            block, bits = Block(lanes, context, builder), ir.Constant(_INDEX, 0)
-            state = block.data(sig.args[0], args[0])
-            for number in range(PLANE // lanes):
-                transmittance = block.load(state, block.offset(args[1], number * lanes))
-                passes = builder.zext((transmittance >= float(TRANSMITTANCE_MIN)).any(), _INDEX)
-                bits = builder.or_(bits, builder.shl(passes, ir.Constant(_INDEX, number)))
-            return bits
-
-        return types.uint64(m, types.intp), generate
-
-    return active
-
-
-_active_16, _active_8 = _active_intrinsic(16), _active_intrinsic(8)
-
-
-@inline
-def active_blocks(lanes: Any, m: Any, plane: Any) -> Any:
+@compile_time
+def active_blocks(typingctx, lanes, m, plane):  # type: ignore[no-untyped-def]
     """Return as bits the blocks with a pixel that is not opaque; T is at ``m[plane ..]``."""
-    return _active_16(m, plane) if lanes == 16 else _active_8(m, plane)
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        block, bits = Block(lanes.literal_value, context, builder), ir.Constant(_INDEX, 0)
+        state = block.data(sig.args[1], args[1])
+        for number in range(PLANE // block.lanes):
+            transmittance = block.load(state, block.offset(args[2], number * block.lanes))
+            passes = builder.zext((transmittance >= float(TRANSMITTANCE_MIN)).any(), _INDEX)
+            bits = builder.or_(bits, builder.shl(passes, ir.Constant(_INDEX, number)))
+        return bits
+
+    return types.uint64(lanes, m, types.intp), generate
 
 
 # -- Copy rows of a tile between its planes, ordered by blocks, and the images, ordered by pixels
@@ -156,7 +140,6 @@ def active_blocks(lanes: Any, m: Any, plane: Any) -> Any:
 
 
 _CHANNELS = 3
-_MASK_WORD = ir.IntType(32)
 
 
 class _Rows:
@@ -168,19 +151,19 @@ class _Rows:
         self.lanes, self.builder = lanes, builder
         self.block, self.quad = Block(TILE, context, builder), Block(BLOCK_WIDTH, context, builder)
         self.offset, self.at = offset, at
-        self._live = None if live is None else builder.trunc(live, _MASK_WORD)
+        self._live = None if live is None else builder.trunc(live, _WORD)
 
     def plane(self, m: Any, which: int) -> Vector:
         """Return the row of one plane."""
         a, b, c, d = (self.quad.load(m, offset).value for offset in self._offsets(which))
-        left, right = self._shuffle(a, b, range(8)), self._shuffle(c, d, range(8))
-        return Vector(self.block, self._shuffle(left, right, range(TILE)))
+        left, right = shuffle(self.builder, a, b, range(8)), shuffle(self.builder, c, d, range(8))
+        return Vector(self.block, shuffle(self.builder, left, right, range(TILE)))
 
     def set_plane(self, value: Vector, m: Any, which: int) -> None:
         """Write the row of one plane."""
         for column, offset in enumerate(self._offsets(which)):
             order = range(column * BLOCK_WIDTH, (column + 1) * BLOCK_WIDTH)
-            part = self._shuffle(value.value, value.value, order)
+            part = shuffle(self.builder, value.value, value.value, order)
             self.quad.store(Vector(self.quad, part), m, offset)
 
     def _offsets(self, which: int) -> list[Any]:
@@ -205,7 +188,7 @@ class _Rows:
             pixels = [divmod(part * TILE + k, _CHANNELS) for k in range(TILE)]
             two = [pixel + TILE * (channel == 1) for pixel, channel in pixels]
             three = [pixels[k][0] + TILE if pixels[k][1] == 2 else k for k in range(TILE)]
-            value = self._shuffle(self._shuffle(a, b, two), c, three)
+            value = shuffle(self.builder, shuffle(self.builder, a, b, two), c, three)
             self._store(Vector(self.block, value), image, first, part, _CHANNELS)
 
     def load_three(self, image: Any) -> list[Vector]:
@@ -217,7 +200,7 @@ class _Rows:
             indices = [divmod(k * _CHANNELS + channel, TILE) for k in range(TILE)]
             two = [at + TILE * (part == 1) for part, at in indices]
             three = [indices[k][1] + TILE if indices[k][0] == 2 else k for k in range(TILE)]
-            value = self._shuffle(self._shuffle(a, b, two), c, three)
+            value = shuffle(self.builder, shuffle(self.builder, a, b, two), c, three)
             channels.append(Vector(self.block, value))
         return channels
 
@@ -231,21 +214,15 @@ class _Rows:
     def _first_value(self) -> Any:
         return self.builder.mul(self.at, self.block.index(_CHANNELS), flags=("nuw", "nsw"))
 
-    def _shuffle(self, a: Any, b: Any, order: Sequence[int]) -> Any:
-        indices = [ir.Constant(_MASK_WORD, k) for k in order]
-        return self.builder.shuffle_vector(
-            a, b, ir.Constant(ir.VectorType(_MASK_WORD, len(indices)), indices)
-        )
-
     def _mask(self, part: int, channels: int) -> Any:
         """Return which of 16 values of a row lie in the image."""
-        words = ir.VectorType(_MASK_WORD, TILE)
-        values = self.builder.mul(self._live, ir.Constant(_MASK_WORD, channels))
+        words = ir.VectorType(_WORD, TILE)
+        values = self.builder.mul(self._live, ir.Constant(_WORD, channels))
         one = self.builder.insert_element(
-            ir.Constant(words, ir.Undefined), values, ir.Constant(_MASK_WORD, 0)
+            ir.Constant(words, ir.Undefined), values, ir.Constant(_WORD, 0)
         )
         end = self.builder.shuffle_vector(one, one, ir.Constant(words, None))
-        own = ir.Constant(words, [ir.Constant(_MASK_WORD, part * TILE + k) for k in range(TILE)])
+        own = ir.Constant(words, [ir.Constant(_WORD, part * TILE + k) for k in range(TILE)])
         return self.builder.icmp_signed("<", own, end)
 
     def _masked(self, operation: str, result: Any, values: Sequence[Any]) -> Any:
@@ -263,7 +240,7 @@ class _Rows:
         if self._live is None:
             self.builder.store(value.value, pointer, align=4)
             return
-        align = ir.Constant(_MASK_WORD, 4)
+        align = ir.Constant(_WORD, 4)
         mask = self._mask(part, channels)
         self._masked("store", ir.VoidType(), [value.value, pointer, align, mask])
 
@@ -271,7 +248,7 @@ class _Rows:
         pointer = self._pointer(image, first, part)
         if self._live is None:
             return Vector(self.block, self.builder.load(pointer, align=4))
-        align, zeros = ir.Constant(_MASK_WORD, 4), self.block.vector(0.0).value
+        align, zeros = ir.Constant(_WORD, 4), self.block.vector(0.0).value
         mask = self._mask(part, channels)
         values = [pointer, align, mask, zeros]
         return Vector(self.block, self._masked("load", self.block.kind, values))
@@ -294,96 +271,74 @@ def _multiply_add(a: Vector, b: Vector, c: Vector) -> Vector:
     return Vector(a.block, a.block.call("llvm.fmuladd", [a.value, b.value, c.value], flags=()))
 
 
-def _write_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
-    @intrinsic
-    def write(typingctx, m, offset, live, background, images, at):  # type: ignore[no-untyped-def]
-        _require_contiguous(m, background, *images)
+@compile_time
+def _write(typingctx, lanes, depth, whole, m, offset, live, background, images, at):  # type: ignore[no-untyped-def]
+    _require_contiguous(m, background, *images)
 
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            rows = _Rows(lanes, context, builder, args[1], args[5], None if whole else args[2])
-            block = rows.block
-            state, behind = block.data(sig.args[0], args[0]), block.data(sig.args[3], args[3])
-            *three, alpha, depth_image, slope = _images(block, sig.args[4], args[4])
-            transmittance = rows.plane(state, TRANSMITTANCE)
-            for number, image in enumerate(three):
-                first = F0 + number * _CHANNELS
-                planes = [rows.plane(state, first + channel) for channel in range(_CHANNELS)]
-                if number == 0:
-                    colors = [block.scalar(behind, block.index(k)) for k in range(_CHANNELS)]
-                    planes = [
-                        plane + transmittance * block.splat(color)
-                        for plane, color in zip(planes, colors, strict=True)
-                    ]
-                rows.store_three(planes, image)
-            rows.store_one(1.0 - transmittance, alpha)
-            if depth:
-                rows.store_one(rows.plane(state, DEPTH), depth_image)
-                rows.store_one(rows.plane(state, SLOPE), slope)
-            return context.get_dummy_value()
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        live = None if whole.literal_value else args[5]
+        rows = _Rows(lanes.literal_value, context, builder, args[4], args[8], live)
+        block = rows.block
+        state, behind = block.data(sig.args[3], args[3]), block.data(sig.args[6], args[6])
+        *three, alpha, depth_image, slope = _images(block, sig.args[7], args[7])
+        transmittance = rows.plane(state, TRANSMITTANCE)
+        for number, image in enumerate(three):
+            first = F0 + number * _CHANNELS
+            planes = [rows.plane(state, first + channel) for channel in range(_CHANNELS)]
+            if number == 0:
+                colors = [block.scalar(behind, block.index(k)) for k in range(_CHANNELS)]
+                planes = [
+                    plane + transmittance * block.splat(color)
+                    for plane, color in zip(planes, colors, strict=True)
+                ]
+            rows.store_three(planes, image)
+        rows.store_one(1.0 - transmittance, alpha)
+        if depth.literal_value:
+            rows.store_one(rows.plane(state, DEPTH), depth_image)
+            rows.store_one(rows.plane(state, SLOPE), slope)
+        return context.get_dummy_value()
 
-        index = types.intp
-        return types.void(m, index, index, background, images, index), generate
-
-    return write
+    index = types.intp
+    return types.void(lanes, depth, whole, m, index, index, background, images, index), generate
 
 
-def _read_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
-    @intrinsic
-    def read(typingctx, m, offset, live, images, grads, at):  # type: ignore[no-untyped-def]
-        _require_contiguous(m, *images, *grads)
+@compile_time
+def _read(typingctx, lanes, depth, whole, m, offset, live, images, grads, at):  # type: ignore[no-untyped-def]
+    _require_contiguous(m, *images, *grads)
 
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            rows = _Rows(lanes, context, builder, args[1], args[5], None if whole else args[2])
-            block = rows.block
-            state = block.data(sig.args[0], args[0])
-            *three, alpha, depth_image, slope_image = _images(block, sig.args[3], args[3])
-            *g_three, g_alpha, g_depth = _images(block, sig.args[4], args[4])
-            # The colour includes the background, and with it the final transmittance.
-            grad = rows.load_one(g_alpha)
-            remaining = _multiply_add(grad, rows.load_one(alpha), -grad)
-            values = [rows.load_three(image) for image in three]
-            grads_of = [rows.load_three(image) for image in g_three]
-            for channel in range(_CHANNELS):
-                for number, pair in enumerate(zip(values, grads_of, strict=True)):
-                    which = gradient.G0 + number * _CHANNELS + channel
-                    value, grad = (channels[channel] for channels in pair)
-                    rows.set_plane(grad, state, which)
-                    remaining = _multiply_add(grad, value, remaining)
-            rows.set_plane(remaining, state, gradient.REMAINING)
-            rows.set_plane(rows.inside(block.vector(1.0)), state, gradient.BACKWARD_TRANSMITTANCE)
-            if depth:
-                found, grad = rows.load_one(depth_image), rows.load_one(g_depth)
-                has_gradient = (found > 0.0) & ((grad < 0.0) | (grad > 0.0))
-                slope = rows.load_one(slope_image)
-                # Exact division: fast math would allow an approximation for vectors, and numba
-                # makes every operation without a flag of its own fast.
-                log_t_gradient = Vector(
-                    block, builder.fdiv(grad.value, slope.value, flags=("nsz",))
-                )
-                rows.set_plane(has_gradient.select(found, 0.0), state, gradient.DEPTH)
-                rows.set_plane(
-                    has_gradient.select(log_t_gradient, 0.0), state, gradient.LOG_T_GRADIENT
-                )
-            return context.get_dummy_value()
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        live = None if whole.literal_value else args[5]
+        rows = _Rows(lanes.literal_value, context, builder, args[4], args[8], live)
+        block = rows.block
+        state = block.data(sig.args[3], args[3])
+        *three, alpha, depth_image, slope_image = _images(block, sig.args[6], args[6])
+        *g_three, g_alpha, g_depth = _images(block, sig.args[7], args[7])
+        # The colour includes the background, and with it the final transmittance.
+        grad = rows.load_one(g_alpha)
+        remaining = _multiply_add(grad, rows.load_one(alpha), -grad)
+        values = [rows.load_three(image) for image in three]
+        grads_of = [rows.load_three(image) for image in g_three]
+        for channel in range(_CHANNELS):
+            for number, pair in enumerate(zip(values, grads_of, strict=True)):
+                which = gradient.G0 + number * _CHANNELS + channel
+                value, grad = (channels[channel] for channels in pair)
+                rows.set_plane(grad, state, which)
+                remaining = _multiply_add(grad, value, remaining)
+        rows.set_plane(remaining, state, gradient.REMAINING)
+        rows.set_plane(rows.inside(block.vector(1.0)), state, gradient.BACKWARD_TRANSMITTANCE)
+        if depth.literal_value:
+            found, grad = rows.load_one(depth_image), rows.load_one(g_depth)
+            has_gradient = (found > 0.0) & ((grad < 0.0) | (grad > 0.0))
+            slope = rows.load_one(slope_image)
+            # Exact division: fast math would allow an approximation for vectors, and numba
+            # makes every operation without a flag of its own fast.
+            log_t_gradient = Vector(block, builder.fdiv(grad.value, slope.value, flags=("nsz",)))
+            rows.set_plane(has_gradient.select(found, 0.0), state, gradient.DEPTH)
+            rows.set_plane(has_gradient.select(log_t_gradient, 0.0), state, gradient.LOG_T_GRADIENT)
+        return context.get_dummy_value()
 
-        index = types.intp
-        return types.void(m, index, index, images, grads, index), generate
-
-    return read
-
-
-_write_whole_16, _write_cut_16 = (_write_intrinsic(16, False, whole) for whole in (True, False))
-_write_whole_8, _write_cut_8 = (_write_intrinsic(8, False, whole) for whole in (True, False))
-_depth_whole_16, _depth_cut_16 = (_write_intrinsic(16, True, whole) for whole in (True, False))
-_depth_whole_8, _depth_cut_8 = (_write_intrinsic(8, True, whole) for whole in (True, False))
-_read_whole_16, _read_cut_16 = (_read_intrinsic(16, False, whole) for whole in (True, False))
-_read_whole_8, _read_cut_8 = (_read_intrinsic(8, False, whole) for whole in (True, False))
-_depth_read_whole_16, _depth_read_cut_16 = (
-    _read_intrinsic(16, True, whole) for whole in (True, False)
-)
-_depth_read_whole_8, _depth_read_cut_8 = (
-    _read_intrinsic(8, True, whole) for whole in (True, False)
-)
+    index = types.intp
+    return types.void(lanes, depth, whole, m, index, index, images, grads, index), generate
 
 
 @inline
@@ -392,46 +347,14 @@ def write_row(
 ) -> None:
     """Write one row of a tile's forward planes to the images.
 
-    Parameters
-    ----------
-    lanes : int
-        8 or 16.
-    depth : bool
-        Include depth and slope.
-    m : (n,) float32
-        The tile's scratch.
-    offset : int
-        Start of the row in each plane.
-    live : int
-        Columns of the tile in the image.
-    background : (3,) float32
-    images : tuple
-        Colour, normal, geometric normal, alpha, depth, slope; C-contiguous.
-    at : int
-        Index of the row's first pixel in an image.
+    The row starts at ``offset`` in each plane of the scratch ``m`` and at pixel ``at`` of the
+    images (colour, normal, geometric normal, alpha, and with ``depth`` also depth and slope), which
+    are C-contiguous; ``live`` columns of the tile lie in them.
     """
-    if lanes == 16:
-        if depth:
-            if live == TILE:
-                _depth_whole_16(m, offset, live, background, images, at)
-            else:
-                _depth_cut_16(m, offset, live, background, images, at)
-        else:
-            if live == TILE:
-                _write_whole_16(m, offset, live, background, images, at)
-            else:
-                _write_cut_16(m, offset, live, background, images, at)
+    if live == TILE:
+        _write(lanes, depth, True, m, offset, live, background, images, at)
     else:
-        if depth:
-            if live == TILE:
-                _depth_whole_8(m, offset, live, background, images, at)
-            else:
-                _depth_cut_8(m, offset, live, background, images, at)
-        else:
-            if live == TILE:
-                _write_whole_8(m, offset, live, background, images, at)
-            else:
-                _write_cut_8(m, offset, live, background, images, at)
+        _write(lanes, depth, False, m, offset, live, background, images, at)
 
 
 @inline
@@ -443,25 +366,7 @@ def read_row(
     Pixels outside the image become opaque and have no gradient; ``live`` may be 0. Other parameters
     as in :func:`write_row`; ``grads`` are those on all images but the slope.
     """
-    if lanes == 16:
-        if depth:
-            if live == TILE:
-                _depth_read_whole_16(m, offset, live, images, grads, at)
-            else:
-                _depth_read_cut_16(m, offset, live, images, grads, at)
-        else:
-            if live == TILE:
-                _read_whole_16(m, offset, live, images, grads, at)
-            else:
-                _read_cut_16(m, offset, live, images, grads, at)
+    if live == TILE:
+        _read(lanes, depth, True, m, offset, live, images, grads, at)
     else:
-        if depth:
-            if live == TILE:
-                _depth_read_whole_8(m, offset, live, images, grads, at)
-            else:
-                _depth_read_cut_8(m, offset, live, images, grads, at)
-        else:
-            if live == TILE:
-                _read_whole_8(m, offset, live, images, grads, at)
-            else:
-                _read_cut_8(m, offset, live, images, grads, at)
+        _read(lanes, depth, False, m, offset, live, images, grads, at)

@@ -10,16 +10,13 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba.core import types
-from numba.extending import intrinsic
 
-from .. import limits
 from ..compiled import inline, kernel
-from .simd import BLOCK_COLUMNS, BLOCK_WIDTH, HALF, TILE, Block, Vector
+from .simd import BLOCK_COLUMNS, BLOCK_WIDTH, HALF, TILE, Block, Vector, compile_time, shuffle
 
 # -- Compiled kernels of tile binning: pixel ranges, intersected tiles, slots, scattering ---------
 
 
-_TILE = limits.TILE_PX
 # Margin for the rounding of float32 boxes and skews: relative to the half width, and in pixels.
 _SHARE_MARGIN = 1e-6
 _PIXEL_MARGIN = 0.02
@@ -34,20 +31,12 @@ _AHEAD = 4
 
 @kernel(fast=False)
 def range_pixels(
-    begin: int,
-    end: int,
-    boxes: np.ndarray,
-    visible: np.ndarray,
-    width: int,
-    height: int,
+    begin: int, end: int, boxes: np.ndarray, visible: np.ndarray, width: int, height: int,
     ranges: np.ndarray,
-) -> tuple[int, int]:
+) -> tuple[int, int]:  # fmt: skip
     """Write the pixel ranges of the Gaussians ``begin .. end``.
 
-    Returns
-    -------
-    visible, spans : int
-        Number of visible Gaussians, and of tile rows that they reach in total.
+    Returns the number of visible Gaussians, and of tile rows that they reach in total.
     """
     count = 0
     spans = 0
@@ -61,49 +50,28 @@ def range_pixels(
         ranges[i, 2] = int(max(np.ceil(boxes[i, 0] - 0.5), 0.0))
         ranges[i, 3] = int(min(np.floor(boxes[i, 2] - 0.5), width - 1.0))
         count += 1
-        spans += ranges[i, 1] // _TILE - ranges[i, 0] // _TILE + 1
+        spans += ranges[i, 1] // TILE - ranges[i, 0] // TILE + 1
     return count, spans
 
 
 @kernel(fast=False)
 def span_tiles(
-    begin: int,
-    end: int,
-    record: int,
-    span: int,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    visible: np.ndarray,
-    depths: np.ndarray,
-    ranges: np.ndarray,
-    spans: np.ndarray,
-    records: np.ndarray,
-    keys: np.ndarray,
-    changes: np.ndarray,
-) -> tuple[int, int, np.int64, np.int64]:
+    begin: int, end: int, record: int, span: int, boxes: np.ndarray, skews: np.ndarray,
+    visible: np.ndarray, depths: np.ndarray, ranges: np.ndarray, spans: np.ndarray,
+    records: np.ndarray, keys: np.ndarray, changes: np.ndarray,
+) -> tuple[int, int, np.int64, np.int64]:  # fmt: skip
     """Find the tiles that the ellipses of the Gaussians ``begin .. end`` reach.
 
     The ellipse clipped to the strip of pixel centres of a tile row is convex, so the columns follow
     from its extent in x. That extent ends at the ellipse's own extreme point if the strip contains
     it, else on the nearer edge of the strip.
 
-    Parameters
-    ----------
-    record, span : int
-        Where writing starts in ``records`` and ``spans``.
-    spans : (s, 2) uint16
-        Receives first and end tile column for each tile row.
-    records : (r, 5) int32
-        Receives one row for each Gaussian that reaches a tile, with its number of intersections
-        instead of the slot.
-    keys : (r,) uint32
-        Receives the bits of the distance, which order positive floats.
-    changes : (tiles_y, tiles_x + 1) int32
-        Receives the change in the number of intersections from each tile to the next in its row.
-
-    Returns
-    -------
-    end_record, intersections, lowest_key, highest_key : int
+    Writing starts at ``record`` in ``records (r, 5) int32``, a row for each Gaussian that reaches a
+    tile, with its number of intersections instead of the slot, and in ``keys (r,) uint32``, the
+    bits of its distance, which order positive floats; and at ``span`` in ``spans (s, 2) uint16``,
+    the first and end tile column of each tile row. ``changes (tiles_y, tiles_x + 1) int32``
+    receives the change in the number of intersections from each tile to the next in its row.
+    Returns the end record, the number of intersections, the lowest and the highest key.
     """
     changes[:] = 0
     all_intersections = 0
@@ -112,8 +80,8 @@ def span_tiles(
     for i in range(begin, end):
         if not visible[i]:
             continue
-        first_row, last_row = ranges[i, 0] // _TILE, ranges[i, 1] // _TILE
-        first, last = ranges[i, 2] // _TILE, ranges[i, 3] // _TILE
+        first_row, last_row = ranges[i, 0] // TILE, ranges[i, 1] // TILE
+        first, last = ranges[i, 2] // TILE, ranges[i, 3] // TILE
         intersections = 0
         x0, x1 = np.float64(boxes[i, 0]), np.float64(boxes[i, 2])
         y0, y1 = np.float64(boxes[i, 1]), np.float64(boxes[i, 3])
@@ -138,8 +106,8 @@ def span_tiles(
             low_px, high_px = np.float64(ranges[i, 2]), np.float64(ranges[i, 3])
             for row in range(first_row, last_row + 1):
                 at = span + row - first_row
-                upper = max(row * _TILE, ranges[i, 0]) + 0.5 - _PIXEL_MARGIN
-                lower = min(row * _TILE + _TILE - 1, ranges[i, 1]) + 0.5 + _PIXEL_MARGIN
+                upper = max(row * TILE, ranges[i, 0]) + 0.5 - _PIXEL_MARGIN
+                lower = min(row * TILE + TILE - 1, ranges[i, 1]) + 0.5 + _PIXEL_MARGIN
                 top = max((upper - center_y) * inverse, -1.0)
                 bottom = min((lower - center_y) * inverse, 1.0)
                 first_tile, end_tile = first, last + 1
@@ -154,8 +122,8 @@ def span_tiles(
                     if first_px > last_px:
                         first_tile = end_tile = 0
                     else:
-                        first_tile = int(first_px) // _TILE
-                        end_tile = int(last_px) // _TILE + 1
+                        first_tile = int(first_px) // TILE
+                        end_tile = int(last_px) // TILE + 1
                 spans[at, 0], spans[at, 1] = first_tile, end_tile
                 changes[row, first_tile] += 1
                 changes[row, end_tile] -= 1
@@ -178,14 +146,9 @@ def span_tiles(
 
 @kernel(fast=False)
 def count_band(
-    begin: int,
-    end: int,
-    first_tile: int,
-    end_tile: int,
-    tiles_x: int,
-    spans: np.ndarray,
+    begin: int, end: int, first_tile: int, end_tile: int, tiles_x: int, spans: np.ndarray,
     records: np.ndarray,
-) -> int:
+) -> int:  # fmt: skip
     """Replace the slots by the numbers of intersections within a band; return their sum."""
     all_intersections = 0
     first_band_row, end_band_row = first_tile // tiles_x, (end_tile - 1) // tiles_x + 1
@@ -204,14 +167,9 @@ def count_band(
 
 @kernel(fast=False)
 def assign_slots(
-    begin: int,
-    end: int,
-    begin_gaussian: int,
-    end_gaussian: int,
-    slot: int,
-    records: np.ndarray,
+    begin: int, end: int, begin_gaussian: int, end_gaussian: int, slot: int, records: np.ndarray,
     intersection_offsets: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Turn the numbers of intersections into first slots, counting from ``slot``.
 
     Writes ``intersection_offsets`` of the Gaussians ``begin_gaussian .. end_gaussian``, whose
@@ -243,14 +201,9 @@ def rank_records(
 
 @inline
 def _scatter(
-    filled: Any,
-    tiles: Any,
-    slots: Any,
-    ids: Any,
-    heads: Any,
-    gaussian_ids: Any,
+    filled: Any, tiles: Any, slots: Any, ids: Any, heads: Any, gaussian_ids: Any,
     intersection_slots: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Scatter the buffered intersections to the heads of their tiles."""
     for intersection in range(filled):
         listed_tile = np.uint64(tiles[intersection])
@@ -262,17 +215,10 @@ def _scatter(
 
 @kernel(fast=False)
 def scatter_tiles(
-    first_tile: int,
-    end_tile: int,
-    first_band_tile: int,
-    end_band_tile: int,
-    tiles_x: int,
-    ranked: np.ndarray,
-    spans: np.ndarray,
-    heads: np.ndarray,
-    gaussian_ids: np.ndarray,
+    first_tile: int, end_tile: int, first_band_tile: int, end_band_tile: int, tiles_x: int,
+    ranked: np.ndarray, spans: np.ndarray, heads: np.ndarray, gaussian_ids: np.ndarray,
     intersection_slots: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Write the intersections of some tiles of a band at their ``heads``.
 
     The tiles are ``first_tile .. end_tile``; ``ranked`` holds the records by increasing distance.
@@ -381,21 +327,16 @@ def _columns(block: Block, ids: Any, at: Any, boxes: Any, skews: Any) -> list[Ve
         rows.append(quad.load(boxes, builder.mul(gaussian, block.index(_BOX))).value)
         number_ = ir.Constant(_WORD, number)
         skew = builder.insert_element(skew, block.scalar(skews, gaussian), number_)
-
-    def shuffle(a: Any, b: Any, order: list[int]) -> Any:
-        indices = [ir.Constant(_WORD, k) for k in order]
-        kind = ir.VectorType(_WORD, len(order))
-        return builder.shuffle_vector(a, b, ir.Constant(kind, indices))
-
     while len(rows) > _BOX:
         both = list(range(2 * rows[0].type.count))
-        rows = [shuffle(a, b, both) for a, b in zip(rows[::2], rows[1::2], strict=True)]
+        rows = [shuffle(builder, a, b, both) for a, b in zip(rows[::2], rows[1::2], strict=True)]
     # Four vectors of four boxes each.
     columns = []
     for column in range(_BOX):
         eight = [column + _BOX * k for k in range(2 * _BOX)]
-        left, right = shuffle(rows[0], rows[1], eight), shuffle(rows[2], rows[3], eight)
-        columns.append(Vector(block, shuffle(left, right, list(range(_GROUP)))))
+        left = shuffle(builder, rows[0], rows[1], eight)
+        right = shuffle(builder, rows[2], rows[3], eight)
+        columns.append(Vector(block, shuffle(builder, left, right, range(_GROUP))))
     return [*columns, Vector(block, skew)]
 
 
@@ -452,41 +393,26 @@ def _reached_blocks(
     return _Words(block, chosen)
 
 
-def _mask_intrinsic(lanes: int) -> Any:
-    @intrinsic
-    def mask(  # type: ignore[no-untyped-def]
-        typingctx, ids, at, boxes, skews, left, top, masks, masks_at
-    ):
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            block = Block(_GROUP, context, builder)
-            ids_data, boxes_data, skews_data, out = (
-                block.data(sig.args[k], args[k]) for k in (0, 2, 3, 6)
-            )
-            columns = _columns(block, ids_data, args[1], boxes_data, skews_data)
-            words = _reached_blocks(block, columns, args[4], args[5], lanes // BLOCK_WIDTH)
-            pointer = builder.gep(out, [args[7]], inbounds=True)
-            builder.store(words.value, builder.bitcast(pointer, words.value.type.as_pointer()), 4)
-            return context.get_dummy_value()
+@compile_time
+def _mask_group(  # type: ignore[no-untyped-def]
+    typingctx, lanes, ids, at, boxes, skews, left, top, masks, masks_at
+):
+    """Write the masks of the 16 Gaussians ``ids[at ..]`` in one tile to ``masks[masks_at ..]``."""
 
-        index, single = types.intp, types.float32
-        return types.void(ids, index, boxes, skews, single, single, masks, index), generate
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        block = Block(_GROUP, context, builder)
+        ids_data, boxes_data, skews_data, out = (
+            block.data(sig.args[k], args[k]) for k in (1, 3, 4, 7)
+        )
+        columns = _columns(block, ids_data, args[2], boxes_data, skews_data)
+        height = lanes.literal_value // BLOCK_WIDTH
+        words = _reached_blocks(block, columns, args[5], args[6], height)
+        pointer = builder.gep(out, [args[8]], inbounds=True)
+        builder.store(words.value, builder.bitcast(pointer, words.value.type.as_pointer()), 4)
+        return context.get_dummy_value()
 
-    return mask
-
-
-_mask_16, _mask_8 = _mask_intrinsic(16), _mask_intrinsic(8)
-
-
-@inline
-def _mask_group(
-    lanes: Any, ids: Any, at: Any, boxes: Any, skews: Any, left: Any, top: Any, out: Any,
-    out_at: Any,
-) -> None:  # fmt: skip
-    """Write the masks of the 16 Gaussians ``ids[at ..]`` in one tile to ``out[out_at ..]``."""
-    if lanes == 16:
-        _mask_16(ids, at, boxes, skews, left, top, out, out_at)
-    else:
-        _mask_8(ids, at, boxes, skews, left, top, out, out_at)
+    index, single = types.intp, types.float32
+    return types.void(lanes, ids, index, boxes, skews, single, single, masks, index), generate
 
 
 @functools.cache
@@ -495,15 +421,9 @@ def mask_kernel(lanes: int) -> Any:
 
     @kernel(fast=True)
     def mask_range(
-        first_tile: int,
-        end_tile: int,
-        start: np.ndarray,
-        gaussian_ids: np.ndarray,
-        boxes: np.ndarray,
-        skews: np.ndarray,
-        tiles_x: int,
-        masks: np.ndarray,
-    ) -> None:
+        first_tile: int, end_tile: int, start: np.ndarray, gaussian_ids: np.ndarray,
+        boxes: np.ndarray, skews: np.ndarray, tiles_x: int, masks: np.ndarray,
+    ) -> None:  # fmt: skip
         """Write ``masks (intersections,) uint32``: bit ``4 block row + block column`` of the tile.
 
         The part of the ellipse between the first and last pixel centres of a row of blocks is

@@ -11,7 +11,7 @@ import numpy as np
 from .. import limits
 from ..compiled import kernel
 from ..errors import ResourceError, UsageError
-from ..parallel import ArrayStore, balanced_bounds, default_threads, even_bounds, run_chunks
+from ..parallel import ArrayStore, balanced_bounds, even_bounds, run_chunks
 from .projection import ScreenGaussians
 from .tile_kernels import (
     ID,
@@ -49,14 +49,9 @@ def _coarse_histogram(
 
 @kernel(fast=False)
 def _sort_part(
-    keys: np.ndarray,
-    bounds: np.ndarray,
-    first_key: int,
-    end_key: int,
-    packed: np.ndarray,
-    other: np.ndarray,
-    order: np.ndarray,
-) -> None:
+    keys: np.ndarray, bounds: np.ndarray, first_key: int, end_key: int, packed: np.ndarray,
+    other: np.ndarray, order: np.ndarray,
+) -> None:  # fmt: skip
     """Write the indices of the keys in ``first_key .. end_key`` to ``order``, sorted.
 
     ``order`` has exactly their number of elements, ``packed`` and ``other`` one more.
@@ -102,23 +97,11 @@ def _sort_part(
 def order_by_keys(
     keys: np.ndarray, bounds: np.ndarray, extent: tuple[int, int], threads: int, store: ArrayStore
 ) -> np.ndarray:
-    """Return the indices of keys in increasing order of key, ties by index.
+    """Return the (v,) int32 indices of keys in increasing order of key, ties by index.
 
-    Parameters
-    ----------
-    keys : (r,) uint32
-    bounds : (m, 2) int64
-        The runs of ``keys`` to sort, increasing.
-    extent : (int, int)
-        Smallest and largest key in these runs.
-    threads : int
-    store : ArrayStore
-        Owns the result, which is valid until the next call with this store.
-
-    Returns
-    -------
-    (v,) int32
-        Indices into ``keys``; the same for any number of threads.
+    ``bounds (m, 2)`` are the runs of ``keys (r,) uint32`` to sort, increasing; ``extent`` is the
+    smallest and largest key in them. The result is the same for any number of threads, and belongs
+    to ``store`` until the next call with it.
     """
     count = int((bounds[:, 1] - bounds[:, 0]).sum())
     order = store.take("order", count, np.int32)
@@ -140,29 +123,16 @@ def order_by_keys(
             begin, stop = int(begins[part]), int(begins[part + 1])
             room = slice(begin + part, stop + part + 1)
             _sort_part(
-                keys,
-                bounds,
-                int(cuts[part]),
-                int(cuts[part + 1]),
-                packed[room],
-                other[room],
+                keys, bounds, int(cuts[part]), int(cuts[part + 1]), packed[room], other[room],
                 order[begin:stop],
-            )
+            )  # fmt: skip
 
     run_chunks(sort, np.arange(len(cuts)), threads)
     return order
 
 
 def radix_order(depths: np.ndarray, visible: np.ndarray, threads: int = 1) -> np.ndarray:
-    """Return the indices of the visible rows by increasing distance, ties by index (int32).
-
-    Parameters
-    ----------
-    depths : (n,) float32
-        Distances, >= 0 where visible.
-    visible : (n,) bool
-    threads : int
-    """
+    """Return the indices of the visible rows by increasing distance >= 0, ties by index (int32)."""
     ids = np.nonzero(visible)[0].astype(np.int32)
     # Positive floats are ordered like their bit patterns.
     keys = depths[ids].view(np.uint32)
@@ -206,14 +176,9 @@ class TileLists:
 class TileBinning:
     """The tiles that each Gaussian of a view reaches; yields the lists of any band of tiles.
 
-    Attributes
-    ----------
-    ids : (v,) int32
-        The Gaussians that reach a tile, increasing.
-    tile_counts : (tiles,) int64
-        Number of Gaussians that reach each tile.
-    pixel_ranges, tiles_x, tiles_y
-        As in :class:`TileLists`.
+    ``ids (v,) int32`` are the Gaussians that reach a tile, increasing;
+    ``tile_counts (tiles,) int64`` the numbers of Gaussians that reach each tile. Others as in
+    :class:`TileLists`.
     """
 
     def __init__(
@@ -264,20 +229,10 @@ class TileBinning:
         def spans(first: int, end: int) -> None:
             for chunk in range(first, end):
                 results[chunk] = span_tiles(
-                    self._gaussians[chunk],
-                    self._gaussians[chunk + 1],
-                    starts[chunk, 0],
-                    starts[chunk, 1],
-                    screen.boxes,
-                    screen.skews,
-                    screen.visible,
-                    screen.depths,
-                    self.pixel_ranges,
-                    self._spans,
-                    self._records,
-                    keys,
-                    changes[chunk],
-                )
+                    self._gaussians[chunk], self._gaussians[chunk + 1], starts[chunk, 0],
+                    starts[chunk, 1], screen.boxes, screen.skews, screen.visible, screen.depths,
+                    self.pixel_ranges, self._spans, self._records, keys, changes[chunk],
+                )  # fmt: skip
 
         run_chunks(spans, np.arange(chunks + 1), threads)
         # Gaussians that turn out to reach no tile leave gaps at the ends of the runs.
@@ -300,10 +255,7 @@ class TileBinning:
     def bands(self, max_intersections: int) -> list[tuple[int, int]]:
         """Split the tiles into runs of at most ``max_intersections``, or of a single tile.
 
-        Returns
-        -------
-        list of (first, end)
-            At least one band, even if nothing is visible.
+        Returns (first, end) of at least one band, even if nothing is visible.
         """
         below = np.concatenate([[0], np.cumsum(self.tile_counts)])
         tiles = len(self.tile_counts)
@@ -320,17 +272,8 @@ class TileBinning:
     def lists(self, first: int, end: int, max_intersections: int | None = None) -> TileLists:
         """Return the lists of the tiles ``first .. end``, overwriting those of the last call.
 
-        Parameters
-        ----------
-        first, end : int
-            Any run of tiles.
-        max_intersections : int, optional
-            Largest number of intersections to reserve memory for ahead of need.
-
-        Raises
-        ------
-        ResourceError
-            If the lists would hold more than 2^31 - 1 intersections.
+        Memory for ``max_intersections`` is reserved ahead of need. Raises ResourceError if the
+        lists would hold more than 2^31 - 1 intersections.
         """
         store, threads = self._store, self.threads
         tiles = len(self.tile_counts)
@@ -359,30 +302,17 @@ class TileBinning:
 
         def scatter(first_tile: int, end_tile: int) -> None:
             scatter_tiles(
-                first_tile,
-                end_tile,
-                first,
-                end,
-                self.tiles_x,
-                ranked,
-                self._spans,
-                heads,
-                gaussian_ids,
-                intersection_slots,
-            )
+                first_tile, end_tile, first, end, self.tiles_x, ranked, self._spans, heads,
+                gaussian_ids, intersection_slots,
+            )  # fmt: skip
 
         # Each thread passes over the whole order and keeps what falls into its tiles.
         bounds = first + balanced_bounds(self.tile_counts[first:end], threads)
         run_chunks(scatter, bounds, threads)
         return TileLists(
-            start,
-            gaussian_ids,
-            intersection_slots,
-            intersection_offsets,
-            self.pixel_ranges,
-            self.tiles_x,
-            self.tiles_y,
-        )
+            start, gaussian_ids, intersection_slots, intersection_offsets, self.pixel_ranges,
+            self.tiles_x, self.tiles_y,
+        )  # fmt: skip
 
     def _offsets(self, first: int, end: int) -> np.ndarray:
         """Number the slots of a band; return (n + 1,) offsets."""
@@ -415,38 +345,6 @@ class TileBinning:
         run_chunks(assign, np.arange(chunks + 1), threads)
         offsets[self._count] = slots[-1]
         return offsets
-
-
-def bin_gaussians(
-    screen: ScreenGaussians,
-    width: int,
-    height: int,
-    threads: int = 0,
-    store: ArrayStore | None = None,
-) -> TileLists:
-    """Sort the visible Gaussians by distance and scatter them into tile lists.
-
-    One radix sort of the distances and one counting sort into tiles; within each tile the order is
-    that of a stable sort, for any number of threads. Tiles at the corners of a box that the ellipse
-    itself does not reach leave the Gaussian out.
-
-    Parameters
-    ----------
-    screen : ScreenGaussians
-        Projected for an image of ``width`` x ``height`` pixels.
-    threads : int
-        0 uses every core.
-    store : ArrayStore, optional
-        Owns the lists, which are valid until its next binning; by default a new one.
-
-    Raises
-    ------
-    ResourceError
-        If the lists would hold more than 2^31 - 1 intersections.
-    """
-    store = ArrayStore() if store is None else store
-    binning = TileBinning(screen, width, height, threads or default_threads(), store)
-    return binning.lists(0, binning.tiles_x * binning.tiles_y)
 
 
 def _bounds(count: int, threads: int) -> np.ndarray:

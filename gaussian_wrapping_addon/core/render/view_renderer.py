@@ -9,6 +9,8 @@ gradients do not depend on the number of threads.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ..errors import UsageError
@@ -50,11 +52,9 @@ def allocate_screen(count: int, store: ArrayStore) -> ScreenGaussians:
     """Return uninitialised arrays for the projection of ``count`` Gaussians."""
     return ScreenGaussians(
         store.take("params", (count, ROW_VALUES), np.float32),
-        store.take("boxes", (count, 4), np.float32),
-        store.take("in image", count, np.bool_),
-        store.take("depths", count, np.float32),
-        store.take("skews", count, np.float32),
-    )
+        store.take("boxes", (count, 4), np.float32), store.take("in image", count, np.bool_),
+        store.take("depths", count, np.float32), store.take("skews", count, np.float32),
+    )  # fmt: skip
 
 
 def band_view(
@@ -72,36 +72,17 @@ def band_view(
     costs = np.diff(lists.start[first : end + 1]) + _TILE_COST
     bounds = first + balanced_bounds(costs, threads * CHUNKS_PER_THREAD if threads > 1 else 1)
     lanes = vector_lanes()
-    masks = _block_masks(screen, lists, lanes, bounds, threads, store)
-    return ScreenView(gaussians, camera, options, screen, lists, lanes, masks, bounds, threads)
-
-
-def _block_masks(
-    screen: ScreenGaussians,
-    lists: TileLists,
-    lanes: int,
-    bounds: np.ndarray,
-    threads: int,
-    store: ArrayStore,
-) -> np.ndarray:
-    """Return the blocks of its tile that each intersection reaches (:class:`ScreenView`)."""
     masks = store.take("masks", len(lists.gaussian_ids), np.uint32)
     mask_range = mask_kernel(lanes)
-
-    def mark(first: int, end: int) -> None:
-        mask_range(
-            first,
-            end,
-            lists.start,
-            lists.gaussian_ids,
-            screen.boxes,
-            screen.skews,
-            lists.tiles_x,
+    run_chunks(
+        lambda begin, end: mask_range(
+            begin, end, lists.start, lists.gaussian_ids, screen.boxes, screen.skews, lists.tiles_x,
             masks,
-        )
-
-    run_chunks(mark, bounds, threads)
-    return masks
+        ),
+        bounds,
+        threads,
+    )  # fmt: skip
+    return ScreenView(gaussians, camera, options, screen, lists, lanes, masks, bounds, threads)
 
 
 class ViewPass:
@@ -158,13 +139,18 @@ class ViewPass:
         """Return the view of a band; only one band's lists exist at a time."""
         if self._listed is None or self._listed[0] != band:
             lists = self._binning.lists(*band, max_intersections=self._max_intersections)
-            gaussians, camera, options = self.gaussians, self._camera, self._options
-            view = band_view(gaussians, camera, options, self.screen, lists, band, self._store)
+            view = band_view(
+                self.gaussians, self._camera, self._options, self.screen, lists, band, self._store
+            )
             self._listed = band, view
         return self._listed[1]
 
-    def _visible_bounds(self) -> np.ndarray:
-        return even_bounds(len(self.ids), self._threads, 4 if self._threads > 1 else 1)
+    def _for_visible(self, kernel: Any, *arguments: Any) -> None:
+        """Run a kernel over ``ids``, in chunks."""
+        bounds = even_bounds(len(self.ids), self._threads, 4 if self._threads > 1 else 1)
+        run_chunks(
+            lambda begin, end: kernel(begin, end, self.ids, *arguments), bounds, self._threads
+        )
 
     def forward(self) -> None:
         """Blend all bands; called once, by the renderer."""
@@ -177,8 +163,11 @@ class ViewPass:
                 "intersection weights", (intersections, 2), np.float32, self._max_intersections
             )
             blend(view, self._images, self._renderer.buffers, weights)
-            if self._options.statistics:
-                self._add_weights(view.lists, weights)
+            if self._options.statistics and self.statistics is not None:
+                self._for_visible(
+                    add_intersection_weights, weights, view.lists.intersection_offsets,
+                    self.statistics.weight_sum, self.statistics.weight_max,
+                )  # fmt: skip
 
     def _first_statistics(self) -> RenderStatistics:
         """Return statistics with what binning determines; all others are 0."""
@@ -194,44 +183,14 @@ class ViewPass:
             strongest=self._images.strongest if weighed else None,
         )
 
-        def mark(begin: int, end: int) -> None:
-            mark_visible(
-                begin, end, self.ids, self.screen.boxes, statistics.visible, statistics.radii_px
-            )
-
-        run_chunks(mark, self._visible_bounds(), self._threads)
+        self._for_visible(mark_visible, self.screen.boxes, statistics.visible, statistics.radii_px)
         return statistics
-
-    def _add_weights(self, lists: TileLists, weights: np.ndarray) -> None:
-        statistics = self.statistics
-        assert statistics is not None
-
-        def add(begin: int, end: int) -> None:
-            add_intersection_weights(
-                begin,
-                end,
-                self.ids,
-                weights,
-                lists.intersection_offsets,
-                statistics.weight_sum,
-                statistics.weight_max,
-            )
-
-        run_chunks(add, self._visible_bounds(), self._threads)
 
     def backward(self, grads: ImageGradients) -> VisibleGradients:
         """Return the gradient with respect to the raw parameters of the visible Gaussians.
 
-        Parameters
-        ----------
-        grads : ImageGradients
-            C-contiguous float32 arrays of the images' shapes.
-
-        Returns
-        -------
-        VisibleGradients
-            One row for every Gaussian that reaches a tile of the image; valid until the renderer is
-            used again.
+        ``grads`` are arrays of the images' shapes. One row for every Gaussian that reaches a tile
+        of the image; valid until the renderer is used again.
 
         Raises
         ------
@@ -240,24 +199,10 @@ class ViewPass:
             rendered another view since.
         """
         grad_params = self.params_gradient(grads)
-        gaussians, count = self.gaussians, len(self.ids)
-
-        def take(name: str) -> np.ndarray:
-            shape = (count, *getattr(gaussians, name).shape[1:])
-            return self._store.take(f"grad {name}", shape, np.float32)
-
-        out = VisibleGradients(
-            self.ids,
-            take("means"),
-            take("log_scales"),
-            take("quats"),
-            take("opacity_logits"),
-            take("sh"),
-            take("orientation"),
-        )
         return project_backward_visible(
-            gaussians, self._camera, self._options, self.screen, grad_params, self.ids, out
-        )
+            self.gaussians, self._camera, self._options, self.screen, grad_params, self.ids,
+            self._store.take,
+        )  # fmt: skip
 
     def params_gradient(self, grads: ImageGradients) -> np.ndarray:
         """Return the (n, 24) float32 gradient on the screen params; only rows ``ids`` are valid."""
@@ -274,46 +219,24 @@ class ViewPass:
         # The lists of the last band still exist.
         for band in reversed(self._bands):
             view = self._view(band)
-            lists = view.lists
             intersections = store.take(
-                "intersections",
-                (len(lists.gaussian_ids), ROW_VALUES),
-                np.float32,
+                "intersections", (len(view.lists.gaussian_ids), ROW_VALUES), np.float32,
                 self._max_intersections,
-            )
+            )  # fmt: skip
             write_intersection_gradients(
-                view,
-                self._images,
-                incoming,
-                self._renderer.buffers,
-                intersections,
-                depth=depth,
+                view, self._images, incoming, self._renderer.buffers, intersections, depth=depth,
                 absolute=absolute,
-            )
-            self._add_intersections(lists, intersections, grad_params, band == self._bands[-1])
+            )  # fmt: skip
+            self._for_visible(
+                add_intersection_gradients, intersections, view.lists.intersection_offsets,
+                band == self._bands[-1], grad_params,
+            )  # fmt: skip
         if self.statistics is not None:
-            self._write_screen_gradients(self.statistics, grad_params)
+            self._for_visible(
+                write_screen_gradients, grad_params, self.statistics.grad_px,
+                self.statistics.grad_abs_px,
+            )  # fmt: skip
         return grad_params
-
-    def _add_intersections(
-        self, lists: TileLists, intersections: np.ndarray, grad_params: np.ndarray, fresh: bool
-    ) -> None:
-        def add(begin: int, end: int) -> None:
-            add_intersection_gradients(
-                begin, end, self.ids, intersections, lists.intersection_offsets, fresh, grad_params
-            )
-
-        run_chunks(add, self._visible_bounds(), self._threads)
-
-    def _write_screen_gradients(
-        self, statistics: RenderStatistics, grad_params: np.ndarray
-    ) -> None:
-        def take(begin: int, end: int) -> None:
-            write_screen_gradients(
-                begin, end, self.ids, grad_params, statistics.grad_px, statistics.grad_abs_px
-            )
-
-        run_chunks(take, self._visible_bounds(), self._threads)
 
     def _incoming(self, grads: ImageGradients) -> list[np.ndarray]:
         """Return the five image gradients, zeros for those that are ``None``."""
@@ -335,12 +258,8 @@ class ViewRenderer:
     """Renders one view after the other in the same memory; not thread-safe.
 
     After a view of the largest image and number of Gaussians, no memory that grows with Gaussians,
-    pixels or intersections is allocated any more.
-
-    Parameters
-    ----------
-    buffers : RenderBuffers, optional
-        Scratch memory of the threads; by default its own.
+    pixels or intersections is allocated any more. ``buffers`` is scratch memory of the threads; by
+    default its own.
     """
 
     def __init__(self, buffers: RenderBuffers | None = None) -> None:
@@ -357,25 +276,12 @@ class ViewRenderer:
         options: RenderOptions | None = None,
         images: Images | None = None,
     ) -> ViewPass:
-        """Render like :func:`~.render`, without autograd.
+        """Render like :func:`~.render`, without autograd; Gaussians and camera in the scene frame.
 
         The parameters must not change before :meth:`ViewPass.backward` has run. The result of the
-        previous call is overwritten.
-
-        Parameters
-        ----------
-        gaussians : RawArrays
-            Scene frame.
-        camera : Camera
-            In the scene frame; any image size.
-        options : RenderOptions, optional
-        images : Images, optional
-            Receives the images; by default memory of the renderer.
-
-        Raises
-        ------
-        ResourceError
-            If the tile lists or the contributor lists grow beyond what can be addressed.
+        previous call is overwritten. ``images`` receives the images; by default memory of the
+        renderer. Raises ResourceError if the tile lists or the contributor lists grow beyond what
+        can be addressed.
         """
         options = options or RenderOptions()
         threads = options.threads or default_threads()

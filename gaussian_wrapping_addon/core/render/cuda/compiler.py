@@ -25,21 +25,9 @@ _DRIVER_HINT = "Update the NVIDIA driver, or render on the CPU."
 
 
 class DriverModule:
-    """Compiled kernels loaded into the primary context of one GPU.
+    """Compiled kernels loaded into the primary context of the GPU of torch's device index.
 
-    Parameters
-    ----------
-    device_index : int
-        Device index of torch.
-    image : bytes
-        From the compiler.
-    names : sequence of str
-        Kernels to look up.
-
-    Raises
-    ------
-    DeviceError
-        If the driver is missing or fails.
+    Raises DeviceError if the driver is missing or fails.
     """
 
     def __init__(self, device_index: int, image: bytes, names: Sequence[str]) -> None:
@@ -59,12 +47,9 @@ class DriverModule:
             for name in names:
                 function = ctypes.c_void_p()
                 _check_driver(
-                    self._cuda,
-                    "cuModuleGetFunction",
-                    ctypes.byref(function),
-                    module,
+                    self._cuda, "cuModuleGetFunction", ctypes.byref(function), module,
                     name.encode(),
-                )
+                )  # fmt: skip
                 self._functions[name] = function
         finally:
             self._leave()
@@ -74,22 +59,15 @@ class DriverModule:
     ) -> None:
         """Queue a kernel; ``parameters`` points to the values of its arguments, in order.
 
-        Raises
-        ------
-        DeviceError
-            If it cannot be queued. Errors during execution are reported later, by torch.
+        Raises DeviceError if it cannot be queued; torch reports errors during execution, later.
         """
         self._enter()
         try:
             _check_driver(
-                self._cuda,
-                "cuLaunchKernel",
-                self._functions[name],
+                self._cuda, "cuLaunchKernel", self._functions[name],
                 *(ctypes.c_uint(value) for value in (blocks, 1, 1, threads, 1, 1, 0)),
-                ctypes.c_void_p(stream),
-                parameters,
-                None,
-            )
+                ctypes.c_void_p(stream), parameters, None,
+            )  # fmt: skip
         finally:
             self._leave()
 
@@ -103,13 +81,7 @@ class DriverModule:
 
 @functools.cache
 def load_driver() -> ctypes.CDLL:
-    """Return the NVIDIA driver library, initialised.
-
-    Raises
-    ------
-    DeviceError
-        If the driver is not installed.
-    """
+    """Return the NVIDIA driver library, initialised; DeviceError if it is not installed."""
     name = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
     try:
         cuda = ctypes.CDLL(name)
@@ -124,10 +96,7 @@ def load_driver() -> ctypes.CDLL:
 def device_count() -> int:
     """Return how many GPUs the driver shows to this process; needs no torch.
 
-    Raises
-    ------
-    DeviceError
-        If the driver is not installed, fails, or finds no GPU.
+    Raises DeviceError if the driver is not installed, fails, or finds no GPU.
     """
     count = ctypes.c_int()
     _check_driver(load_driver(), "cuDeviceGetCount", ctypes.byref(count))
@@ -137,10 +106,7 @@ def device_count() -> int:
 def driver_cuda_version() -> str:
     """Return the newest version of CUDA that the driver supports, such as ``"13.0"``.
 
-    Raises
-    ------
-    DeviceError
-        If the driver is not installed or fails.
+    Raises DeviceError if the driver is not installed or fails.
     """
     number = ctypes.c_int()
     _check_driver(load_driver(), "cuDriverGetVersion", ctypes.byref(number))
@@ -179,14 +145,9 @@ class CompiledText:
 def find_nvrtc(cuda_major: int | None = None) -> Path | None:
     """Return the NVRTC library to use, or ``None`` if there is none.
 
-    Searched in the ``nvidia`` wheels that torch depends on, in torch's own folder (Windows),
-    and in the CUDA toolkit of ``CUDA_PATH`` or ``CUDA_HOME``.
-
-    Parameters
-    ----------
-    cuda_major : int, optional
-        Major version of torch's CUDA, which the driver is known to support: preferred. Otherwise
-        the newest is returned.
+    Searched in the ``nvidia`` wheels that torch depends on, in torch's own folder (Windows), and in
+    the CUDA toolkit of ``CUDA_PATH`` or ``CUDA_HOME``. That of ``cuda_major``, torch's CUDA, which
+    the driver is known to support, is preferred; otherwise the newest is returned.
     """
     found = []
     for path in _library_files():
@@ -201,20 +162,10 @@ def find_nvrtc(cuda_major: int | None = None) -> Path | None:
 def compile_text(
     text: str, capability: tuple[int, int], library: Path, *, verbose: bool = False
 ) -> CompiledText:
-    """Compile CUDA C for one compute capability.
+    """Compile CUDA C for one compute capability, such as (8, 9).
 
     For an architecture newer than the compiler, PTX of the newest known one is returned, which the
-    driver translates.
-
-    Parameters
-    ----------
-    text : str
-    capability : (int, int)
-        Such as (8, 9).
-    library : Path
-        From :func:`find_nvrtc`.
-    verbose : bool
-        Log registers, shared memory and spills of every kernel.
+    driver translates. ``verbose`` logs registers, shared memory and spills of every kernel.
 
     Raises
     ------
@@ -233,10 +184,8 @@ def compile_text(
             "Render on the CPU.",
         )
     exact = wanted in known
-    options = ["--std=c++17", "--restrict"]
-    options.append(f"--gpu-architecture={'sm' if exact else 'compute'}_{max(usable)}")
-    if verbose:
-        options.append("--ptxas-options=-v")
+    architecture = f"--gpu-architecture={'sm' if exact else 'compute'}_{max(usable)}"
+    options = ["--std=c++17", "--restrict", architecture, *["--ptxas-options=-v"] * verbose]
     program = ctypes.c_void_p()
     _check_compiler(
         nvrtc,

@@ -17,8 +17,9 @@ from ...errors import ResourceError, UsageError
 from ...gaussians.model import OrientedGaussians
 from ...scene.camera import Camera
 from ..query_kernels import fine_scale
+from ..simd import ROW_VALUES
 from ..types import RenderOptions
-from .device_view import MAX_INTERSECTIONS, ROW_VALUES, WARPS, DeviceScreen, RawTensors, offsets
+from .device_view import MAX_INTERSECTIONS, WARPS, DeviceScreen, RawTensors, offsets, sorted_by_tile
 from .kernels import Kernels
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits")
@@ -73,56 +74,26 @@ class DeviceQueryResult:
 def query_view(
     kernels: Kernels, gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
 ) -> DeviceQueryView:
-    """Project Gaussians for queries only, including those between pixel centres.
+    """Project float32 Gaussians for queries only, including those between pixel centres.
 
-    Parameters
-    ----------
-    kernels : Kernels
-        Of the tensors' device.
-    gaussians : OrientedGaussians
-        Scene frame, float32.
-    camera : Camera
-        In the scene frame.
-    options : RenderOptions
-        ``near_z`` and ``depth_valid_transmittance`` are used.
+    Of the options ``near_z`` and ``depth_valid_transmittance`` are used.
     """
     raw = RawTensors.of(gaussians.replaced(sh=gaussians.sh[:, :1]), camera, options)
     count, device = len(gaussians), gaussians.means.device
     screen = DeviceScreen.empty(count, device)
     kernels.launch_each(
-        "project_finely",
-        count,
-        *raw.arguments(),
-        fine_scale(camera),
-        screen.params,
-        screen.boxes,
-        screen.visible,
-        screen.depths,
-        screen.skews,
-    )
+        "project_finely", count, *raw.arguments(), fine_scale(camera), screen.params, screen.boxes,
+        screen.visible, screen.depths, screen.skews,
+    )  # fmt: skip
     return DeviceQueryView(kernels, raw, camera, options, screen)
 
 
 def solve_depths(view: DeviceQueryView, positions: Tensor) -> DeviceQueryResult:
     """Solve the depth of the 0.5-isosurface at positions of a view.
 
-    Parameters
-    ----------
-    view : DeviceQueryView
-    positions : (m, 2) float32
-        Pixels, on the view's device.
-
-    Returns
-    -------
-    DeviceQueryResult
-        z-depths; 0 where there is none, outside ``[0, width] x [0, height]`` and for NaN.
-
-    Raises
-    ------
-    UsageError
-        If the positions are not (m, 2).
-    ResourceError
-        If the tile lists are too long to be indexed.
+    ``positions (m, 2)`` are pixels, on the view's device; UsageError if their shape differs,
+    ResourceError if the tile lists are too long to be indexed. The result is 0 where there is no
+    depth, outside ``[0, width] x [0, height]`` and for NaN.
     """
     if positions.dim() != 2 or positions.shape[1] != 2:
         raise UsageError(
@@ -135,20 +106,10 @@ def solve_depths(view: DeviceQueryView, positions: Tensor) -> DeviceQueryResult:
     found, slopes = torch.empty((2, count), device=positions.device).unbind()
     stops = torch.empty(count, dtype=torch.int32, device=positions.device)
     view.kernels.launch(
-        "solve_points",
-        -(-count // WARPS),
-        count,
-        view.screen.params,
-        lists.start,
-        lists.gaussian_ids,
-        tiles[0] * tiles[1],
-        points.tiles,
-        points.coordinates,
-        float(view.options.depth_valid_transmittance),
-        found,
-        slopes,
-        stops,
-    )
+        "solve_points", -(-count // WARPS), count, view.screen.params, lists.start,
+        lists.gaussian_ids, tiles[0] * tiles[1], points.tiles, points.coordinates,
+        float(view.options.depth_valid_transmittance), found, slopes, stops,
+    )  # fmt: skip
     values = torch.empty_like(found)
     values[points.order] = found
     return DeviceQueryResult(values, points, lists, found, slopes, stops)
@@ -159,22 +120,9 @@ def add_query_gradients(
 ) -> Tensor:
     """Add the gradient of ``sum grads * values`` to that on the view's ``screen.params``.
 
-    Bitwise reproducible on the same GPU.
-
-    Parameters
-    ----------
-    view : DeviceQueryView
-        The view of the query.
-    result : DeviceQueryResult
-    grads : (m,) floats
-        On ``result.values``; ignored for positions without a result.
-    grad_params : (n, 24) float32
-        Accumulated into; columns from 13 on are unchanged.
-
-    Returns
-    -------
-    (m, 2) float32
-        The gradient on the positions.
+    Bitwise reproducible on the same GPU. ``grads (m,)`` are ignored for positions without a result;
+    columns of ``grad_params (n, 24) float32`` from 13 on are unchanged. Returns the (m, 2) float32
+    gradient on the positions.
     """
     points, lists, params = result.points, result.lists, view.screen.params
     incoming = grads[points.order].float() / result.slopes
@@ -182,44 +130,21 @@ def add_query_gradients(
     tiles_x, tiles_y = _tile_counts(view.camera)
     rows = params.new_empty((len(lists.gaussian_ids), ROW_VALUES))
     view.kernels.launch(
-        "query_gradients",
-        tiles_x * tiles_y,
-        params,
-        lists.start,
-        lists.gaussian_ids,
-        lists.intersection_slots,
-        points.start,
-        points.coordinates,
-        result.found,
-        weights,
-        result.stops,
-        rows,
-    )
+        "query_gradients", tiles_x * tiles_y, params, lists.start, lists.gaussian_ids,
+        lists.intersection_slots, points.start, points.coordinates, result.found, weights,
+        result.stops, rows,
+    )  # fmt: skip
     view.kernels.launch(
-        "sum_pairs",
-        -(-len(params) // WARPS),
-        len(params),
-        rows,
-        lists.intersection_offsets,
+        "sum_pairs", -(-len(params) // WARPS), len(params), rows, lists.intersection_offsets,
         grad_params,
-    )
+    )  # fmt: skip
     count = len(weights)
     by_coordinates = params.new_empty((count, 2))
     view.kernels.launch(
-        "position_gradients",
-        -(-count // WARPS),
-        count,
-        params,
-        lists.start,
-        lists.gaussian_ids,
-        tiles_x * tiles_y,
-        points.tiles,
-        points.coordinates,
-        result.found,
-        weights,
-        result.stops,
+        "position_gradients", -(-count // WARPS), count, params, lists.start, lists.gaussian_ids,
+        tiles_x * tiles_y, points.tiles, points.coordinates, result.found, weights, result.stops,
         by_coordinates,
-    )
+    )  # fmt: skip
     grad_positions = torch.empty_like(by_coordinates)
     grad_positions[points.order] = by_coordinates
     return grad_positions
@@ -230,18 +155,9 @@ def project_query_gradients(
 ) -> dict[str, Tensor]:
     """Return the gradients on the raw parameters from those on the view's ``screen.params``.
 
-    Parameters
-    ----------
-    view : DeviceQueryView
-    result : DeviceQueryResult
-        The only query whose gradients ``grad_params`` holds.
-    grad_params : (n, 24) float32
-        Rows that are not finite are set to 0.
-
-    Returns
-    -------
-    dict
-        Tensors (n, ...) of means, log_scales, quats and opacity_logits; 0 where not reached.
+    ``grad_params (n, 24) float32`` holds the gradients of this one query; rows that are not finite
+    are set to 0. Returns tensors (n, ...) of means, log_scales, quats and opacity_logits, 0 where
+    not reached.
     """
     count = len(grad_params)
     nothing = grad_params.new_empty(0)
@@ -250,15 +166,9 @@ def project_query_gradients(
     gaussians = view.raw.gaussians
     found = {name: torch.zeros_like(getattr(gaussians, name)) for name in _TRAINED}
     view.kernels.launch_each(
-        "project_backward",
-        count,
-        *view.raw.arguments(),
-        reached,
-        grad_params,
-        *found.values(),
-        torch.zeros_like(gaussians.sh),
-        torch.zeros_like(gaussians.orientation),
-    )
+        "project_backward", count, *view.raw.arguments(), reached, grad_params, *found.values(),
+        torch.zeros_like(gaussians.sh), torch.zeros_like(gaussians.orientation),
+    )  # fmt: skip
     return found
 
 
@@ -279,11 +189,9 @@ def _sort_points(positions: Tensor, camera: Camera) -> SortedPoints:
     by_tile = torch.sort(keys, stable=True)
     edges = torch.arange(tiles_x * tiles_y + 1, dtype=torch.int32, device=positions.device)
     return SortedPoints(
-        positions[by_tile.indices],
-        by_tile.indices,
-        by_tile.values,
+        positions[by_tile.indices], by_tile.indices, by_tile.values,
         torch.searchsorted(by_tile.values, edges),
-    )
+    )  # fmt: skip
 
 
 def _list_points(view: DeviceQueryView, points: SortedPoints) -> PointLists:
@@ -306,24 +214,7 @@ def _list_points(view: DeviceQueryView, points: SortedPoints) -> PointLists:
         )
     unsorted = torch.empty((3, intersections), dtype=torch.int32, device=device)
     kernels.launch_each(
-        "list_areas",
-        count,
-        order,
-        rank_offsets,
-        intersection_offsets,
-        *ellipses,
-        areas,
-        tiles_x,
-        tiles_y,
-        *unsorted.unbind(),
-    )
-    # Short keys need half as many passes of the radix sort.
-    keys = unsorted[0].to(torch.int16 if tiles < 2**15 else torch.int32)
-    by_tile = torch.sort(keys, stable=True)
-    edges = torch.arange(tiles + 1, dtype=keys.dtype, device=device)
-    return PointLists(
-        torch.searchsorted(by_tile.values, edges),
-        unsorted[1][by_tile.indices],
-        unsorted[2][by_tile.indices],
-        intersection_offsets,
-    )
+        "list_areas", count, order, rank_offsets, intersection_offsets, *ellipses, areas, tiles_x,
+        tiles_y, *unsorted.unbind(),
+    )  # fmt: skip
+    return PointLists(*sorted_by_tile(unsorted, tiles), intersection_offsets)

@@ -34,20 +34,10 @@ def render_cuda(
     *,
     budget_bytes: int = 0,
 ) -> Render:
-    """Render on the GPU that holds the Gaussians; see :func:`~.render`.
+    """Render on the GPU that holds the float32 Gaussians; see :func:`~.render`.
 
-    Bitwise reproducible on the same GPU.
-
-    Parameters
-    ----------
-    gaussians : OrientedGaussians
-        CUDA tensors, float32, scene frame.
-    camera : Camera
-        In the scene frame.
-    options : RenderOptions, optional
-        ``threads`` and ``budget_bytes``, which is for the CPU's lists, are not used.
-    budget_bytes : int
-        GPU memory for tile intersections; 0 uses half of what is free.
+    Bitwise reproducible on the same GPU. ``budget_bytes`` is GPU memory for tile intersections, 0
+    for half of what is free; the options' own, and ``threads``, are for the CPU.
 
     Raises
     ------
@@ -137,13 +127,10 @@ def empty_statistics(count: int, options: RenderOptions) -> RenderStatistics:
     """Return statistics of zeros for ``count`` Gaussians."""
     weighed = count if options.statistics else 0
     return RenderStatistics(
-        visible=np.zeros(count, np.bool_),
-        radii_px=np.zeros(count, np.float32),
-        weight_sum=np.zeros(weighed, np.float32),
-        weight_max=np.zeros(weighed, np.float32),
-        grad_px=np.zeros(count, np.float32),
-        grad_abs_px=np.zeros(count, np.float32),
-    )
+        visible=np.zeros(count, np.bool_), radii_px=np.zeros(count, np.float32),
+        weight_sum=np.zeros(weighed, np.float32), weight_max=np.zeros(weighed, np.float32),
+        grad_px=np.zeros(count, np.float32), grad_abs_px=np.zeros(count, np.float32),
+    )  # fmt: skip
 
 
 def fill_statistics(statistics: RenderStatistics, view: DeviceView) -> None:
@@ -211,14 +198,8 @@ class DeviceViewPass:
 class DeviceRenderer:
     """Renders views of Gaussians on the host by the kernels of a device.
 
-    The Gaussians of the last call stay on the device and are not sent again.
-
-    Parameters
-    ----------
-    kernels : Kernels
-    device : torch.device
-    budget_bytes : callable
-        Device memory that tile intersections may take now.
+    The Gaussians of the last call stay on the device and are not sent again. ``budget_bytes()`` is
+    the device memory that tile intersections may take now.
     """
 
     def __init__(
@@ -249,10 +230,7 @@ class DeviceRenderer:
 def device_renderer(device: str) -> DeviceRenderer:
     """Return the renderer of a GPU such as ``"cuda:0"``.
 
-    Raises
-    ------
-    DeviceError
-        If the compiler or the driver is missing or fails.
+    Raises DeviceError if the compiler or the driver is missing or fails.
     """
     gpu = torch.device(device)
     index = torch.cuda.current_device() if gpu.index is None else gpu.index

@@ -15,6 +15,7 @@ from ...errors import ResourceError, UsageError
 from ...gaussians.model import TRAINED, OrientedGaussians
 from ...scene.camera import Camera
 from ..projection import pack_camera, used_degree
+from ..simd import ROW_VALUES
 from ..types import RenderOptions
 from .kernels import THREADS_PER_BLOCK, CameraValues, Kernels
 
@@ -22,7 +23,6 @@ from .kernels import THREADS_PER_BLOCK, CameraValues, Kernels
 
 
 WARPS = THREADS_PER_BLOCK // 32
-ROW_VALUES = 24
 KEPT_BYTES = 4 + 4 + 4 * WARPS
 """Memory per intersection kept for the backward pass: Gaussian, slot, contribution masks."""
 PASSING_BYTES = 4 * ROW_VALUES
@@ -44,12 +44,10 @@ class DeviceScreen:
     def empty(cls, count: int, device: torch.device) -> DeviceScreen:
         """Return a screen for a kernel to fill."""
         return cls(
-            torch.empty((count, ROW_VALUES), device=device),
-            torch.empty((count, 4), device=device),
-            torch.empty(count, dtype=torch.bool, device=device),
+            torch.empty((count, ROW_VALUES), device=device), torch.empty((count, 4), device=device),
+            torch.empty(count, dtype=torch.bool, device=device), torch.empty(count, device=device),
             torch.empty(count, device=device),
-            torch.empty(count, device=device),
-        )
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -86,17 +84,9 @@ class RawTensors:
         """Return the arguments that projection forward and backward share."""
         g = self.gaussians
         return (
-            g.means,
-            g.log_scales,
-            g.quats,
-            g.opacity_logits,
-            g.sh,
-            int(g.sh.shape[1]),
-            self.degree,
-            g.orientation,
-            g.filter_3d,
-            self.camera,
-        )
+            g.means, g.log_scales, g.quats, g.opacity_logits, g.sh, int(g.sh.shape[1]), self.degree,
+            g.orientation, g.filter_3d, self.camera,
+        )  # fmt: skip
 
 
 def project(kernels: Kernels, raw: RawTensors) -> DeviceScreen:
@@ -104,15 +94,9 @@ def project(kernels: Kernels, raw: RawTensors) -> DeviceScreen:
     count, device = len(raw.gaussians), raw.gaussians.means.device
     screen = DeviceScreen.empty(count, device)
     kernels.launch_each(
-        "project_gaussians",
-        count,
-        *raw.arguments(),
-        screen.params,
-        screen.boxes,
-        screen.visible,
-        screen.depths,
-        screen.skews,
-    )
+        "project_gaussians", count, *raw.arguments(), screen.params, screen.boxes, screen.visible,
+        screen.depths, screen.skews,
+    )  # fmt: skip
     return screen
 
 
@@ -121,16 +105,8 @@ def bin_bands(
 ) -> Iterator[Band]:
     """Yield the tile lists of a view in bands of tile rows, as few as the budget allows.
 
-    Parameters
-    ----------
-    budget_bytes : int
-        Half of it is for what all bands keep for the backward pass, half for the gradient rows of
-        one band at a time.
-
-    Raises
-    ------
-    ResourceError
-        If one tile row, or all lists together, exceed it.
+    Half of it is for what all bands keep for the backward pass, half for the gradient rows of one
+    band at a time. Raises ResourceError if one tile row, or all lists together, exceed it.
     """
     tile = limits.TILE_PX
     tiles_x, tiles_y = -(-camera.width // tile), -(-camera.height // tile)
@@ -172,17 +148,9 @@ def _count(
     count = len(screen.params)
     counts = torch.empty(count, dtype=torch.int64, device=screen.params.device)
     kernels.launch_each(
-        "count_pairs",
-        count,
-        screen.boxes,
-        screen.skews,
-        screen.visible,
-        camera.width,
-        camera.height,
-        first_row,
-        end_row,
-        counts,
-    )
+        "count_pairs", count, screen.boxes, screen.skews, screen.visible, camera.width,
+        camera.height, first_row, end_row, counts,
+    )  # fmt: skip
     return counts
 
 
@@ -201,34 +169,22 @@ def _list(
     rank_offsets = offsets(counts[order])
     unsorted = torch.empty((3, intersections), dtype=torch.int32, device=device)
     kernels.launch_each(
-        "list_pairs",
-        len(order),
-        order,
-        rank_offsets,
-        intersection_offsets,
-        screen.boxes,
-        screen.skews,
-        camera.width,
-        camera.height,
-        tiles_x,
-        first_row,
-        end_row,
-        *unsorted.unbind(),
-    )
+        "list_pairs", len(order), order, rank_offsets, intersection_offsets, screen.boxes,
+        screen.skews, camera.width, camera.height, tiles_x, first_row, end_row, *unsorted.unbind(),
+    )  # fmt: skip
     tiles = tiles_x * (end_row - first_row)
+    masks = torch.zeros((intersections, WARPS), dtype=torch.int32, device=device)
+    return Band(first_row, tiles, *sorted_by_tile(unsorted, tiles), intersection_offsets, masks)
+
+
+def sorted_by_tile(unsorted: Tensor, tiles: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Sort (3, p) tiles, Gaussians and slots; return the tiles' starts, Gaussians and slots."""
     # Short keys need half as many passes of the radix sort.
     keys = unsorted[0].to(torch.int16 if tiles < 2**15 else torch.int32)
     by_tile = torch.sort(keys, stable=True)
-    edges = torch.arange(tiles + 1, dtype=keys.dtype, device=device)
-    return Band(
-        first_row,
-        tiles,
-        torch.searchsorted(by_tile.values, edges),
-        unsorted[1][by_tile.indices],
-        unsorted[2][by_tile.indices],
-        intersection_offsets,
-        torch.zeros((intersections, WARPS), dtype=torch.int32, device=device),
-    )
+    edges = torch.arange(tiles + 1, dtype=keys.dtype, device=keys.device)
+    start = torch.searchsorted(by_tile.values, edges)
+    return start, unsorted[1][by_tile.indices], unsorted[2][by_tile.indices]
 
 
 def offsets(counts: Tensor) -> Tensor:
@@ -261,14 +217,12 @@ class DeviceImages:
         """Return images for the kernels to fill; depth is 0 unless it is solved."""
         shape = (camera.height, camera.width)
         return cls(
-            torch.empty((*shape, 3), device=device),
-            torch.empty((*shape, 3), device=device),
-            torch.empty((*shape, 3), device=device),
-            torch.empty(shape, device=device),
+            torch.empty((*shape, 3), device=device), torch.empty((*shape, 3), device=device),
+            torch.empty((*shape, 3), device=device), torch.empty(shape, device=device),
             torch.zeros(shape, device=device),
             torch.empty(shape if options.depth else (0,), device=device),
             torch.empty(shape if options.statistics else (0,), dtype=torch.int32, device=device),
-        )
+        )  # fmt: skip
 
 
 @dataclass
@@ -291,28 +245,17 @@ class DeviceStatistics:
         gathered = count if options.gathers_statistics else 0
         return cls(
             torch.zeros(count, dtype=torch.bool, device=device),
-            torch.zeros(weighed, device=device),
-            torch.zeros(weighed, device=device),
-            torch.zeros(gathered, device=device),
-            torch.zeros(gathered, device=device),
-        )
+            torch.zeros(weighed, device=device), torch.zeros(weighed, device=device),
+            torch.zeros(gathered, device=device), torch.zeros(gathered, device=device),
+        )  # fmt: skip
 
 
 class DeviceView:
     """A rendered view, and what its backward pass needs.
 
-    Parameters
-    ----------
-    kernels : Kernels
-        Of the tensors' device.
-    gaussians : OrientedGaussians
-        float32 tensors on one device, scene frame. They must not change before :meth:`backward`.
-    camera : Camera
-        Scene frame.
-    options : RenderOptions
-        ``threads`` and ``budget_bytes``, which is for the CPU's lists, are not used.
-    budget_bytes : int
-        Device memory for tile intersections.
+    The Gaussians are float32 on one device and must not change before :meth:`backward`.
+    ``budget_bytes`` is device memory for tile intersections; the options' own, and ``threads``, are
+    for the CPU.
 
     Raises
     ------
@@ -368,57 +311,29 @@ class DeviceView:
         weighed = self.options.statistics
         weights = screen.params.new_zeros((len(band.gaussian_ids) if weighed else 0, 2))
         kernels.launch(
-            "forward_tiles_weights" if weighed else "forward_tiles",
-            band.tiles,
-            screen.params,
-            screen.boxes,
-            screen.skews,
-            band.start,
-            band.gaussian_ids,
-            band.intersection_slots,
-            *self._geometry(band),
-            *(float(value) for value in self.options.background),
-            images.color,
-            images.normal,
-            images.geometric_normal,
-            images.alpha,
-            band.masks,
-            weights,
+            "forward_tiles_weights" if weighed else "forward_tiles", band.tiles, screen.params,
+            screen.boxes, screen.skews, band.start, band.gaussian_ids, band.intersection_slots,
+            *self._geometry(band), *(float(value) for value in self.options.background),
+            images.color, images.normal, images.geometric_normal, images.alpha, band.masks, weights,
             images.strongest,
-        )
+        )  # fmt: skip
         sums.reached.logical_or_(band.intersection_offsets.diff() > 0)
         if weighed:
             kernels.launch_each(
-                "sum_weights",
-                len(screen.params),
-                weights,
-                band.intersection_offsets,
-                sums.weight_sum,
-                sums.weight_max,
-            )
+                "sum_weights", len(screen.params), weights, band.intersection_offsets,
+                sums.weight_sum, sums.weight_max,
+            )  # fmt: skip
         if self.options.depth:
             kernels.launch(
-                "isosurface_tiles",
-                band.tiles,
-                screen.params,
-                band.start,
-                band.gaussian_ids,
-                band.masks,
-                *self._geometry(band),
-                float(self.options.depth_valid_transmittance),
-                images.alpha,
-                images.depth,
-                images.slope,
-            )
+                "isosurface_tiles", band.tiles, screen.params, band.start, band.gaussian_ids,
+                band.masks, *self._geometry(band), float(self.options.depth_valid_transmittance),
+                images.alpha, images.depth, images.slope,
+            )  # fmt: skip
 
     def params_gradient(self, incoming: list[Tensor | None]) -> Tensor:
         """Return the (n, 24) gradient on the screen params.
 
-        Parameters
-        ----------
-        incoming : list of tensors
-            Contiguous gradients on the five images in the order of :data:`IMAGES`; ``None`` for
-            zeros.
+        ``incoming`` are contiguous gradients on the images of :data:`IMAGES`; ``None`` for zeros.
         """
         outputs = [getattr(self.images, name) for name in IMAGES]
         with_depth = self.options.depth and incoming[4] is not None
@@ -434,57 +349,34 @@ class DeviceView:
         for band in self.band_lists:
             rows = params.new_empty((len(band.gaussian_ids), ROW_VALUES))
             kernels.launch(
-                name,
-                band.tiles,
-                params,
-                band.start,
-                band.gaussian_ids,
-                band.intersection_slots,
-                band.masks,
-                *self._geometry(band),
-                *outputs,
-                self.images.slope,
-                *given,
-                rows,
-            )
+                name, band.tiles, params, band.start, band.gaussian_ids, band.intersection_slots,
+                band.masks, *self._geometry(band), *outputs, self.images.slope, *given, rows,
+            )  # fmt: skip
             blocks = -(-len(params) // WARPS)
             kernels.launch(
                 "sum_pairs", blocks, len(params), rows, band.intersection_offsets, grad_params
             )
         kernels.launch_each(
-            "finish_params",
-            len(params),
-            int(gathers),
-            grad_params,
-            self.statistics.grad_px,
+            "finish_params", len(params), int(gathers), grad_params, self.statistics.grad_px,
             self.statistics.grad_abs_px,
-        )
+        )  # fmt: skip
         return grad_params
 
     def backward(self, incoming: list[Tensor | None]) -> dict[str, Tensor]:
         """Return the gradients of the trained tensors, rows of 0 for Gaussians not seen.
 
-        Parameters
-        ----------
-        incoming : list of tensors
-            As for :meth:`params_gradient`.
+        ``incoming`` as for :meth:`params_gradient`.
         """
         with translated_out_of_memory(self.camera):
-            grad_params = self.params_gradient(incoming)
-            return self.gaussian_gradients(grad_params)
+            return self._gaussian_gradients(self.params_gradient(incoming))
 
-    def gaussian_gradients(self, grad_params: Tensor) -> dict[str, Tensor]:
-        """Return the gradients of the trained tensors from those of the screen params (n, 24)."""
+    def _gaussian_gradients(self, grad_params: Tensor) -> dict[str, Tensor]:
         raw = self._raw
         found = {name: torch.zeros_like(getattr(raw.gaussians, name)) for name in TRAINED}
         self._kernels.launch_each(
-            "project_backward",
-            len(grad_params),
-            *raw.arguments(),
-            self.screen.visible,
-            grad_params,
-            *found.values(),
-        )
+            "project_backward", len(grad_params), *raw.arguments(), self.screen.visible,
+            grad_params, *found.values(),
+        )  # fmt: skip
         return found
 
     def _geometry(self, band: Band) -> tuple[int, int, int, int]:

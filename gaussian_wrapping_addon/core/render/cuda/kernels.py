@@ -24,72 +24,30 @@ from .compiler import DriverModule, compile_text, find_nvrtc, load_driver
 
 
 PARTS = (
-    "common.cu",
-    "projection.cu",
-    "projection_backward.cu",
-    "binning.cu",
-    "raster.cu",
-    "isosurface.cu",
-    "raster_backward.cu",
-    "vacancy.cu",
-    "losses.cu",
-    "adam.cu",
-    "query.cu",
+    "common.cu", "projection.cu", "projection_backward.cu", "binning.cu", "raster.cu",
+    "isosurface.cu", "raster_backward.cu", "vacancy.cu", "losses.cu", "adam.cu", "query.cu",
     "multi_view.cu",
-)
+)  # fmt: skip
 
 KERNELS = (
-    "project_gaussians",
-    "project_backward",
-    "count_pairs",
-    "list_pairs",
-    "forward_tiles",
-    "forward_tiles_weights",
-    "sum_weights",
-    "isosurface_tiles",
-    "backward_tiles",
-    "backward_tiles_depth",
-    "backward_tiles_absolute",
-    "backward_tiles_depth_absolute",
-    "sum_pairs",
-    "finish_params",
-    "locate_points",
-    "transmittance_tiles",
-    "ssim_maps",
-    "color_gradient",
-    "agree_normals",
-    "gather_depth",
-    "prior_depths",
-    "adam_rows",
-    "project_finely",
-    "bound_points",
-    "count_areas",
-    "list_areas",
-    "solve_points",
-    "query_gradients",
-    "position_gradients",
-    "grey_pixels",
-    "measure_pixels",
-    "pick_pixels",
-    "lift_points",
-    "return_points",
-    "compare_patches",
-    "finish_pixels",
-)
+    "project_gaussians", "project_backward", "count_pairs", "list_pairs", "forward_tiles",
+    "forward_tiles_weights", "sum_weights", "isosurface_tiles", "backward_tiles",
+    "backward_tiles_depth", "backward_tiles_absolute", "backward_tiles_depth_absolute", "sum_pairs",
+    "finish_params", "locate_points", "transmittance_tiles", "ssim_maps", "color_gradient",
+    "agree_normals", "gather_depth", "prior_depths", "adam_rows", "project_finely", "bound_points",
+    "count_areas", "list_areas", "solve_points", "query_gradients", "position_gradients",
+    "grey_pixels", "measure_pixels", "pick_pixels", "lift_points", "return_points",
+    "compare_patches", "finish_pixels",
+)  # fmt: skip
 """Names of the kernels (entry points)."""
 
 THREADS_PER_BLOCK = 256
 
 _SINGLE = {
-    "ALPHA_MIN": limits.ALPHA_MIN,
-    "ALPHA_MAX": limits.ALPHA_MAX,
-    "TRANSMITTANCE_MIN": limits.TRANSMITTANCE_MIN,
-    "ISO_LEVEL": limits.ISO_LEVEL,
-    "DENOMINATOR_MIN": limits.DENOMINATOR_MIN,
-    "FRONT_SIGMAS": float(FRONT_SIGMAS),
-    "SLOPE_FLOOR": limits.SLOPE_FLOOR,
-    "TINY": 1e-30,
-    "FARTHEST": 3e38,
+    "ALPHA_MIN": limits.ALPHA_MIN, "ALPHA_MAX": limits.ALPHA_MAX,
+    "TRANSMITTANCE_MIN": limits.TRANSMITTANCE_MIN, "ISO_LEVEL": limits.ISO_LEVEL,
+    "DENOMINATOR_MIN": limits.DENOMINATOR_MIN, "FRONT_SIGMAS": float(FRONT_SIGMAS),
+    "SLOPE_FLOOR": limits.SLOPE_FLOOR, "TINY": 1e-30, "FARTHEST": 3e38,
     "FLOAT32_LARGE": 3.0e38,  # every smaller magnitude is a usable float32
     # Ellipses above this half width take every row of their box: rows are narrowed in float32,
     # whose rounding at this size stays a tenth of the margin.
@@ -100,12 +58,8 @@ _SINGLE = {
     "FALL_END": 22.4,
     "SOLVER_STEP_SIGMAS": 5e-4,
     "SOLVER_LEVEL_MARGIN": 3e-7,  # as in isosurface.py
-    "SOLVER_BRACKET_SHARE": 1.25e-7,
-    "SOLVER_LEAST_SHARE": 1.25e-7,
-    "SOLVER_POLISH_SIGMAS": 3e-3,
-    "SOLVER_LEVEL_FAR": 0.05,
-    "SOLVER_FLAT": 0.02,
-    "SOLVER_LEAST_SLOPE": 1e-12,
+    "SOLVER_BRACKET_SHARE": 1.25e-7, "SOLVER_LEAST_SHARE": 1.25e-7, "SOLVER_POLISH_SIGMAS": 3e-3,
+    "SOLVER_LEVEL_FAR": 0.05, "SOLVER_FLAT": 0.02, "SOLVER_LEAST_SLOPE": 1e-12,
     "FLOAT_MARGIN": 4e-6,  # as in query_kernels.py
     # As in core/field/vacancy_kernels.py.
     "FACTOR_MIN": 1e-7,
@@ -118,20 +72,14 @@ _SINGLE = {
     "ADAM_BETA1": 0.9,
     "ADAM_BETA2": 0.999,
     "ADAM_EPSILON": 1e-15,
-}
+}  # fmt: skip
 _DOUBLE = {
-    "ALPHA_MIN_WIDE": limits.ALPHA_MIN,
-    "QUATERNION_MIN_NORM": limits.QUATERNION_MIN_NORM,
-    "DIRECTION_MIN_NORM": limits.DIRECTION_MIN_NORM,
-    "FINITE_OFFSET_PX": limits.FINITE_OFFSET_PX,
-    "FINITE_NUM": limits.FINITE_NUM,
-    "FINITE_DEN": limits.FINITE_DEN,
-    "FINITE_SPREAD": limits.FINITE_SPREAD,
-    "FINITE_PULL": limits.FINITE_PULL,
-    "FINITE_Z_MIN": limits.FINITE_Z_MIN,
-    "FINITE_Z_MAX": limits.FINITE_Z_MAX,
-    "FINITE_SIGMA_Z": limits.FINITE_SIGMA_Z,
-    "FINITE_COLOR": limits.FINITE_COLOR,
+    "ALPHA_MIN_WIDE": limits.ALPHA_MIN, "QUATERNION_MIN_NORM": limits.QUATERNION_MIN_NORM,
+    "DIRECTION_MIN_NORM": limits.DIRECTION_MIN_NORM, "FINITE_OFFSET_PX": limits.FINITE_OFFSET_PX,
+    "FINITE_NUM": limits.FINITE_NUM, "FINITE_DEN": limits.FINITE_DEN,
+    "FINITE_SPREAD": limits.FINITE_SPREAD, "FINITE_PULL": limits.FINITE_PULL,
+    "FINITE_Z_MIN": limits.FINITE_Z_MIN, "FINITE_Z_MAX": limits.FINITE_Z_MAX,
+    "FINITE_SIGMA_Z": limits.FINITE_SIGMA_Z, "FINITE_COLOR": limits.FINITE_COLOR,
     "FLOAT32_MAX": FLOAT32_MAX,
     # As in projection.py.
     "GRADIENT_MAX": 1e38,
@@ -146,34 +94,21 @@ _DOUBLE = {
     "SHARE_MARGIN": 1e-6,
     "STRIP_MARGIN": 0.02,
     # As in query_kernels.py.
-    "BOX_END": BOX_END,
-    "PATCH_STEP_PX": limits.PATCH_STEP_PX,
-    "MAX_NOISE_PX": limits.MAX_NOISE_PX,
-    "MIN_NOISE_PX": limits.MIN_NOISE_PX,
-    "SPREAD_PRODUCT": limits.SPREAD_PRODUCT,
-    "MAX_PATCH_ERROR": limits.MAX_PATCH_ERROR,
-    "MIN_PLANE_NORMAL": limits.MIN_PLANE_NORMAL,
+    "BOX_END": BOX_END, "PATCH_STEP_PX": limits.PATCH_STEP_PX, "MAX_NOISE_PX": limits.MAX_NOISE_PX,
+    "MIN_NOISE_PX": limits.MIN_NOISE_PX, "SPREAD_PRODUCT": limits.SPREAD_PRODUCT,
+    "MAX_PATCH_ERROR": limits.MAX_PATCH_ERROR, "MIN_PLANE_NORMAL": limits.MIN_PLANE_NORMAL,
     "MIN_PLANE_FACING": limits.MIN_PLANE_FACING,
-    "SH_C0": 0.5 / math.sqrt(math.pi),
-    "SH_C1": math.sqrt(3.0 / (4.0 * math.pi)),
-    "SH_C2A": math.sqrt(15.0 / (4.0 * math.pi)),
-    "SH_C2B": math.sqrt(5.0 / (16.0 * math.pi)),
-    "SH_C2C": math.sqrt(15.0 / (16.0 * math.pi)),
-    "SH_C3A": math.sqrt(35.0 / (32.0 * math.pi)),
-    "SH_C3B": math.sqrt(105.0 / (4.0 * math.pi)),
-    "SH_C3C": math.sqrt(21.0 / (32.0 * math.pi)),
-    "SH_C3D": math.sqrt(7.0 / (16.0 * math.pi)),
-    "SH_C3E": math.sqrt(105.0 / (16.0 * math.pi)),
-}
+    "SH_C0": 0.5 / math.sqrt(math.pi), "SH_C1": math.sqrt(3.0 / (4.0 * math.pi)),
+    "SH_C2A": math.sqrt(15.0 / (4.0 * math.pi)), "SH_C2B": math.sqrt(5.0 / (16.0 * math.pi)),
+    "SH_C2C": math.sqrt(15.0 / (16.0 * math.pi)), "SH_C3A": math.sqrt(35.0 / (32.0 * math.pi)),
+    "SH_C3B": math.sqrt(105.0 / (4.0 * math.pi)), "SH_C3C": math.sqrt(21.0 / (32.0 * math.pi)),
+    "SH_C3D": math.sqrt(7.0 / (16.0 * math.pi)), "SH_C3E": math.sqrt(105.0 / (16.0 * math.pi)),
+}  # fmt: skip
 _INTEGER = {
-    "TILE": limits.TILE_PX,
-    "SOLVER_NEWTON_STEPS": 8,
-    "SOLVER_MAX_STEPS": 80,
-    "HALF_PATCH": limits.HALF_PATCH,
-    "PATCH_SKIPPED": limits.PATCH_SKIPPED,
-    "PATCH_KEPT": limits.PATCH_KEPT,
-    "PATCH_BROKEN": limits.PATCH_BROKEN,
-}
+    "TILE": limits.TILE_PX, "SOLVER_NEWTON_STEPS": 8, "SOLVER_MAX_STEPS": 80,
+    "HALF_PATCH": limits.HALF_PATCH, "PATCH_SKIPPED": limits.PATCH_SKIPPED,
+    "PATCH_KEPT": limits.PATCH_KEPT, "PATCH_BROKEN": limits.PATCH_BROKEN,
+}  # fmt: skip
 
 
 @functools.cache
@@ -253,22 +188,13 @@ _NO_NVRTC_HINT = "Install the package nvidia-cuda-nvrtc of torch's CUDA version.
 def device_kernels(device_index: int) -> DeviceKernels:
     """Return the kernels of a GPU, compiled on the first call of the process.
 
-    Raises
-    ------
-    DeviceError
-        If the compiler or the driver is missing or fails.
+    Raises DeviceError if the compiler or the driver is missing or fails.
     """
     return DeviceKernels(device_index)
 
 
 def cuda_available(device_index: int | None = None) -> tuple[bool, str]:
-    """Return whether the renderer can run on a GPU of this machine, and the reason.
-
-    Parameters
-    ----------
-    device_index : int, optional
-        Device index of torch; by default its current device.
-    """
+    """Return whether the renderer can run on a GPU, by default torch's current one, and why."""
     if torch.version.cuda is None:
         return False, "This PyTorch was built without CUDA."
     if not torch.cuda.is_available():
