@@ -21,7 +21,6 @@ ALLOWED = {
     "gaussian_wrapping_addon": {"register", "unregister"},  # called by Blender
     "gaussian_wrapping_addon.batch": {"console_entry"},  # named in pyproject.toml
     # Definitions that tests compare with.
-    "gaussian_wrapping_addon.core.render.reference": {"reference_depth_at"},
     "gaussian_wrapping_addon.core.units.georeference": {"geographic_from_enu"},
 }
 """Names that nothing in the repository uses but its tests, and why they stay."""

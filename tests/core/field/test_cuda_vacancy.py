@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.vacancy_scale import brute_force_vacancy
 from gaussian_wrapping_addon.core.errors import Cancelled, DeviceError, ResourceError
 from gaussian_wrapping_addon.core.field import cuda_vacancy, vacancy_kernels
 from gaussian_wrapping_addon.core.field.cuda_vacancy import CudaVacancyField
-from gaussian_wrapping_addon.core.field.vacancy import SETTLED, VacancyField, brute_force_vacancy
+from gaussian_wrapping_addon.core.field.vacancy import SETTLED, VacancyField
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.cuda.kernels import cuda_available, cuda_source
 from gaussian_wrapping_addon.core.scene.camera import Similarity

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
+from benchmarks.vacancy_scale import brute_force_vacancy
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.field.isosurface_projection import (
     MAX_TRAVEL_SIGMAS,
@@ -19,7 +20,6 @@ from gaussian_wrapping_addon.core.field.isosurface_projection import (
 from gaussian_wrapping_addon.core.field.vacancy import (
     VacancyField,
     VacancyResult,
-    brute_force_vacancy,
 )
 from gaussian_wrapping_addon.core.field.vector_field import VectorField, VectorFieldResult
 from gaussian_wrapping_addon.core.progress import Progress

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.vacancy_scale import log_gaussian, log_one_minus
 from gaussian_wrapping_addon.core import limits
-from gaussian_wrapping_addon.core.field.vacancy_kernels import log_gaussian, log_one_minus
 from gaussian_wrapping_addon.core.field.vector_field import TAIL, VectorField
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
 from tests.core.field.field_scenes import (

@@ -8,7 +8,8 @@ import functools
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.field.vacancy import VacancyField, brute_force_vacancy
+from benchmarks.vacancy_scale import brute_force_vacancy
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region

@@ -8,6 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.render import reference
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.render.scenes import look_at, random_gaussians
 
@@ -34,6 +36,20 @@ def random_positions(camera: Camera, count: int, seed: int = 0) -> np.ndarray:
     random = np.random.default_rng(seed)
     size = np.array([camera.width, camera.height])
     return (random.uniform(-0.03, 1.03, (count, 2)) * size).astype(np.float32)
+
+
+def reference_depth_at(
+    gaussians: OrientedGaussians, camera: Camera, positions: torch.Tensor, options: RenderOptions
+) -> torch.Tensor:
+    """Return the depth of ``render_reference`` at (m, 2) positions; 0 where there is none."""
+    screen = reference.reference_projection(gaussians, camera, options)
+    chosen = torch.nonzero(screen.usable)[:, 0]
+    order = chosen[torch.argsort(screen.depths[chosen].float(), stable=True)]
+    size = positions.new_tensor([camera.width, camera.height])
+    seen = torch.nonzero(((positions >= 0.0) & (positions <= size)).all(1))[:, 0]
+    rays = reference._evaluate_rays(screen.params[order], *positions[seen].unbind(1))
+    depth = reference._depth(rays, options)
+    return positions.new_zeros(len(positions)).index_put((seen,), depth)
 
 
 class Oracle:

@@ -9,6 +9,9 @@ import numpy as np
 import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.parallel import ArrayStore
+from gaussian_wrapping_addon.core.render.projection import ScreenGaussians
+from gaussian_wrapping_addon.core.render.tiles import TileBinning, TileLists
 from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.poses import look_at_pose
 
@@ -33,6 +36,12 @@ def look_at(
         0.5 * height - 0.4,
         look_at_pose(eye, target),
     )
+
+
+def bin_gaussians(screen: ScreenGaussians, width: int, height: int, threads: int = 1) -> TileLists:
+    """Return the lists of all tiles of an image."""
+    binning = TileBinning(screen, width, height, threads, ArrayStore())
+    return binning.lists(0, len(binning.tile_counts))
 
 
 def front_camera(

@@ -17,7 +17,7 @@ from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.area_lists import sort_positions
 from gaussian_wrapping_addon.core.render.depth_query import query_view, solve_depths
 from gaussian_wrapping_addon.core.render.projection import RawArrays
-from gaussian_wrapping_addon.core.render.reference import reference_depth_at, reference_projection
+from gaussian_wrapping_addon.core.render.reference import reference_projection
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
@@ -38,6 +38,8 @@ from tests.core.render.query_scenes import (
 )
 from tests.core.render.scenes import front_camera, isotropic, look_at, one_gaussian
 from tests.core.render.test_properties import cameras, steady, wild_gaussians
+
+from .query_scenes import reference_depth_at
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -19,7 +19,6 @@ from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     RawGradients,
     ScreenGaussians,
-    allocate_visible,
     project_arrays,
     project_backward,
     project_backward_visible,
@@ -181,11 +180,11 @@ def test_reused_output_allocates_no_arrays() -> None:
     screen = project_gaussians(raw, CAMERA, OPTIONS)
     ids = np.flatnonzero(screen.visible).astype(np.int32)
     grad_params = np.ones((20_000, 24), np.float32)
-    scratch = allocate_visible(raw, 20_000)
-    project_backward_visible(raw, CAMERA, OPTIONS, screen, grad_params, ids, scratch)
+    store = ArrayStore()
+    project_backward_visible(raw, CAMERA, OPTIONS, screen, grad_params, ids, store.take)
     tracemalloc.start()
     project_gaussians(raw, CAMERA, OPTIONS, screen)
-    project_backward_visible(raw, CAMERA, OPTIONS, screen, grad_params, ids, scratch)
+    project_backward_visible(raw, CAMERA, OPTIONS, screen, grad_params, ids, store.take)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20_000  # bytes: less than one for each Gaussian
@@ -317,32 +316,24 @@ def test_compact_rows_are_the_dense_ones() -> None:
     project_backward(raw, CAMERA, options, screen, grad_params, dense)
     seen = np.flatnonzero(screen.visible).astype(np.int32)
     assert 50 < len(seen) < 290
-    scratch = allocate_visible(raw, 300)
+    store = ArrayStore()
     for ids in (seen, seen[3:50], seen[:1], seen[:0], np.arange(300, dtype=np.int32)):
         for name in TRAINED:
-            getattr(scratch, name)[:] = np.nan
+            store.take(f"grad {name}", getattr(raw, name).shape, np.float32)[:] = np.nan
         for threads in (1, 3):
             chosen = dataclasses.replace(options, threads=threads)
-            part = project_backward_visible(raw, CAMERA, chosen, screen, grad_params, ids, scratch)
+            part = project_backward_visible(
+                raw, CAMERA, chosen, screen, grad_params, ids, store.take
+            )
             assert part.ids is ids
             for name in TRAINED:
                 got = getattr(part, name)
                 np.testing.assert_array_equal(got, getattr(dense, name)[ids], err_msg=name)
-                assert np.isnan(getattr(scratch, name)[len(ids) :]).all()
-                assert np.shares_memory(got, getattr(scratch, name)) or not len(ids)
+                reused = store.take(f"grad {name}", getattr(raw, name).shape, np.float32)
+                assert np.isnan(reused[len(ids) :]).all()
+                assert np.shares_memory(got, reused) or not len(ids)
             # Coefficients above the degree used.
             assert not part.sh[:, 4:].any()
-
-
-def test_scratch_of_another_shape_is_refused() -> None:
-    raw = RawArrays.from_gaussians(random_gaussians(9, 4, dtype=torch.float32))
-    screen = project_gaussians(raw, CAMERA, OPTIONS)
-    ids, grad = np.arange(9, dtype=np.int32), np.zeros((9, 24), np.float32)
-    small = allocate_visible(raw, 8)
-    other = allocate_visible(dataclasses.replace(raw, sh=raw.sh[:, :4]), 9)
-    for scratch in (small, other):
-        with pytest.raises(UsageError, match="scratch"):
-            project_backward_visible(raw, CAMERA, OPTIONS, screen, grad, ids, scratch)
 
 
 EDGE_ON = {"log_scales": [0.0, 0.0, np.log(1e-6)], "quats": [1.0, 1.0, 0.0, 0.0]}
