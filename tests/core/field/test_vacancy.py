@@ -12,17 +12,19 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.vacancy_scale import (
+    brute_force_vacancy,
+    log_gaussian,
+    log_one_minus,
+    log_transmittance,
+)
 from gaussian_wrapping_addon.core.errors import Cancelled, UsageError
 from gaussian_wrapping_addon.core.field.vacancy import (
     SETTLED,
     PackedMask,
     VacancyField,
-    brute_force_vacancy,
-    log_transmittance,
 )
 from gaussian_wrapping_addon.core.field.vacancy_kernels import (
-    log_gaussian,
-    log_one_minus,
     transmittance_of_cells,
 )
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays, OrientedGaussians
