@@ -111,7 +111,7 @@ def _plain(number: float) -> str:
 
 PRESETS = ("draft", "standard", "fine", "paper", "large")
 SELECTION_MODES = ("auto", "on", "off")
-"""Of an optional part of the model; ``"auto"`` selects it by evidence in the photos."""
+"""Of what is chosen by evidence in the photos where it is ``"auto"``."""
 SWITCH = ("off", "on")
 
 DEVICE = r"auto|cpu|cuda(:[0-9]{1,3})?"
@@ -128,9 +128,6 @@ MASKS_MADE = ("off", "region")
 MODEL_RANGES = ("imagenet", "half", "unit")
 """Colours of a segmentation model: mean and deviation of ImageNet, -0.5 to 0.5, 0 to 1."""
 MAX_MASK_GROW_PX = 200
-GEOREFERENCES = ("auto", "on", "off")
-TURNTABLE_MODES = ("auto", "on", "off")
-PANORAMA_MODES = ("auto", "on", "off")
 CORRELATIONS = ("signed", "squared")
 SPACINGS = ("adaptive", "uniform")
 MESH_METHODS = ("pam", "pivots")
@@ -172,23 +169,20 @@ Owner = Literal["scene", "training", "preferences"]
 """Owner of a property in Blender: ``Scene.gwrap``, ``Scene.gwrap.training``, or the add-on."""
 
 PanelName = Literal[
-    "dataset",
-    "train",
-    "train_advanced",
-    "mesh",
-    "mesh_advanced",
-    "texture",
-    "computers",
+    "dataset", "train", "train_advanced", "mesh", "mesh_advanced", "texture", "computers",
     "preferences",
-]
+]  # fmt: skip
 """A panel in Blender."""
 
 JOB = "job"
 """Group of the settings that are direct fields of the job's settings."""
 
-_SCOPES: Mapping[str, Scope] = {"training": "training", "meshing": "region", "texture": "region"}
+_SCOPES: Mapping[str, Scope] = {
+    JOB: "training", "training": "training", "meshing": "region", "texture": "region",
+}  # fmt: skip
 _PANEL_NAMES: Mapping[str, PanelName] = {
-    "training": "train_advanced", "meshing": "mesh_advanced", "texture": "texture",
+    JOB: "train_advanced", "training": "train_advanced", "meshing": "mesh_advanced",
+    "texture": "texture",
 }  # fmt: skip
 
 
@@ -196,8 +190,8 @@ _PANEL_NAMES: Mapping[str, PanelName] = {
 class Option:
     """How a setting is given on the command line."""
 
-    name: str
-    """With its leading dashes."""
+    name: str = ""
+    """With its leading dashes; empty: the setting's."""
     metavar: str = ""
     help: str = ""
     """Replaces the setting's help."""
@@ -227,6 +221,11 @@ class Item:
     value: Any
     label: str
     description: str
+
+
+def auto_on_off(auto: str, on: str, off: str) -> tuple[Item, ...]:
+    """Return the entries of a setting that is ``"auto"``, ``"on"`` or ``"off"``, by tooltips."""
+    return Item("auto", "Auto", auto), Item("on", "On", on), Item("off", "Off", off)
 
 
 @dataclass(frozen=True)
@@ -333,7 +332,7 @@ class Declaration:
     def property_owner(self) -> Owner:
         """The owner of its property in Blender."""
         assert self.panel is not None
-        return self.panel.owner or ("training" if self.group == "training" else "scene")
+        return self.panel.owner or ("training" if self.group in (JOB, "training") else "scene")
 
     @property
     def panel_name(self) -> PanelName:
@@ -364,33 +363,9 @@ class Declaration:
         return {self.to_panel(item.value): item.value for item in self.panel.items}[stored]
 
 
-def setting(
-    default: Any,
-    *,
-    help: str,
-    check: Check | None = None,
-    unit: str = "",
-    presets: Mapping[str, Any] | None = None,
-    option: Option | None = None,
-    panel: PanelProperty | None = None,
-    model_selection: bool = False,
-    affects_result: bool = True,
-    since: str = "",
-) -> Any:
+def setting(default: Any, **declared: Any) -> Any:
     """Declare a setting as a field of a settings class; see :class:`Declaration`."""
-    declared = Declaration(
-        default,
-        help,
-        check,
-        unit,
-        presets or {},
-        option,
-        panel,
-        model_selection,
-        affects_result,
-        since,
-    )
-    return field(default=default, metadata={_KEY: declared})
+    return field(default=default, metadata={_KEY: Declaration(default, **declared)})
 
 
 @functools.cache
@@ -413,7 +388,10 @@ def _walk(kind: type, prefix: str) -> Iterable[Declaration]:
         if dataclasses.is_dataclass(hint):
             yield from _walk(typing.cast(type, hint), f"{path}.")
         elif isinstance(declared, Declaration):
-            yield dataclasses.replace(declared, path=path, kind=hint)
+            option = declared.option
+            if option is not None and not option.name:
+                option = dataclasses.replace(option, name=f"--{entry.name.replace('_', '-')}")
+            yield dataclasses.replace(declared, path=path, kind=hint, option=option)
         else:
             raise TypeError(f"{kind.__name__}.{entry.name} is not declared by setting()")
 
