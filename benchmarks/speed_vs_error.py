@@ -298,7 +298,7 @@ def write_comparison(scene: Path, runs: Sequence[tuple[str, Path]], path: Path) 
         distance = distances_to_mesh(centres, truth.vertices, truth.faces)[0] / diagonal
         colors = np.array(ERROR_COLORS, float)[np.searchsorted(THRESHOLD_SHARES, distance)]
         if truth.crop is not None:
-            colors[~truth.crop.inside(centres)] = NOT_JUDGED
+            colors[~truth.crop.contains(centres)] = NOT_JUDGED
         bottom.append((f"{label}: error", shade(mesh.vertices, mesh.faces, colors, camera, size)))
     rows = [
         np.concatenate([_labelled(image, text) for text, image in row], 1) for row in (top, bottom)

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import DatasetError
 from ..scene.camera import Camera, Similarity
 from ..scene.placement import fit_similarity, require_plane, umeyama
-from .surface_scores import voxel_downsample_points
+from .surface_scores import voxel_downsample
 
 # -- Errors of solved camera poses after a similarity alignment of the camera centres -------------
 
@@ -292,9 +292,9 @@ def refine_as_tanks(
         if voxels:
             # Voxels are in the target's frame, so that both sets are equally dense.
             moving = transform.inverse().points(
-                voxel_downsample_points(transform.points(moving), voxels * threshold)
+                voxel_downsample(transform.points(moving), voxels * threshold)
             )
-            aim = voxel_downsample_points(aim, voxels * threshold)
+            aim = voxel_downsample(aim, voxels * threshold)
         else:
             moving, aim = _every_kth(moving), _every_kth(aim)
         stages.append(

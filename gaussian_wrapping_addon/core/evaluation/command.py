@@ -313,7 +313,7 @@ def _icp(
     for reach in ICP_REACH:
         moving = points
         if truth.crop is not None:
-            moving = points[truth.crop.inside(start.points(points))]
+            moving = points[truth.crop.contains(start.points(points))]
         stages.append(
             icp(
                 moving,

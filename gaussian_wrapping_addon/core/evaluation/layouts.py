@@ -27,7 +27,7 @@ from .surface_scores import (
     sample_uniformly,
     scan_virtually,
     score_clouds,
-    voxel_downsample_points,
+    voxel_downsample,
 )
 
 # -- Read meshes and point clouds for evaluation from common file formats -------------------------
@@ -599,10 +599,10 @@ def _scan(
         progress.check()
         seen = start.points(scan_virtually(vertices, faces, [camera], threads=threads).points)
         near = ((seen >= low - margin) & (seen <= high + margin)).all(1)
-        kept.append(voxel_downsample_points(seen[near], voxel))
+        kept.append(voxel_downsample(seen[near], voxel))
         count += len(kept[-1])
         if count > SCAN_KEPT_POINTS:
-            kept = [voxel_downsample_points(np.concatenate(kept), voxel)]
+            kept = [voxel_downsample(np.concatenate(kept), voxel)]
             # The rest cannot get sparser: downsample again only after as many new points.
             count = 0
-    return back.points(voxel_downsample_points(np.concatenate(kept), voxel))
+    return back.points(voxel_downsample(np.concatenate(kept), voxel))
