@@ -54,12 +54,7 @@ class PoseErrors:
 def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> PoseErrors:
     """Align cameras of equal names by their centres (with scale) and return the residual errors.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Solved cameras, in any frame.
-    true_cameras : sequence of Camera
-        Their true poses. Cameras are matched by ``name``.
+    The solved cameras may be in any frame.
 
     Raises
     ------
@@ -145,15 +140,8 @@ class TanksRefinement:
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return fitness, rmse and iterations of every stage as plain JSON values."""
-        return [
-            {
-                "fitness": s.fitness,
-                "rmse": s.rmse,
-                "iterations": s.iterations,
-                "converged": s.converged,
-            }
-            for s in self.stages
-        ]
+        names = ("fitness", "rmse", "iterations", "converged")
+        return [{name: getattr(stage, name) for name in names} for stage in self.stages]
 
 
 def icp(
@@ -174,8 +162,7 @@ def icp(
 
     Parameters
     ----------
-    source : (n, 3) float64
-    target : (m, 3) float64
+    source, target : (n, 3), (m, 3) float64
     start : Similarity
         Initial ``target_from_source``.
     max_distance : float
@@ -183,7 +170,7 @@ def icp(
     with_scale : bool
         Whether the scale is optimised; otherwise that of ``start`` is kept.
     threads : int
-        Threads of the search; the result does not depend on it.
+        Of the search; the result does not depend on it.
 
     Raises
     ------
@@ -207,7 +194,7 @@ def icp(
     # "placed" are the source points under ``start``; only the increment is iterated.
     placed = start.points(source) - center
     added = Similarity()
-    partners, fitness, rmse, round_, converged = np.zeros(0, np.int64), 0.0, 0.0, 0, False
+    partners, fitness, rmse, round_ = np.zeros(0, np.int64), 0.0, 0.0, 0
     while True:
         distances, nearest = tree.query(
             added.points(placed), distance_upper_bound=max_distance, workers=max(threads, 1)
@@ -222,16 +209,12 @@ def icp(
         before = (fitness, rmse)
         fitness = float(near.mean())
         rmse = float(np.sqrt((distances[near] ** 2).mean()))
-        if round_ and (
-            np.array_equal(nearest, partners)
-            or (
-                abs(fitness - before[0]) <= tolerance * fitness
-                and abs(rmse - before[1]) <= tolerance * rmse
-            )
-        ):
-            converged = True
-            break
-        if round_ == iterations:
+        steady = (
+            abs(fitness - before[0]) <= tolerance * fitness
+            and abs(rmse - before[1]) <= tolerance * rmse
+        )
+        converged = round_ > 0 and (steady or np.array_equal(nearest, partners))
+        if converged or round_ == iterations:
             break
         partners = nearest
         pairs = placed[near], aim[nearest[near]]
@@ -252,8 +235,7 @@ def refine_as_tanks(
     start: Similarity,
     threshold: float,
     *,
-    inside: Callable[[np.ndarray], np.ndarray] | None = None,
-    iterations: int = ICP_ITERATIONS,
+    inside: Callable[[np.ndarray], np.ndarray],
     threads: int = 1,
 ) -> TanksRefinement:
     """Refine an alignment as Tanks and Temples does: ICP with scale in three stages.
@@ -269,7 +251,7 @@ def refine_as_tanks(
     source, target : (n, 3), (m, 3) float64
     threshold : float
         The scene's tau, units of the target.
-    inside : callable or None
+    inside : callable
         The crop: maps (n, 3) points in the target's frame to (n,) bool.
 
     Raises
@@ -278,38 +260,28 @@ def refine_as_tanks(
         See :func:`icp`; also if the crop is empty.
     """
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
-    if inside is not None:
-        target = target[inside(target)]
+    target = target[inside(target)]
     transform, stages = start, []
     for voxels, reach in TANKS_STAGES:
-        moving = source if inside is None else source[inside(transform.points(source))]
+        moving = source[inside(transform.points(source))]
         if min(len(moving), len(target)) < 3:
             raise DatasetError(
                 f"The crop leaves {len(moving)} points of the mesh and {len(target)} of the truth.",
                 "The initial alignment is wrong, or the crop belongs to another scene.",
             )
-        aim = target
         if voxels:
             # Voxels are in the target's frame, so that both sets are equally dense.
-            moving = transform.inverse().points(
-                voxel_downsample(transform.points(moving), voxels * threshold)
-            )
-            aim = voxel_downsample(aim, voxels * threshold)
+            moved = voxel_downsample(transform.points(moving), voxels * threshold)
+            moving = transform.inverse().points(moved)
+            aim = voxel_downsample(target, voxels * threshold)
         else:
-            moving, aim = _every_kth(moving), _every_kth(aim)
-        stages.append(
-            icp(
-                moving,
-                aim,
-                transform,
-                max_distance=reach * threshold,
-                iterations=iterations,
-                with_scale=True,
-                tolerance=TANKS_TOLERANCE,
-                threads=threads,
-            )
-        )
-        transform = stages[-1].transform
+            moving, aim = _every_kth(moving), _every_kth(target)
+        found = icp(
+            moving, aim, transform, max_distance=reach * threshold, with_scale=True,
+            tolerance=TANKS_TOLERANCE, threads=threads,
+        )  # fmt: skip
+        stages.append(found)
+        transform = found.transform
     return TanksRefinement(transform, tuple(stages))
 
 

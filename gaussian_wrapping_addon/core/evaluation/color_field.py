@@ -38,10 +38,7 @@ class Contraction:
     def of_cameras(cls, cameras: Sequence[Camera], distance: float) -> Contraction:
         """Return the contraction around the mean camera centre, out to the farthest one.
 
-        Parameters
-        ----------
-        distance : float
-            Typical distance of the surface from the cameras, world units, > 0.
+        ``distance`` is a typical one of the surface from the cameras, world units, > 0.
         """
         centers = np.array([camera.center for camera in cameras])
         center = centers.mean(axis=0)
@@ -90,15 +87,7 @@ class Level:
 
     @classmethod
     def of_cells(cls, keys: np.ndarray, indices: np.ndarray) -> Level:
-        """Return the level of the given cells.
-
-        Parameters
-        ----------
-        keys : (c,) int64
-            Increasing.
-        indices : (c, 3) int64
-            Of the cells along each axis.
-        """
+        """Return the level of cells of increasing keys (c,), from their indices (c, 3) int64."""
         corner_keys = pack(indices[:, None, :] + CORNERS)  # (c, 8)
         vertices, inverse = np.unique(corner_keys, return_inverse=True)
         corners = inverse.reshape(corner_keys.shape).astype(np.int32)
@@ -125,12 +114,8 @@ def pack(indices: np.ndarray) -> np.ndarray:
 def locate(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the fine cells of contracted points and the positions in them.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        In [-2, 2].
-    cell : float
-        Side of a fine cell, at least :data:`MIN_CELL`.
+    Points are (n, 3) float64 in [-2, 2]; ``cell`` is the side of a fine cell, at least
+    :data:`MIN_CELL`.
 
     Returns
     -------
@@ -462,12 +447,7 @@ def fit_color_field(
 ) -> ColorField:
     """Return the field of least squared error at the samples, by conjugate gradients.
 
-    Parameters
-    ----------
-    samples : Samples
-        At least one.
-    threads : int
-        The result does not depend on it.
+    There must be a sample; the result does not depend on ``threads``.
     """
     scales = contraction.scales(samples.points)
     cell = settings.cell_px * float(np.median(samples.footprints * scales))
@@ -494,13 +474,9 @@ class _System:
 
     @classmethod
     def of(
-        cls,
-        samples: Samples,
-        contraction: Contraction,
-        cell: float,
-        settings: ColorFieldSettings,
+        cls, samples: Samples, contraction: Contraction, cell: float, settings: ColorFieldSettings,
         threads: int,
-    ) -> _System:
+    ) -> _System:  # fmt: skip
         keys, indices, places = locate(contraction.points(samples.points), cell)
         order = np.argsort(keys, kind="stable")
         keys = keys[order]

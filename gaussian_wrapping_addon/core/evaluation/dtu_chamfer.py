@@ -70,10 +70,8 @@ class ObservationMask:
     def observed(self, points: np.ndarray) -> np.ndarray:
         """Return whether (n, 3) points lie in an observed voxel, (n,) bool."""
         # Clipped before the cast: far points would overflow an integer.
-        along_row = np.clip(
-            np.floor((points - self.low) / self.resolution + 0.5), -1.0, self.volume.shape
-        )
-        index = along_row.astype(np.int64)  # (n, 3)
+        place = np.floor((points - self.low) / self.resolution + 0.5)
+        index = np.clip(place, -1.0, self.volume.shape).astype(np.int64)  # (n, 3)
         inside = ((index >= 0) & (index < self.volume.shape)).all(1)
         result = np.zeros(len(points), np.bool_)
         i, j, k = index[inside].T
@@ -128,18 +126,16 @@ def dtu_chamfer(
 
     Parameters
     ----------
-    points : (n, 3) float64
-        Predicted, in the truth's frame; for a mesh, see :func:`resample_mesh`. May be empty.
-    truth_points : (m, 3) float64
-    mask : ObservationMask
+    points, truth_points : (n, 3), (m, 3) float64
+        In the truth's frame; for a mesh, see :func:`resample_mesh`. The former may be empty.
     plane : (4,) float64
         A true point x is above the ground where ``plane . [x, 1] > 0``.
     density, patch, max_distance : float
         In the truth's unit (mm); ``density`` 0 keeps all points.
     seed : int
-        Seed of the order in step 2.
+        Of the order in step 2.
     threads : int
-        Threads of the search; the result does not depend on it.
+        Of the search; the result does not depend on it.
 
     Raises
     ------
@@ -173,10 +169,8 @@ def dtu_chamfer(
 def thin_by_distance(points: np.ndarray, density: float, *, seed: int) -> np.ndarray:
     """Keep points, in random order, that are at least ``density`` from all points kept before.
 
-    Returns
-    -------
-    (k, 3) float64
-        In the original order; every removed point is nearer than ``density`` to one of them.
+    Returns (k, 3) float64 points in the original order; every removed point is nearer than
+    ``density`` to one of them.
 
     Raises
     ------
@@ -203,17 +197,8 @@ def resample_mesh(vertices: np.ndarray, faces: np.ndarray, density: float) -> np
     row and :data:`ROW_SHARE` of it between rows. Edges are covered by both of their faces;
     :func:`dtu_chamfer` removes the duplicates.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int
-    density : float
-        > 0, in the mesh's unit.
-
-    Returns
-    -------
-    (n, 3) float64
-        Empty for a mesh without faces.
+    Of vertices (v, 3) float64 and faces (f, 3) int, with a density > 0 in the mesh's unit. Returns
+    (n, 3) float64 points, none for a mesh without faces.
 
     Raises
     ------

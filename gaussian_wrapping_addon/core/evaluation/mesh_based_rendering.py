@@ -64,22 +64,16 @@ def bake_held_out_texture(
 ) -> TexturedMesh:
     """Bake the colours again on the same UVs from all photos except the named ones.
 
+    At least one photo must remain. The result has no normal map and no occlusion, which unlit
+    pictures do not show.
+
     Parameters
     ----------
-    textured : TexturedMesh
-        Scene frame.
-    names : collection of str
-        Photos to leave out; at least one must remain.
     reduction : int
         Factor by which the compared pictures are coarser than the photos: the texture is reduced
         by the largest power of two up to it.
     work_folder : Path
         For temporary files, all removed before returning.
-
-    Returns
-    -------
-    TexturedMesh
-        Without normal map and occlusion, which unlit pictures do not show.
     """
     kept = [i for i, view in enumerate(scene.views) if view.camera.name not in names]
     full_px = len(textured.albedo)
@@ -92,10 +86,7 @@ def bake_held_out_texture(
     charts = uv_charts(graph, mesh.faces, uvs)
     unwrapped = Unwrap(uvs, charts, "kept", gutter_px, face_atlas=textured.face_atlas)
     settings = TextureSettings(
-        size_px=size_px,
-        gutter_px=max(1, math.floor(gutter_px)),
-        normal_map="off",
-        ambient_occlusion="off",
+        size_px, max(1, math.floor(gutter_px)), normal_map="off", ambient_occlusion="off"
     )
     part = dataclasses.replace(scene, views=tuple(scene.views[i] for i in kept))
     return texture_mesh(
@@ -168,15 +159,10 @@ class MeshBasedView:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; unmeasured ones are absent."""
-        values = {
-            "name": self.name,
-            **self.scores.to_json(),
-            "covered_psnr": self.covered_psnr,
-            "inside_psnr": self.inside_psnr,
-            "uncovered": self.uncovered,
-            "beyond": self.beyond,
-        }
-        return {key: value for key, value in values.items() if value is not None}
+        names = ("covered_psnr", "inside_psnr", "uncovered", "beyond")
+        own = {name: getattr(self, name) for name in names}
+        measured = {name: value for name, value in own.items() if value is not None}
+        return {"name": self.name, **self.scores.to_json(), **measured}
 
 
 @dataclass(frozen=True)
@@ -241,10 +227,8 @@ def mesh_based_rendering(
     Parameters
     ----------
     vertices, faces : (v, 3) float64, (f, 3)
-    training : sequence of PhotoView
-        The only photos that the field is fitted to.
-    test : sequence of PhotoView
-        The only photos that are compared.
+    training, test : sequence of PhotoView
+        The only photos that the field is fitted to, and the only ones that are compared.
     threads : int
         0 uses every core; the result does not depend on it, except for the last digits of LPIPS.
     on_view : callable, optional
@@ -278,13 +262,11 @@ def mesh_based_rendering(
         found = _compare(surface, color_field, view, settings, lpips, on_view)
         if found is not None:
             views.append(found)
-    vertices_of_field = (0, 0)
-    if color_field is not None:
-        near, far = color_field.levels
-        vertices_of_field = (len(near.vertices), len(far.vertices))
+    levels = () if color_field is None else color_field.levels
+    near, far = [len(level.vertices) for level in levels] or [0, 0]
     return MeshBasedRendering(
         tuple(views), len(test) - len(views), len(training), pixels,
-        0 if samples is None else len(samples.points), reached, vertices_of_field, settings,
+        0 if samples is None else len(samples.points), reached, (near, far), settings,
     )  # fmt: skip
 
 

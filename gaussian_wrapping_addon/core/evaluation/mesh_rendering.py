@@ -55,14 +55,10 @@ class TexturedView:
 
 
 class TexturedRenderer:
-    """Render one textured mesh from many cameras; faces are two-sided.
+    """Render one textured mesh of the scene frame from many cameras; faces are two-sided.
 
-    Parameters
-    ----------
-    textured : TexturedMesh
-        In the scene frame; surfaces nearer than ``depth_buffer.NEAR_DEPTH`` are clipped.
-    threads : int
-        0 uses every core; the result does not depend on it.
+    Surfaces nearer than ``depth_buffer.NEAR_DEPTH`` are clipped. 0 threads use every core; the
+    result does not depend on their number.
     """
 
     def __init__(self, textured: TexturedMesh, *, threads: int = 0) -> None:
@@ -74,14 +70,9 @@ class TexturedRenderer:
         self._atlas = textured.atlas_of_faces
 
     def render(self, camera: Camera, size: tuple[int, int] | None = None) -> TexturedView:
-        """Render from a camera of the scene frame.
+        """Render from a camera of the scene frame, whose view is resampled.
 
-        Parameters
-        ----------
-        camera : Camera
-            Of any size; its view is resampled.
-        size : (width, height), optional
-            Size of the picture in pixels; by default that of the camera.
+        ``size`` is the width and height of the picture in pixels, by default that of the camera.
         """
         width, height = size or (camera.width, camera.height)
         fine = camera.resized(width * SUPERSAMPLING, height * SUPERSAMPLING)
@@ -233,40 +224,15 @@ class MeshRenderingScore:
     lpips_note: str = ""
     """Why LPIPS is missing."""
 
-    @property
-    def psnr(self) -> float | None:
-        """Mean PSNR, dB; ``None`` without any view."""
-        return _mean([view.scores.psnr for view in self.views])
-
-    @property
-    def ssim(self) -> float | None:
-        """Mean SSIM; ``None`` without any view."""
-        return _mean([view.scores.ssim for view in self.views])
-
-    @property
-    def lpips(self) -> float | None:
-        """Mean LPIPS of the views with a value; ``None`` without any."""
-        return _mean([v.scores.lpips for v in self.views if v.scores.lpips is not None])
-
-    @property
-    def covered(self) -> float | None:
-        """Mean covered share; ``None`` without any view."""
-        return _mean([view.covered for view in self.views])
-
-    @property
-    def uncovered(self) -> float | None:
-        """Mean uncovered share; ``None`` without any view."""
-        return _mean([view.uncovered for view in self.views])
-
-    @property
-    def whole_psnr(self) -> float | None:
-        """Mean PSNR that counts uncovered pixels as black, dB; ``None`` without any view."""
-        return _mean([view.whole_psnr for view in self.views])
+    def mean(self, name: str) -> float | None:
+        """Return the mean over the views that have the figure: a key of their JSON values."""
+        found = [values[name] for view in self.views if name in (values := view.to_json())]
+        return sum(found) / len(found) if found else None
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; unmeasured values are absent, and no value is infinite."""
         names = ("psnr", "ssim", "lpips", "covered", "uncovered", "whole_psnr")
-        means = {name: getattr(self, name) for name in names}
+        means = {name: self.mean(name) for name in names}
         values: dict[str, Any] = {
             "views": [view.to_json() for view in self.views],
             **{name: value for name, value in means.items() if value is not None},
@@ -297,8 +263,6 @@ def render_views(
 
     Parameters
     ----------
-    textured : TexturedMesh
-        Scene frame.
     cameras : sequence of Camera
         In the mesh's frame (see ``Camera.moved``), each of the size of its photo.
     images : sequence of (h, w, 3) uint8, or floats whose white is 1
@@ -310,7 +274,6 @@ def render_views(
         front of the mesh in the photo are errors.
     counted : sequence of ((h, w) bool or None), optional
         Candidate pixels of each photo, such as the photo's own mask.
-    lpips : Lpips, optional
     threads : int
         0 uses every core; the result does not depend on it, except for the last digits of LPIPS.
     on_view : callable, optional
@@ -386,7 +349,3 @@ def _note(lpips: Lpips | None, views: list[MeshView]) -> str:
     if views and all(view.scores.lpips is None for view in views):
         return "The pictures are too small for LPIPS."
     return ""
-
-
-def _mean(values: list[float]) -> float | None:
-    return sum(values) / len(values) if values else None
