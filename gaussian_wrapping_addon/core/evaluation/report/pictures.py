@@ -94,12 +94,8 @@ def _tick(value: float, log: bool) -> str:
     return f"{value:.6g}"
 
 
-def _shown(panel: Panel) -> list[tuple[float, float]]:
-    """Return the points within the domain of the axes."""
-    return [p for series in panel.series for p in series.points if _fits(panel, p)]
-
-
 def _fits(panel: Panel, point: tuple[float, float]) -> bool:
+    """Tell whether a point is within the domain of the axes."""
     finite = math.isfinite(point[0]) and math.isfinite(point[1])
     return finite and (not panel.x_log or point[0] > 0) and (not panel.y_log or point[1] > 0)
 
@@ -114,7 +110,7 @@ def _dot(x: float, y: float, color: str) -> str:
 
 
 def _panel(panel: Panel, left: int, top: int) -> list[str]:
-    points = _shown(panel)
+    points = [p for series in panel.series for p in series.points if _fits(panel, p)]
     inner_w, inner_h = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
     x0, y0 = left + _LEFT, top + _TOP
     middle_x, middle_y = x0 + inner_w / 2, y0 + inner_h / 2
@@ -151,9 +147,7 @@ def _panel(panel: Panel, left: int, top: int) -> list[str]:
                 f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="1.5"/>'
             )
         if series.dots:
-            parts += [
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{color}"/>' for x, y in positions
-            ]
+            parts += [_dot(x, y, color) for x, y in positions]
         if series.labels:
             parts += [
                 _text(x + 5, y - 5, series.labels[i], "start", f' fill="{color}"')
@@ -174,13 +168,11 @@ def write_svg(panels: Sequence[Panel], path: Path, *, columns: int = 3) -> None:
     """
     rows = -(-len(panels) // columns)
     width, height = _WIDTH * min(columns, len(panels)), _HEIGHT * rows
-    lines = [
-        (
-            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
-            f'viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="11">'
-        ),
-        f'<rect width="{width}" height="{height}" fill="white"/>',
-    ]
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
+        f'viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="11">'
+    )
+    lines = [head, f'<rect width="{width}" height="{height}" fill="white"/>']
     for number, panel in enumerate(panels):
         row, column = divmod(number, columns)
         lines += _panel(panel, column * _WIDTH, row * _HEIGHT)
@@ -194,7 +186,7 @@ MAX_PICTURES = 4
 """Number of held-out photos shown: the worst, the best, and some between."""
 
 STRIP_PX = 1500
-"""Maximum width of a strip of three images."""
+"""Maximum width of a strip of three images; a wider one is scaled down."""
 
 ERROR_GAIN = 4.0
 """Factor applied to the errors: the scale ends at a quarter of full brightness."""
@@ -224,13 +216,8 @@ def error_map(
 ) -> np.ndarray:
     """Return the absolute error (mean of the channels, times :data:`ERROR_GAIN`) as heat colours.
 
-    Parameters
-    ----------
-    photo : (h, w, 3) uint8
-    rendering : (h, w, 3)
-        Floats, white is 1; clipped to [0, 1].
-    mask : (h, w) bool, optional
-        Pixels that count; others are black.
+    The photo is (h, w, 3) uint8, the rendering floats whose white is 1, clipped to [0, 1]; pixels
+    outside of the mask (h, w) bool are black.
     """
     error = np.abs(np.clip(rendering, 0.0, 1.0) - photo / 255.0).mean(-1)  # (h, w)
     if mask is not None:
@@ -238,17 +225,10 @@ def error_map(
     return heat_colors(ERROR_GAIN * error)
 
 
-def strip(images: Sequence[tuple[str, np.ndarray]], *, width_px: int = STRIP_PX) -> bytes:
-    """Return images of one size side by side, each under its caption, as JPEG.
-
-    Parameters
-    ----------
-    images : sequence of (caption, (h, w, 3) uint8)
-    width_px : int
-        Maximum width; a wider strip is scaled down.
-    """
+def strip(images: Sequence[tuple[str, np.ndarray]]) -> bytes:
+    """Return (h, w, 3) uint8 images of one size side by side, each under its caption, as JPEG."""
     height, width = images[0][1].shape[:2]
-    room = (width_px - GAP_PX * (len(images) - 1)) // len(images)
+    room = (STRIP_PX - GAP_PX * (len(images) - 1)) // len(images)
     scale = min(1.0, room / width)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     total = size[0] * len(images) + GAP_PX * (len(images) - 1)
@@ -266,10 +246,10 @@ def strip(images: Sequence[tuple[str, np.ndarray]], *, width_px: int = STRIP_PX)
     return stream.getvalue()
 
 
-def worst_to_best(figures: Sequence[float], count: int = MAX_PICTURES) -> list[int]:
+def worst_to_best(figures: Sequence[float]) -> list[int]:
     """Return indices of figures to show: the lowest, the highest, evenly spaced ones between."""
     ranked = sorted(range(len(figures)), key=lambda i: (figures[i], i))
-    return evenly_spaced(ranked, count)
+    return evenly_spaced(ranked, MAX_PICTURES)
 
 
 def write_held_out(
@@ -285,15 +265,12 @@ def write_held_out(
 
     Parameters
     ----------
-    gaussians : OrientedGaussians
-        Trained.
     photos : PhotoStore
-        The photos used for training; their finest size is shown.
+        Their finest size is shown.
     views : sequence of (index, name, psnr)
         All measured views; the pictures are chosen by :func:`worst_to_best`.
     folder : Path
         Where ``held-out-0.jpg`` and so on are written.
-    threads : int
     renderer : Renderer, optional
         By default that of the processor.
 
@@ -310,13 +287,11 @@ def write_held_out(
         image = renderer.render(raw, photos.camera(index, 1), options).color
         rendering = np.clip(image, 0.0, 1.0)
         photo, mask = photos.photo(index, 1), photos.mask(index, 1)
+        error = f"Error x {ERROR_GAIN:g} (white: {1 / ERROR_GAIN:.0%} or more)"
         columns = [
             ("Photo", photo),
             (f"Gaussians, {psnr:.1f} dB", np.rint(255.0 * rendering).astype(np.uint8)),
-            (
-                f"Error x {ERROR_GAIN:g} (white: {1 / ERROR_GAIN:.0%} or more)",
-                error_map(photo, rendering, mask),
-            ),
+            (error, error_map(photo, rendering, mask)),
         ]
         file = f"held-out-{number}.jpg"
         write_bytes(folder / file, strip(columns))
@@ -327,13 +302,9 @@ def write_held_out(
 def write_learning_curve(training: dict[str, Any], path: Path) -> bool:
     """Plot PSNR and number of Gaussians over the iterations; return ``False`` if there is no curve.
 
-    Parameters
-    ----------
-    training : dict
-        Of a report: ``history`` (a list of ``iteration``, ``psnr`` of the photos trained on, dB,
-        and ``gaussians``), and ``iterations`` and ``held_out_psnr`` if measured.
-    path : Path
-        An SVG file.
+    The training's figures are those of a report: ``history`` (a list of ``iteration``, ``psnr`` of
+    the photos trained on, dB, and ``gaussians``), and ``iterations`` and ``held_out_psnr`` if
+    measured. The file is an SVG.
     """
     quality, count = [], []
     for entry in map(part, items(training.get("history"))):
