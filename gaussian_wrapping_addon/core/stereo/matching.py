@@ -58,17 +58,8 @@ def source_views(cameras: Sequence[Camera], points: np.ndarray) -> list[np.ndarr
     A point in both images counts by the angle between its two rays and by the likeness of its two
     scales, the less the more sources chosen before hold it.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-    points : (n, 3) float64
-        Sparse points in the frame of the cameras.
-
-    Returns
-    -------
-    list of (k,) int64
-        Indices of at most :data:`MOST_SOURCES` other cameras, for each camera; empty where none
-        shares points with it.
+    Of sparse points (n, 3) in the frame of the cameras. Returns for each camera (k,) int64 indices
+    of at most :data:`MOST_SOURCES` others; none where no camera shares points with it.
     """
     count = len(cameras)
     points = points[:: max(1, -(-len(points) // _MOST_POINTS))]
@@ -404,12 +395,9 @@ class MatchingLevel:
     """
 
     def __init__(
-        self,
-        cameras: Sequence[Camera],
-        greys: Sequence[np.ndarray],
-        sources: Sequence[np.ndarray],
+        self, cameras: Sequence[Camera], greys: Sequence[np.ndarray], sources: Sequence[np.ndarray],
         depth_ranges: np.ndarray,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.cameras, self.greys, self.sources = list(cameras), list(greys), list(sources)
         self.depth_ranges = depth_ranges.astype(np.float32)
         count = len(self.greys)
@@ -447,25 +435,12 @@ class MatchingLevel:
         return np.ascontiguousarray(self.planes[..., 0]).reshape(-1)
 
     def sweep(
-        self,
-        view: int,
-        turn: int,
-        seed: int,
-        *,
-        fresh: bool = False,
-        geometric: float = 0.0,
-        inverse_depths: np.ndarray = NO_DEPTHS,
-        prior: np.ndarray = NO_PRIOR,
-    ) -> None:
-        """Run one sweep over a photo.
+        self, view: int, turn: int, seed: int, *, fresh: bool = False, geometric: float = 0.0,
+        inverse_depths: np.ndarray = NO_DEPTHS, prior: np.ndarray = NO_PRIOR,
+    ) -> None:  # fmt: skip
+        """Run one sweep over a photo; its number decides direction and farther neighbours.
 
-        Parameters
-        ----------
-        turn : int
-            Number of the sweep: it decides direction and farther neighbours.
-        seed : int
-        fresh, geometric, inverse_depths, prior
-            As in :func:`~.matching.sweep`.
+        ``fresh``, ``geometric``, ``inverse_depths`` and ``prior`` are as in :func:`sweep`.
         """
         if len(self.sources[view]) == 0:
             return
@@ -494,6 +469,11 @@ class MatchingLevel:
                 means,
             )  # fmt: skip
         return means
+
+    def confirm_all(self) -> list[np.ndarray]:
+        """Do so for all photos with the depths that they have now."""
+        depths = self.inverse_depths()
+        return [self.confirm(view, depths) for view in range(len(self))]
 
     def compare_brightness(self) -> None:
         """Measure gains between photos on the confirmed pixels; costs compare them from now on."""
@@ -536,12 +516,8 @@ class MatchingLevel:
             back_maps.append(_map(lens_here, rotation.T, -rotation.T @ offset, lens_there))
             sizes.append((there.width - 1, there.height - 1))
         bases = np.asarray(self.sources[view], np.uint64) * np.uint64(self._photo_pixels)
-        return (
-            np.array(maps, np.float32).reshape(-1, 12),
-            np.array(back_maps, np.float32).reshape(-1, 12),
-            np.array(sizes, np.float32).reshape(-1, 2),
-            bases,
-        )
+        there_and_back = (np.array(rows, np.float32).reshape(-1, 12) for rows in (maps, back_maps))
+        return (*there_and_back, np.array(sizes, np.float32).reshape(-1, 2), bases)
 
 
 def _matrix(camera: Camera) -> np.ndarray:

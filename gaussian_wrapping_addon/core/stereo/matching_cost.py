@@ -163,12 +163,9 @@ def confirm(
 
 
 def brightness_of(
-    means: np.ndarray,
-    inverse_depths: np.ndarray,
-    confirmed: np.ndarray,
-    maps: np.ndarray,
+    means: np.ndarray, inverse_depths: np.ndarray, confirmed: np.ndarray, maps: np.ndarray,
     other_means: list[np.ndarray],
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return (s, 2) float32: gain and rate of each source of a photo.
 
     A window on a smooth plain surface shows a ramp of shading, and a ramp correlates with itself at
@@ -176,16 +173,14 @@ def brightness_of(
 
     Parameters
     ----------
-    means : (h, w) float32
-        Mean grey level around each pixel.
+    means, other_means : (h, w) float32
+        Mean grey level around each pixel of the photo, and of its sources.
     inverse_depths : (h, w) float32
         Where ``confirmed`` is not 0.
     confirmed : (h, w) uint8
         Bits of the sources whose own depth agrees.
     maps : (s, 12) float32
         From the photo to its sources (:mod:`~.matching`).
-    other_means : list of (h', w') float32
-        As ``means``, of the sources.
     """
     found = np.tile(NO_BRIGHTNESS, (len(maps), 1))
     row, column = np.nonzero(confirmed)

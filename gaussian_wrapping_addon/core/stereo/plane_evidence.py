@@ -213,11 +213,7 @@ class PackedPhotos:
     ) -> np.ndarray:  # fmt: skip
         """Return (n, 5) int32 counts of :func:`count_votes` for pixels of a photo.
 
-        Parameters
-        ----------
-        pixels : (n, 2) float64
-            Centres whole.
-        inverse_depths : (n,) float64, positive
+        Pixels are (n, 2) float64, centres whole; their inverse depths (n,) are positive.
         """
         counts = np.zeros((len(pixels), 5), np.int32)
         column, row = pixels.astype(np.int64).T
@@ -261,14 +257,9 @@ def packed(depth_maps: Sequence[DepthMap], random: np.random.Generator) -> Packe
         part = (view, slice(cameras[view].height), slice(cameras[view].width))
         depths[part] = np.where(found.confidence > 0, found.depth, 0.0)
         images[part] = found.color
-    photos = PackedPhotos(
-        cameras,
-        np.array([_projection(camera) for camera in cameras]),
-        np.array([(camera.width, camera.height) for camera in cameras], np.int64),
-        depths,
-        images,
-        np.ones((len(cameras), 3)),
-    )
+    projections = np.array([_projection(camera) for camera in cameras])
+    sizes = np.array([(camera.width, camera.height) for camera in cameras], np.int64)
+    photos = PackedPhotos(cameras, projections, sizes, depths, images, np.ones((len(cameras), 3)))
     gains = np.exp(-_log_gains(photos, random))  # (n, 3)
     for view, gain in enumerate(gains):
         corrected = (images[view].astype(np.float32) + _DARK) * gain.astype(np.float32) - _DARK
@@ -317,18 +308,6 @@ def _ratio(
         return None
     there = photos.images[other][row, column][agree] + _DARK
     return np.median(np.log(there / color[shown][agree]), axis=0)
-
-
-__all__ = [
-    "AGREEING",
-    "ALIKE",
-    "NEARER",
-    "THROUGH",
-    "PackedPhotos",
-    "Votes",
-    "packed",
-    "photos_asked",
-]
 
 
 # -- Planes moved until the faint texture of their segments matches between photos ----------------
@@ -400,16 +379,9 @@ class _Sampled:
 
 
 class Aligner:
-    """Moves planes to where the texture of plain pixels matches best.
+    """Moves planes to where the texture of all plain segments matches best.
 
-    Parameters
-    ----------
-    photos : PackedPhotos
-    segments : sequence of Segment
-        All plain ones.
-    random : numpy.random.Generator
-    progress : Progress
-        Checked for cancellation, here only.
+    ``progress`` is checked for cancellation while textures are drawn only.
     """
 
     def __init__(

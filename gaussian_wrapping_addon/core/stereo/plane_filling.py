@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -143,12 +142,7 @@ class PlaneSet:
 def assigned(segment: Segment, known: PlaneSet, *, first: bool) -> Assignment | None:
     """Return the planes that explain most of what is known around a segment and pass the votes.
 
-    Parameters
-    ----------
-    segment : Segment
-    known : PlaneSet
-    first : bool
-        Planes are proposals of single segments still.
+    At ``first`` planes are proposals of single segments still.
     """
     if not known.planes or segment.weights.sum() < LEAST_WEIGHT:
         return None
@@ -189,11 +183,8 @@ class _Choices:
         """Return the choices that explain enough, the best first."""
         rank = self.shares * np.minimum(self.spreads / FULL_SPREAD, 1.0)
         order = [int(k) for k in np.argsort(-rank)[:MOST_RANKED] if self.shares[k] > LEAST_RANKED]
-        found = [
-            (self.shares[k], Assignment((k,)))
-            for k in order
-            if self.spreads[k] >= self.least_spread
-        ]
+        wide = [k for k in order if self.spreads[k] >= self.least_spread]
+        found = [(self.shares[k], Assignment((k,))) for k in wide]
         found += list(self._pairs(order[:MOST_PAIRED]))
         found = [choice for choice in found if choice[0] >= LEAST_BORDER]
         found.sort(key=lambda c: -c[0] * self.trust[list(c[1].planes)].min())
@@ -255,12 +246,9 @@ def _colors(segment: Segment, photos: PackedPhotos) -> np.ndarray:
 
 
 def _taken_over(
-    own: Sequence[int],
-    segments: Sequence[Segment],
-    found: Sequence[Assignment | None],
-    colors: dict[int, np.ndarray],
-    known: PlaneSet,
-) -> dict[int, Assignment]:
+    own: Sequence[int], segments: Sequence[Segment], found: Sequence[Assignment | None],
+    colors: dict[int, np.ndarray], known: PlaneSet,
+) -> dict[int, Assignment]:  # fmt: skip
     """Return the assignments that segments of one photo take over in one turn."""
     camera = known.photos.cameras[segments[own[0]].view]
     done = np.zeros((camera.height, camera.width), np.int64)
@@ -277,9 +265,7 @@ def _taken_over(
         close = distance[segment.rows, segment.columns] <= GAP_PX
         if found[number] is not None or not close.any():
             continue
-        near, count = np.unique(
-            nearest[segment.rows, segment.columns][close], return_counts=True
-        )  # fmt: skip
+        near, count = np.unique(nearest[segment.rows, segment.columns][close], return_counts=True)
         for other in near[np.argsort(-count)][:NEIGHBOURS]:
             if np.abs(colors[number] - colors[int(other)]).max() > LIKE_LEVELS:
                 continue
@@ -356,13 +342,8 @@ def fill_plain_parts(
     beside. So do those that other photos see through, onto a plane or onto what lies too far away
     for parallax, as the sky.
 
-    Parameters
-    ----------
-    depth_maps : sequence of DepthMap
-    points : (n, 3) float64
-        Sparse points, scene frame.
-    progress : Progress
-        Told once, at its end; checked for cancellation.
+    The sparse points (n, 3) are in the scene frame; progress is told once, at its end, and checked
+    for cancellation.
     """
     if len(depth_maps) < LEAST_VIEWS:
         return list(depth_maps)
@@ -454,20 +435,18 @@ def _fitted(
                 exact.append(tilted)
             else:
                 inverse = segment.inverse_depths[near]
-                points = lifted_pixels(camera, segment.places[near], inverse)
-                known.append((points, segment.weights[near] * inverse**2))
+                at = lifted_pixels(camera, segment.places[near], inverse)
+                known.append((at, segment.weights[near] * inverse**2))
         if len(views) < LEAST_VIEWS:
             continue
         if sum(len(part[0]) for part in exact) < LEAST_FITTED:
             exact = known + exact
         if not exact:
             continue
-        evidence = Plane(
-            plane.normal, plane.offset, plane.center,
-            np.concatenate([part[0] for part in exact]),
-            np.concatenate([part[1] for part in exact]),
-            support, frozenset(views), plane.distance,
-        )  # fmt: skip
+        points, weights = (np.concatenate(parts) for parts in zip(*exact, strict=True))
+        evidence = replace(
+            plane, points=points, weights=weights, support=support, views=frozenset(views)
+        )
         result.append(refined(evidence))
     return result
 
@@ -478,11 +457,8 @@ def _tilted_alike(
     """Return confirmed points in and around a segment that lie on a plane and have its normal."""
     camera = depth_map.camera
     top, left = max(segment.rows.min() - BORDER_PX, 0), max(segment.columns.min() - BORDER_PX, 0)
-    box = (
-        slice(top, segment.rows.max() + BORDER_PX + 1),
-        slice(left, segment.columns.max() + BORDER_PX + 1),
-    )
-    row, column = np.nonzero(depth_map.confidence[box] > 0)
+    low, right = segment.rows.max() + BORDER_PX + 1, segment.columns.max() + BORDER_PX + 1
+    row, column = np.nonzero(depth_map.confidence[top:low, left:right] > 0)
     row, column = row + top, column + left
     depth = depth_map.depth[row, column].astype(np.float64)
     points = lifted_pixels(camera, np.stack([column, row], 1).astype(np.float64), 1.0 / depth)
@@ -632,7 +608,7 @@ class _Filled:
         confidence = np.where(lost | far, np.float32(0), depth_map.confidence)
         confidence[filled] = FILLED_CONFIDENCE
         agreeing = np.where(filled, np.uint8(FILLED_AGREEING), depth_map.agreeing)
-        return dataclasses.replace(
+        return replace(
             depth_map, depth=depth, normal=normal, confidence=confidence,
             agreeing=np.where(far, np.uint8(0), agreeing),
             cost=np.where(far, WORST_COST, depth_map.cost),
