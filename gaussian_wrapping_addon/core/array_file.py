@@ -49,10 +49,9 @@ def read_arrays(
     ----------
     path : Path
         The file itself, not a link to it.
-    names : iterable of str, optional
-        Arrays that it must hold; ``None`` reads all that it holds.
-    optional : iterable of str
-        Arrays that it may hold; the others are not read.
+    names, optional : iterable of str
+        Arrays that it must hold and may hold, the others are not read; without names, all that it
+        holds.
     most_bytes : int, optional
         Largest size of those that are read when unpacked; without it compressed entries are
         refused.

@@ -30,14 +30,10 @@ class Pyramid:
     """(levels, 3) int64: first pixel, width, height."""
 
 
-def pyramid(image: np.ndarray, max_levels: int = MAX_LEVELS) -> Pyramid:
-    """Build a pyramid by averaging 2 x 2 pixels; odd borders are repeated, so scales are exact.
+def pyramid(image: np.ndarray) -> Pyramid:
+    """Build a pyramid of an image (h, w, 3) uint8 by averaging 2 x 2 pixels.
 
-    Parameters
-    ----------
-    image : (h, w, 3) uint8
-    max_levels : int
-        Upper bound; the pyramid also ends at one pixel.
+    It ends at one pixel, or after :data:`MAX_LEVELS`. Odd borders are repeated, so scales are exact.
     """
     parts, levels, begin = [], [], 0
     current = image
@@ -46,7 +42,7 @@ def pyramid(image: np.ndarray, max_levels: int = MAX_LEVELS) -> Pyramid:
         parts.append(current.reshape(-1, 3))
         levels.append((begin, width, height))
         begin += width * height
-        if len(levels) >= max_levels or max(width, height) == 1:
+        if len(levels) >= MAX_LEVELS or max(width, height) == 1:
             break
         even = np.pad(current, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         total = even[0::2, 0::2].astype(np.uint16) + even[1::2, 0::2]

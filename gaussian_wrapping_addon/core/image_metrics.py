@@ -9,7 +9,6 @@ import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,10 +16,6 @@ from .compiled import inline, kernel, part
 from .filters import LANES, RING, TAPS, filter_run, filter_two_runs
 from .parallel import even_bounds, run_chunks
 from .resampling import as_unit_floats, check_sizes
-
-if TYPE_CHECKING:
-    pass
-
 
 # -- Compiled comparison of two images: errors, structural similarity (SSIM), and the gradient ----
 
@@ -316,12 +311,8 @@ class Comparison:
 def psnr(image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the peak signal-to-noise ratio in dB; infinite for equal images.
 
-    Parameters
-    ----------
-    image, photo : (h, w, 3)
-        uint8, or floats whose white is 1. The image is clamped to [0, 1] as a display would.
-    mask : (h, w) bool, optional
-        Pixels to measure.
+    Both are (h, w, 3) uint8, or floats whose white is 1, and measured at the pixels of the mask
+    (h, w) bool. The image is clamped to [0, 1] as a display would.
 
     Raises
     ------
@@ -355,18 +346,12 @@ def score_images(
     lpips: Lpips | None = None,
     threads: int = 1,
 ) -> ViewScores:
-    """Return all metrics of an image and its photo.
+    """Return all metrics of an image and its photo, as for :func:`psnr`.
 
-    Parameters
-    ----------
-    image, photo : (h, w, 3)
-        uint8, or floats whose white is 1. The image is clamped to [0, 1] as a display would.
-    mask : (h, w) bool, optional
-        Pixels to compare. PSNR is over these; SSIM over the windows centred on them, both images
-        black elsewhere (1 if there are none: see :func:`has_windows`); LPIPS is of the whole image,
-        with the photo's pixels in both elsewhere.
-    lpips : Lpips, optional
-        Without it, or if the image is too small for it, LPIPS is not measured.
+    PSNR is over the pixels of the mask; SSIM over the windows centred on them, both images black
+    elsewhere (1 if there are none: see :func:`has_windows`); LPIPS is of the whole image, with the
+    photo's pixels in both elsewhere. Without ``lpips``, or if the image is too small for it, it is
+    not measured.
 
     Raises
     ------
@@ -404,6 +389,8 @@ def compare(
     The window of SSIM is 11 x 11, Gaussian with sigma 1.5, "valid" padding. With a mask, both
     images are black outside it, and only windows centred inside it are counted.
 
+    The result is bitwise the same for any number of threads.
+
     Parameters
     ----------
     image : (h, w, 3) float32 or float64
@@ -415,11 +402,6 @@ def compare(
         Weights of the mean absolute error and the mean SSIM in the scalar to differentiate.
     out : (h, w, 3), C-contiguous, of the image's type, optional
         Receives the gradient; by default a new array.
-
-    Returns
-    -------
-    Comparison
-        Bitwise the same for any number of threads.
 
     Raises
     ------
@@ -433,14 +415,12 @@ def compare(
     height, width = image.shape[:2]
     inside = (slice(RADIUS, height - RADIUS), slice(RADIUS, width - RADIUS))
     if mask is None:
-        mask = _NO_MASK
-        pixels = height * width
+        mask, pixels = _NO_MASK, height * width
         windows = max(0, height - 2 * RADIUS) * max(0, width - 2 * RADIUS)
     else:
         mask = np.ascontiguousarray(mask, np.bool_)
         pixels = int(np.count_nonzero(mask))
-        fits = min(height, width) >= WINDOW
-        windows = int(np.count_nonzero(mask[inside])) if fits else 0
+        windows = int(np.count_nonzero(mask[inside])) if min(height, width) >= WINDOW else 0
     values, windows = 3 * pixels, 3 * windows
     flat_image, flat_photo = image.reshape(height, -1), photo.reshape(height, -1)  # (h, 3 w)
     sums = np.zeros((-(-width // BLOCK_PX), height, 3))
@@ -529,10 +509,7 @@ class Lpips:
     def distance(self, image: np.ndarray, photo: np.ndarray) -> float:
         """Return the distance: 0 for equal images, about 0.7 for unrelated ones.
 
-        Parameters
-        ----------
-        image, photo : (h, w, 3)
-            sRGB, uint8 or floats with white = 1; clamped to [0, 1] as by a display.
+        Both are (h, w, 3) sRGB, uint8 or floats with white = 1, clamped to [0, 1] as by a display.
         """
         import torch
 

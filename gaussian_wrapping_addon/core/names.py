@@ -61,12 +61,7 @@ def printable_name(name: Any) -> str:
 def region_name(request: str, body: Any) -> str:
     """Return the folder name of a requested region: ASCII, short, never empty.
 
-    Parameters
-    ----------
-    request : str
-        One of :data:`AUTOMATIC_REGIONS`, or the path of a region file.
-    body : object
-        Content of that file.
+    The request is one of :data:`AUTOMATIC_REGIONS`, or the path of a region file with this body.
     """
     if request in AUTOMATIC_REGIONS:
         return request
@@ -85,12 +80,7 @@ def _requested_name(request: str, body: Any) -> str:
 
 
 def region_names(requests: Sequence[str], bodies: Mapping[str, Any]) -> list[str]:
-    """Return the folder names of all requested regions.
-
-    Parameters
-    ----------
-    bodies : mapping
-        Content of the region files, by request.
+    """Return the folder names of all requested regions, by the contents of the region files.
 
     Raises
     ------
@@ -130,12 +120,8 @@ def file_stems(meshes: Iterable[tuple[str, int]]) -> dict[tuple[str, int], str]:
     """Return the stems of all meshes of a result, unique even if case is ignored.
 
     Colliding stems all end with a hash of their own name, which does not depend on which of them
-    are written, so that a later export overwrites none of the others.
-
-    Parameters
-    ----------
-    meshes : iterable of (region, level)
-        All meshes of the result, not only those to be written.
+    are written, so that a later export overwrites none of the others. Meshes are all (region,
+    level) of the result, not only those to be written.
     """
     stems = {mesh: file_stem(*mesh) for mesh in meshes}
     count = Counter([SPLAT_STEM, *(stem.casefold() for stem in stems.values())])

@@ -63,13 +63,7 @@ class PlyHeader:
 
 
 def read_ply_header(path: Path, hint: str) -> PlyHeader:
-    """Read a header of at most :data:`MAX_HEADER_BYTES`.
-
-    Parameters
-    ----------
-    path : Path
-    hint : str
-        Hint of every error.
+    """Read a header of at most :data:`MAX_HEADER_BYTES`; every error has the hint.
 
     Raises
     ------
@@ -143,10 +137,8 @@ def vertex_layout(
         raise ParseError(path, "header", "the first element is not named vertex.", hint)
     vertex = header.elements[0]
     if vertex.count > most:
-        raise ParseError(
-            path, "header", f"{vertex.count} vertices; at most {most} are read.",
-            hint,
-        )  # fmt: skip
+        text = f"{vertex.count} vertices; at most {most} are read."
+        raise ParseError(path, "header", text, hint)
     if not vertex.properties:
         raise ParseError(path, "header", "vertices without properties.", hint)
     if any(kind == LIST for _, kind in vertex.properties):
@@ -170,22 +162,9 @@ def read_vertices(
 ) -> np.ndarray:
     """Read the vertices, the first element of a file.
 
-    Nothing is allocated before the file is known to be as long as its header declares.
-
-    Parameters
-    ----------
-    path : Path
-    header : PlyHeader
-        Header of the file.
-    hint : str
-        Hint of every error.
-    most : int
-        Greatest number of vertices that is accepted.
-
-    Returns
-    -------
-    (n,) structured array
-        One field per property; for ASCII files all are float64.
+    Nothing is allocated before the file is known to be as long as its header declares. Up to
+    ``most`` vertices are accepted; every error has the hint. Returns an (n,) structured array with
+    one field per property; for ASCII files all are float64.
 
     Raises
     ------
