@@ -17,8 +17,7 @@ EXIT_CANCELLED = 5
 DISK_FULL_ERRNOS = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG)
 """Error numbers of a full disk or an exhausted quota."""
 
-SHOWN_PATH = 80
-"""Characters of an over-long path that a message shows."""
+SHOWN_PATH = 80  # characters of an over-long path that a message shows
 
 
 class WrapError(Exception):

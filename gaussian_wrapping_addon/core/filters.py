@@ -24,16 +24,15 @@ MAX_LEVELS = 8
 class Pyramid:
     """Image levels in one flat array, each half the size of the previous one."""
 
-    pixels: np.ndarray
-    """(n, 3) uint8 pixels of all levels, row by row."""
-    levels: np.ndarray
-    """(levels, 3) int64: first pixel, width, height."""
+    pixels: np.ndarray  # (n, 3) uint8 pixels of all levels, row by row
+    levels: np.ndarray  # (levels, 3) int64: first pixel, width, height
 
 
 def pyramid(image: np.ndarray) -> Pyramid:
     """Build a pyramid of an image (h, w, 3) uint8 by averaging 2 x 2 pixels.
 
-    It ends at one pixel, or after :data:`MAX_LEVELS`. Odd borders are repeated, so scales are exact.
+    It ends at one pixel, or after :data:`MAX_LEVELS`. Odd borders are repeated, so scales are
+    exact.
     """
     parts, levels, begin = [], [], 0
     current = image
@@ -103,8 +102,7 @@ def trilinear(
 # each run, as LLVM cannot prove that the target is another array.
 
 
-LANES = 16
-"""Values per run. LLVM splits a run into as many registers as needed."""
+LANES = 16  # Values per run. LLVM splits a run into as many registers as needed.
 
 TAPS = 11
 HALF = TAPS // 2 + 1

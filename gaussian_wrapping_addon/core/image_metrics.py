@@ -20,8 +20,7 @@ from .resampling import as_unit_floats, check_sizes
 # -- Compiled comparison of two images: errors, structural similarity (SSIM), and the gradient ----
 
 
-WINDOW = TAPS
-"""Side of the Gaussian window, pixels; sigma is 1.5 (docs/method.md, section 3.1)."""
+WINDOW = TAPS  # Side of the Gaussian window, pixels; sigma is 1.5 (docs/method.md, section 3.1).
 RADIUS = WINDOW // 2
 SIGMA_PX = 1.5
 REACH = WINDOW - 1
@@ -33,8 +32,7 @@ WEIGHTS = tuple(float(tap / sum(_taps)) for tap in _taps)
 C1 = 0.01**2
 C2 = 0.03**2
 
-BLOCK_PX = 512
-"""Width of a column block: the buffered last rows of one fit a cache of 1 MB."""
+BLOCK_PX = 512  # width of a column block: the buffered last rows of one fit a cache of 1 MB
 
 _AVERAGED = 4  # x, y, x^2 + y^2, x y: SSIM only needs the sum of the two variances
 _MAPS = 3  # derivatives of SSIM with respect to E[x], E[x^2] and E[x y] of its window
@@ -270,8 +268,7 @@ def compare_rows(  # type: ignore[no-untyped-def]
 # -- PSNR, SSIM and LPIPS between a rendered view and its photo, over the pixels of a mask --------
 
 
-PSNR_CAP_DB = 100.0
-"""Replaces the infinite PSNR of equal images in averages and reports."""
+PSNR_CAP_DB = 100.0  # replaces the infinite PSNR of equal images in averages and reports
 
 _NO_MASK = np.zeros((0, 0), np.bool_)
 
@@ -280,8 +277,7 @@ _NO_MASK = np.zeros((0, 0), np.bool_)
 class ViewScores:
     """Metrics between an image and its photo."""
 
-    psnr: float
-    """dB, at most :data:`PSNR_CAP_DB`."""
+    psnr: float  # dB, at most :data:`PSNR_CAP_DB`
     ssim: float
     lpips: float | None = None
     """``None`` where it was not measured."""
@@ -296,12 +292,9 @@ class ViewScores:
 class Comparison:
     """Errors and SSIM of an image over the pixels of a mask, and their gradient."""
 
-    absolute: float
-    """Mean absolute error over pixels and colours; 0 if there are none."""
-    squared: float
-    """Mean squared error."""
-    similarity: float
-    """Mean SSIM over windows and colours; 1 if there are none."""
+    absolute: float  # Mean absolute error over pixels and colours; 0 if there are none.
+    squared: float  # mean squared error
+    similarity: float  # Mean SSIM over windows and colours; 1 if there are none.
     windows: int
     gradient: np.ndarray | None
     """(h, w, 3), of the image's type: derivative of ``weights[0] absolute + weights[1] similarity``
@@ -456,11 +449,9 @@ def compare(
 
 _logger = logging.getLogger(__name__)
 
-BACKBONE_PATTERN = "alexnet-owt-*.pth"
-"""Name of torchvision's AlexNet weights in torch's hub cache."""
+BACKBONE_PATTERN = "alexnet-owt-*.pth"  # name of torchvision's AlexNet weights in torch's hub cache
 
-MIN_SIDE_PX = 31
-"""For smaller images, the last layers of AlexNet have no pixel."""
+MIN_SIDE_PX = 31  # for smaller images, the last layers of AlexNet have no pixel
 
 
 def lpips_ready() -> tuple[bool, str]:

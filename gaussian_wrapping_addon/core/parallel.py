@@ -91,12 +91,10 @@ def run_chunks(function: Callable[[int, int], object], bounds: np.ndarray, threa
 # -- Memory for large arrays, aligned so that the system can use huge pages -----------------------
 
 
-_PAGE_BYTES = 1 << 21
-"""A huge page of x86, and of ARM with 4 kB pages."""
+_PAGE_BYTES = 1 << 21  # a huge page of x86, and of ARM with 4 kB pages
 _LARGE_BYTES = 1 << 19
 """Smallest array to align; for smaller ones a huge page would be mostly empty."""
-_ADVISED_BYTES = 1 << 22
-"""Allocation size from which numpy requests huge pages from Linux."""
+_ADVISED_BYTES = 1 << 22  # allocation size from which numpy requests huge pages from Linux
 
 
 def empty_array(count: int, dtype: DTypeLike) -> np.ndarray:

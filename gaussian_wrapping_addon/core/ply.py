@@ -27,8 +27,7 @@ _TYPES = {
 
 _ENCODINGS = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}
 
-LIST = "list"
-"""Type of a list property; only elements after the vertices may have one."""
+LIST = "list"  # Type of a list property; only elements after the vertices may have one.
 
 
 @dataclass(frozen=True)
@@ -50,8 +49,7 @@ class PlyElement:
 class PlyHeader:
     """A parsed header."""
 
-    encoding: str
-    """``"ascii"``, or the byte order ``"<"`` or ``">"``."""
+    encoding: str  # ``"ascii"``, or the byte order ``"<"`` or ``">"``
     elements: tuple[PlyElement, ...]
     comments: tuple[str, ...]
     begin: int

@@ -219,10 +219,8 @@ class ReportWarning:
     code: str
     """Stable identifier for programs, such as ``"photos-not-placed"``; empty for texts read from
     version 0.1.0."""
-    text: str
-    """One or more sentences for the user."""
-    hint: str = ""
-    """What the user can do; empty if nothing is known to help."""
+    text: str  # one or more sentences for the user
+    hint: str = ""  # What the user can do; empty if nothing is known to help.
 
     def to_json(self) -> dict[str, str]:
         """Return plain JSON values."""

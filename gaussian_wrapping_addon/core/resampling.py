@@ -104,8 +104,7 @@ def check_sizes(
 # -- Grey levels of colours -----------------------------------------------------------------------
 
 
-LUMA = (0.299, 0.587, 0.114)
-"""Shares of red, green and blue in a grey level (ITU-R BT.601)."""
+LUMA = (0.299, 0.587, 0.114)  # shares of red, green and blue in a grey level (ITU-R BT.601)
 
 
 def grey_of(colors: np.ndarray) -> np.ndarray:

@@ -25,16 +25,11 @@ class PoseErrors:
     center_shares: np.ndarray
     """(n,) distance of the aligned centre from the true one, over the true cameras' spread: the
     root mean square distance of their centres from their mean."""
-    given_shares: np.ndarray
-    """(n,) the same distance before any alignment."""
-    rotation_degrees: np.ndarray
-    """(n,) angle between the aligned and the true orientation."""
-    spread: float
-    """The spread, units of the true frame."""
-    transform: Similarity
-    """``true_from_solved``."""
-    missing: tuple[str, ...]
-    """True cameras missing in the solved set."""
+    given_shares: np.ndarray  # (n,) the same distance before any alignment
+    rotation_degrees: np.ndarray  # (n,) angle between the aligned and the true orientation
+    spread: float  # the spread, units of the true frame
+    transform: Similarity  # ``true_from_solved``
+    missing: tuple[str, ...]  # true cameras missing in the solved set
 
     def to_json(self) -> dict[str, Any]:
         """Return counts, medians and maxima as plain JSON values."""
@@ -112,20 +107,16 @@ thresholds an iteration, which no share within the threshold shows."""
 TANKS_STAGES = ((1.0, 80.0), (0.5, 20.0), (0.0, 2.0))
 """Voxel and largest distance of each refinement stage in thresholds (docs/method.md, section 9.1);
 voxel 0 takes every k-th point instead."""
-TANKS_MAX_POINTS = 4_000_000
-"""Maximum number of points in the last stage, after taking every k-th."""
+TANKS_MAX_POINTS = 4_000_000  # maximum number of points in the last stage, after taking every k-th
 
 
 @dataclass(frozen=True)
 class IcpResult:
     """Result of :func:`icp`."""
 
-    transform: Similarity
-    """``target_from_source``."""
-    fitness: float
-    """Share of the source points with a correspondence within ``max_distance``."""
-    rmse: float
-    """Root mean square distance of the correspondences, units of the target."""
+    transform: Similarity  # ``target_from_source``
+    fitness: float  # share of the source points with a correspondence within ``max_distance``
+    rmse: float  # root mean square distance of the correspondences, units of the target
     iterations: int = 0
     converged: bool = False
 
@@ -134,8 +125,7 @@ class IcpResult:
 class TanksRefinement:
     """The three stages of the refinement, in order."""
 
-    transform: Similarity
-    """``target_from_source`` after the last stage."""
+    transform: Similarity  # ``target_from_source`` after the last stage
     stages: tuple[IcpResult, ...]
 
     def to_json(self) -> list[dict[str, Any]]:

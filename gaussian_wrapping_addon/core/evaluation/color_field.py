@@ -29,10 +29,8 @@ class Contraction:
     The map of Mip-NeRF 360 (docs/method.md, section 9.3), which the published colour field uses.
     """
 
-    center: np.ndarray
-    """(3,) float64, world frame."""
-    radius: float
-    """World units."""
+    center: np.ndarray  # (3,) float64, world frame
+    radius: float  # world units
 
     @classmethod
     def of_cameras(cls, cameras: Sequence[Camera], distance: float) -> Contraction:
@@ -61,8 +59,7 @@ class Contraction:
 # -- Sparse cubic lattice: only the cells that hold a sample exist, in two nested sizes -----------
 
 
-RATIO = 4
-"""Coarse cells are this many fine cells wide."""
+RATIO = 4  # coarse cells are this many fine cells wide
 _AXIS_BITS = 19
 """Bits of a coarse cell's index along an axis: three of them and a fine cell's number within the
 coarse one (6 bits) fill 63 bits."""
@@ -76,12 +73,9 @@ CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], 
 class Level:
     """Cells of one size and their corners."""
 
-    cells: np.ndarray
-    """(c,) int64 keys, increasing."""
-    corners: np.ndarray
-    """(c, 8) int32: vertices of each cell."""
-    vertices: np.ndarray
-    """(v,) int64 keys, increasing."""
+    cells: np.ndarray  # (c,) int64 keys, increasing
+    corners: np.ndarray  # (c, 8) int32: vertices of each cell
+    vertices: np.ndarray  # (v,) int64 keys, increasing
     incident: np.ndarray
     """(v, 8) int32: ``8 cell + corner`` of the cells around a vertex, -1 where there is none."""
 
@@ -148,8 +142,7 @@ def _search(sorted_keys: np.ndarray, keys: np.ndarray) -> np.ndarray:
 # of degree 0 to 2 (9 x 3 values) at each coarse vertex, both interpolated trilinearly.
 
 
-HARMONICS = 9
-"""Real spherical harmonics of degree 0 to 2."""
+HARMONICS = 9  # real spherical harmonics of degree 0 to 2
 COARSE_VALUES = 3 * HARMONICS
 
 
@@ -374,31 +367,23 @@ def field_colors(
 class ColorFieldSettings:
     """How fine the field is and how it is solved."""
 
-    cell_px: float = 1.0
-    """Side of a fine cell in median footprints of a pixel."""
-    iterations: int = 20
-    """Steps of conjugate gradients."""
+    cell_px: float = 1.0  # side of a fine cell in median footprints of a pixel
+    iterations: int = 20  # steps of conjugate gradients
     fine_ridge: float = 0.5
     """Pull of each fine value towards 0, in samples: a vertex with fewer samples than this takes
     its colour from the coarse lattice."""
-    mean_ridge: float = 0.02
-    """Pull of the coarse colours towards the mean colour, in samples."""
-    view_ridge: float = 2.0
-    """Pull of the harmonics of degree 1 and 2 towards 0, in samples."""
+    mean_ridge: float = 0.02  # pull of the coarse colours towards the mean colour, in samples
+    view_ridge: float = 2.0  # pull of the harmonics of degree 1 and 2 towards 0, in samples
 
 
 @dataclass(frozen=True)
 class Samples:
     """Coloured points of a surface."""
 
-    points: np.ndarray
-    """(n, 3) float64, world frame."""
-    directions: np.ndarray
-    """(n, 3) float32, unit, from the camera to the point."""
-    footprints: np.ndarray
-    """(n,) float32: side of a pixel at the point, world units."""
-    colors: np.ndarray
-    """(n, 3) float32, white is 1."""
+    points: np.ndarray  # (n, 3) float64, world frame
+    directions: np.ndarray  # (n, 3) float32, unit, from the camera to the point
+    footprints: np.ndarray  # (n,) float32: side of a pixel at the point, world units
+    colors: np.ndarray  # (n, 3) float32, white is 1
 
 
 @dataclass(frozen=True)
@@ -408,14 +393,10 @@ class ColorField:
     contraction: Contraction
     cell: float
     """Side of a fine cell, contracted units."""
-    mean: np.ndarray
-    """(3,) float32: colour far from every sample."""
-    levels: tuple[Level, Level]
-    """Fine and coarse."""
-    fine: np.ndarray
-    """(v, 3) float32."""
-    coarse: np.ndarray
-    """(w, 27) float32: harmonic by harmonic, red, green, blue."""
+    mean: np.ndarray  # (3,) float32: colour far from every sample
+    levels: tuple[Level, Level]  # fine and coarse
+    fine: np.ndarray  # (v, 3) float32
+    coarse: np.ndarray  # (w, 27) float32: harmonic by harmonic, red, green, blue
 
     def colors(self, points: np.ndarray, directions: np.ndarray, *, threads: int = 1) -> np.ndarray:
         """Return (n, 3) float32 colours in [0, 1] of (n, 3) world points seen along directions."""

@@ -38,20 +38,16 @@ class DtuScan:
     mask: ObservationMask
     plane: np.ndarray
     """(4,) ground plane; true points with ``plane . [x, 1] > 0`` are evaluated."""
-    camera_numbers: np.ndarray
-    """(m,) int64; empty if no camera files were found."""
-    camera_centers: np.ndarray
-    """(m, 3) float64."""
-    camera_source: str
-    """Name of the file or folder of the cameras."""
+    camera_numbers: np.ndarray  # (m,) int64; empty if no camera files were found.
+    camera_centers: np.ndarray  # (m, 3) float64
+    camera_source: str  # name of the file or folder of the cameras
 
 
 @dataclass(frozen=True)
 class DtuAlignment:
     """Alignment of the job's cameras to the true ones."""
 
-    transform: Similarity
-    """``truth_from_job``."""
+    transform: Similarity  # ``truth_from_job``
     cameras: int
     number_offset: int
     """Number in the camera files minus the number in the photo's name."""

@@ -18,12 +18,9 @@ from ..files import finite_json
 from ..limits import MAX_POINTS
 from ..mesh.sampling import distances_to_cloud, thin
 
-DENSITY_MM = 0.2
-"""Minimum distance of predicted points, and maximum gap of a resampled mesh."""
-PATCH_MM = 60.0
-"""Predicted points farther than this outside the observed box are ignored."""
-MAX_DISTANCE_MM = 20.0
-"""Distances of this or more are dropped from the means."""
+DENSITY_MM = 0.2  # minimum distance of predicted points, and maximum gap of a resampled mesh
+PATCH_MM = 60.0  # predicted points farther than this outside the observed box are ignored
+MAX_DISTANCE_MM = 20.0  # distances of this or more are dropped from the means
 
 MAX_CELLS = 2e6
 """Maximum extent in densities: indices of cells over three such axes fit into 64 bits."""
@@ -43,8 +40,7 @@ class ObservationMask:
     low: np.ndarray
     high: np.ndarray
     """(3,) float64, corners of the box, rows of ``BB``."""
-    resolution: float
-    """Distance between voxel centres."""
+    resolution: float  # distance between voxel centres
 
     def __post_init__(self) -> None:
         is_valid = (
@@ -83,12 +79,9 @@ class ObservationMask:
 class DtuScore:
     """Mean distances in the truth's unit (mm); infinite if there is no distance to average."""
 
-    accuracy: float
-    """From predicted points in observed voxels to the truth."""
-    completeness: float
-    """From true points above the ground plane to the prediction."""
-    overall: float
-    """Mean of the two: the data set's Chamfer distance."""
+    accuracy: float  # from predicted points in observed voxels to the truth
+    completeness: float  # from true points above the ground plane to the prediction
+    overall: float  # mean of the two: the data set's Chamfer distance
     accuracy_count: int
     completeness_count: int
     """Number of distances averaged."""

@@ -95,8 +95,7 @@ class PolygonVolume:
     polygon: np.ndarray
     """(k, 3) float64 corners in order, the last joined to the first; the coordinate along the axis
     is not used. The polygon may be concave; self-intersections follow the even-odd rule."""
-    orthogonal_axis: str
-    """``"X"``, ``"Y"`` or ``"Z"``."""
+    orthogonal_axis: str  # ``"X"``, ``"Y"`` or ``"Z"``
     axis_min: float
     axis_max: float
 

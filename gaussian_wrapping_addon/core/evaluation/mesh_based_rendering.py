@@ -115,8 +115,7 @@ class MeshBasedSettings:
 
     max_samples: int = 3_000_000
     """Training pixels that are used, of each photo at most an equal share, drawn evenly."""
-    seed: int = 0
-    """Of the draw."""
+    seed: int = 0  # of the draw
     outline_margin: float = 0.02
     """Where outlines are given: distance around them, as a share of the long side of the photo,
     within which pixels are compared."""
@@ -127,12 +126,9 @@ class MeshBasedSettings:
 class PhotoView:
     """A photo with its camera."""
 
-    camera: Camera
-    """In the mesh's frame, of the size of the photo."""
-    photo: np.ndarray
-    """(h, w, 3) uint8, or floats whose white is 1."""
-    counted: np.ndarray | None = None
-    """(h, w) bool: pixels that may be used; all without it."""
+    camera: Camera  # in the mesh's frame, of the size of the photo
+    photo: np.ndarray  # (h, w, 3) uint8, or floats whose white is 1
+    counted: np.ndarray | None = None  # (h, w) bool: pixels that may be used; all without it.
     outline: np.ndarray | None = None
     """(h, w) bool: where the photo shows what the mesh should show. Outside of it the photo is
     taken as black, as if the thing had been photographed alone."""
@@ -175,12 +171,10 @@ class MeshBasedRendering:
     training_views: int
     training_pixels: int
     """Pixels of training photos that a face covers."""
-    samples: int
-    """Those of them that the field was fitted to."""
+    samples: int  # those of them that the field was fitted to
     training_psnr: float | None
     """dB at the samples: how well the field could follow the training photos."""
-    field_vertices: tuple[int, int]
-    """Of the fine and the coarse lattice."""
+    field_vertices: tuple[int, int]  # of the fine and the coarse lattice
     settings: MeshBasedSettings
 
     def mean(self, name: str) -> float | None:

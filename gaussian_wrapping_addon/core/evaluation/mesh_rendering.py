@@ -40,8 +40,7 @@ class TexturedView:
 
     image: np.ndarray
     """(h, w, 3) uint8; :data:`BACKGROUND` outside the mesh, blended along silhouettes."""
-    coverage: np.ndarray
-    """(h, w) float32 in [0, 1]: share of the pixel's rays that meet the mesh."""
+    coverage: np.ndarray  # (h, w) float32 in [0, 1]: share of the pixel's rays that meet the mesh
 
     @property
     def covered(self) -> np.ndarray:
@@ -190,16 +189,13 @@ OnView = Callable[[str, np.ndarray, np.ndarray], None]
 class MeshView:
     """Figures of one photo."""
 
-    name: str
-    """Name of the camera."""
+    name: str  # name of the camera
     scores: ViewScores
     covered: float
     """Share of the candidate pixels (of the mask, or of the whole photo without one) that the mesh
     covers wholly."""
-    uncovered: float
-    """Share of the candidate pixels in which no ray meets a face."""
-    whole_psnr: float
-    """PSNR over all candidate pixels, black where no face covers them, dB."""
+    uncovered: float  # share of the candidate pixels in which no ray meets a face
+    whole_psnr: float  # PSNR over all candidate pixels, black where no face covers them, dB
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; ``lpips`` only if measured."""
@@ -221,8 +217,7 @@ class MeshRenderingScore:
     """``"mask"``: pixels of the given masks; ``"covered"``: pixels that the mesh covers wholly."""
     left_out: int
     """Photos without a valid pixel, or without one on which an SSIM window can be centred."""
-    lpips_note: str = ""
-    """Why LPIPS is missing."""
+    lpips_note: str = ""  # why LPIPS is missing
 
     def mean(self, name: str) -> float | None:
         """Return the mean over the views that have the figure: a key of their JSON values."""

@@ -41,10 +41,8 @@ discrepancy: 1 / g and 1 / g^2 with g^3 = g + 1."""
 class SurfaceSamples:
     """Points on a surface, in the frame of the mesh they come from."""
 
-    points: np.ndarray
-    """(n, 3) float64."""
-    normals: np.ndarray
-    """(n, 3) float64, unit length, or 0 if unknown; oriented like the surface."""
+    points: np.ndarray  # (n, 3) float64
+    normals: np.ndarray  # (n, 3) float64, unit length, or 0 if unknown; oriented like the surface.
 
     def __len__(self) -> int:
         return len(self.points)
@@ -322,14 +320,12 @@ class Truth:
     samples: SurfaceSamples
     vertices: np.ndarray | None = None
     """(v, 3) float64, or ``None`` if only a cloud is known."""
-    faces: np.ndarray | None = None
-    """(f, 3) int."""
+    faces: np.ndarray | None = None  # (f, 3) int
     thin: np.ndarray | None = None
     """(n,) bool: the sample lies on a thin structure; ``None`` if not labelled."""
     seen: np.ndarray | None = None
     """(n,) int32: number of training cameras that see the sample; ``None`` if unknown."""
-    crop: Region | None = None
-    """Samples outside are not evaluated."""
+    crop: Region | None = None  # samples outside are not evaluated
 
     def __post_init__(self) -> None:
         count = len(self.samples)
@@ -443,8 +439,7 @@ MIN_THIN_SHARE = 0.01
 SCAN_RAYS = 4_000_000
 """Rays of a virtual scan, which steps over pixels of more: at most about 400 MB of points."""
 
-Shares = tuple[float, ...]
-"""One number in [0, 1] for each threshold."""
+Shares = tuple[float, ...]  # one number in [0, 1] for each threshold
 
 _Mesh = tuple[np.ndarray, np.ndarray]
 

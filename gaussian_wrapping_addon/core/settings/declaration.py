@@ -35,10 +35,8 @@ class Range:
     high: float = math.inf
     zero: str = ""
     """Meaning of 0, if it is allowed in addition to the range."""
-    words: str = ""
-    """Replaces the generated description."""
-    below_high: bool = False
-    """Whether ``high`` itself is excluded."""
+    words: str = ""  # replaces the generated description
+    below_high: bool = False  # whether ``high`` itself is excluded
 
     @property
     def wanted(self) -> str:
@@ -114,8 +112,7 @@ SELECTION_MODES = ("auto", "on", "off")
 """Of what is chosen by evidence in the photos where it is ``"auto"``."""
 SWITCH = ("off", "on")
 
-DEVICE = r"auto|cpu|cuda(:[0-9]{1,3})?"
-"""Pattern of the devices that a job can be given."""
+DEVICE = r"auto|cpu|cuda(:[0-9]{1,3})?"  # pattern of the devices that a job can be given
 
 COMPUTERS = r"|local|(tcp|tls)://(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253}):[0-9]{1,5}"
 """Pattern of where the parts of a job run; empty: here, in one process."""
@@ -141,8 +138,7 @@ MAX_LODS = 8
 TEXTURE_SOURCES = ("photos", "gaussians")
 UV_CHOICES = ("auto", "own", "new")
 """Of a mesh from elsewhere; ``"auto"``: its own if it has any."""
-UP_AXES = ("auto", "y", "z")
-"""Of a mesh file; ``"auto"``: as the format is exported."""
+UP_AXES = ("auto", "y", "z")  # Of a mesh file; ``"auto"``: as the format is exported.
 
 
 # -- Declare a setting once, as a field of a settings class with metadata -------------------------
@@ -174,8 +170,7 @@ PanelName = Literal[
 ]  # fmt: skip
 """A panel in Blender."""
 
-JOB = "job"
-"""Group of the settings that are direct fields of the job's settings."""
+JOB = "job"  # group of the settings that are direct fields of the job's settings
 
 _SCOPES: Mapping[str, Scope] = {
     JOB: "training", "training": "training", "meshing": "region", "texture": "region",
@@ -190,19 +185,14 @@ _PANEL_NAMES: Mapping[str, PanelName] = {
 class Option:
     """How a setting is given on the command line."""
 
-    name: str = ""
-    """With its leading dashes; empty: the setting's."""
+    name: str = ""  # With its leading dashes; empty: the setting's.
     metavar: str = ""
     help: str = ""
     """Replaces the setting's help."""
-    scope: Scope | None = None
-    """``None``: by the setting's group."""
-    exclusive: str = ""
-    """Options with the same name here exclude each other."""
-    flag: str = ""
-    """If not empty, the option takes no value and sets the setting to this word."""
-    many: bool = False
-    """Whether it takes several values and may be repeated."""
+    scope: Scope | None = None  # ``None``: by the setting's group
+    exclusive: str = ""  # options with the same name here exclude each other
+    flag: str = ""  # if not empty, the option takes no value and sets the setting to this word
+    many: bool = False  # whether it takes several values and may be repeated
     own: bool = False
     """Whether it is an option of its own; others are given as ``--set NAME=VALUE``."""
     parse: Callable[[Any], Any] | None = None
@@ -239,12 +229,9 @@ class PanelProperty:
     description: str
     name: str = ""
     """Name of the property; empty uses the setting's."""
-    items: tuple[Item, ...] = ()
-    """Entries of an enum; identifiers are the values in upper case."""
-    default: Any = None
-    """Default of the property, if it differs from the setting's."""
-    preset_if_zero: bool = False
-    """Whether 0, the property's default, uses the preset's number."""
+    items: tuple[Item, ...] = ()  # Entries of an enum; identifiers are the values in upper case.
+    default: Any = None  # default of the property, if it differs from the setting's
+    preset_if_zero: bool = False  # whether 0, the property's default, uses the preset's number
     low: float | None = None
     """Smallest number, if it differs from the smallest that the check allows."""
     soft_low: float | None = None
@@ -255,16 +242,11 @@ class PanelProperty:
     subtype: str = ""
     unit: str = ""
     """Blender's subtype and unit, such as ``"DISTANCE"`` and ``"LENGTH"``."""
-    owner: Owner | None = None
-    """``None``: by the setting's group."""
-    panel_name: PanelName | None = None
-    """The panel; ``None``: by the setting's group."""
-    order: int = 100
-    """Position within the panel; equal numbers keep the order of declaration."""
-    drawn_label: str = ""
-    """Shorter label in the panel, if its title provides the context."""
-    expand: bool = False
-    """Whether all entries of an enum are shown side by side."""
+    owner: Owner | None = None  # ``None``: by the setting's group
+    panel_name: PanelName | None = None  # The panel; ``None``: by the setting's group.
+    order: int = 100  # Position within the panel; equal numbers keep the order of declaration.
+    drawn_label: str = ""  # shorter label in the panel, if its title provides the context
+    expand: bool = False  # whether all entries of an enum are shown side by side
     shown_if: tuple[str, str | bool | int] | None = None
     """Property of the scene and its value for which this one is shown."""
     default_if_hidden: bool = False
@@ -286,15 +268,12 @@ class Declaration:
     panel: PanelProperty | None = None
     model_selection: bool = False
     """Whether it selects a part of the model: ``--needs`` sets all of these."""
-    affects_result: bool = True
-    """Whether the result depends on it; if not, stage keys exclude it."""
+    affects_result: bool = True  # Whether the result depends on it; if not, stage keys exclude it.
     since: str = ""
     """Version that added it; empty: 0.1.0. Stage keys exclude a later setting at its default, so
     that results of earlier versions stay valid."""
-    path: str = ""
-    """Dotted, within the job's settings, such as ``"training.iterations"``."""
-    kind: Any = None
-    """The type: ``int``, ``float``, ``str`` or ``tuple[str, ...]``."""
+    path: str = ""  # dotted, within the job's settings, such as ``"training.iterations"``
+    kind: Any = None  # the type: ``int``, ``float``, ``str`` or ``tuple[str, ...]``
 
     @property
     def name(self) -> str:

@@ -46,8 +46,7 @@ from .training import TrainingSettings
 # -- Settings of a job's engine: on which processes and computers its parts run -------------------
 
 
-LOCAL = "local"
-"""A cluster of this computer, made for a job and gone with it."""
+LOCAL = "local"  # a cluster of this computer, made for a job and gone with it
 
 
 # -- Printed markers as a setting: dictionary and side, such as ``4x4_50:0.05`` -------------------
@@ -68,10 +67,8 @@ MARKERS_WANTED = "DICTIONARY:SIZE, such as 4x4_50:0.05, the size in metres"
 class MarkerSpec:
     """Which markers were printed."""
 
-    dictionary: str
-    """A name of :data:`MARKER_DICTIONARIES`."""
-    side_m: float
-    """Side of the black square, metres."""
+    dictionary: str  # a name of :data:`MARKER_DICTIONARIES`
+    side_m: float  # side of the black square, metres
 
 
 def marker_spec(text: str) -> MarkerSpec | None:
@@ -521,22 +518,18 @@ FORMAT: Final = "GaussianWrappingSettings"
 VERSION: Final = 1
 MAX_BYTES: Final = 64 * 1024
 """A file with every setting has about 2 kB."""
-MAX_NOTES: Final = 5
-"""Of a file that holds something else; the others are counted."""
-_SHOWN_NAME: Final = 40
-"""Characters of an unknown entry that a note shows."""
+MAX_NOTES: Final = 5  # Of a file that holds something else; the others are counted.
+_SHOWN_NAME: Final = 40  # characters of an unknown entry that a note shows
 
 
 @dataclass(frozen=True)
 class SavedSettings:
     """Contents of a file of saved settings."""
 
-    values: dict[str, Any]
-    """By path; 0 leaves a number to the preset."""
+    values: dict[str, Any]  # By path; 0 leaves a number to the preset.
     panel: dict[str, Any]
     """Choices of the panel that are no settings of a job, by property, not validated."""
-    notes: tuple[str, ...]
-    """What was left out, a sentence each."""
+    notes: tuple[str, ...]  # what was left out, a sentence each
 
 
 def savable_settings() -> list[Declaration]:

@@ -26,17 +26,14 @@ from .matching import NO_PRIOR, MatchingLevel, grey_levels, in_image, source_vie
 # -- Planes of triangles between points whose depth is known (docs/method.md, section 11.6) -------
 
 
-LEAST_COSINE = 0.15
-"""Between ray and normal: steeper triangles mostly bridge the edge of a thing."""
+LEAST_COSINE = 0.15  # between ray and normal: steeper triangles mostly bridge the edge of a thing
 
 HIDDEN_SHARE = 1.25
 """A point this much farther away than the nearest one of its cell counts as hidden."""
 
-BEHIND_SHARE = 1.05
-"""A point this much farther away than the pixel's own depth is hidden."""
+BEHIND_SHARE = 1.05  # a point this much farther away than the pixel's own depth is hidden
 
-_CELLS = 24
-"""Cells along the long side of an image."""
+_CELLS = 24  # cells along the long side of an image
 
 _LEAST_AREA = 1e-9
 
@@ -120,8 +117,7 @@ _logger = logging.getLogger(__name__)
 COARSE_SWEEPS, COARSE_GEOMETRIC_SWEEPS, FINE_SWEEPS = 3, 2, 2
 """Sweeps at the coarse level before and after photos are compared, and at the fine level."""
 
-GEOMETRIC_COST = 0.15
-"""Of a pixel of forward-backward error."""
+GEOMETRIC_COST = 0.15  # of a pixel of forward-backward error
 
 RANDOM_SHARE = 0.25
 """Share of the pixels that start with a random plane although triangles cover them."""
@@ -129,8 +125,7 @@ RANDOM_SHARE = 0.25
 NEAREST_FACTOR, FARTHEST_FACTOR = 1.5, 0.02
 """Range of the inverse depths over that of the sparse points."""
 
-FEW_POINTS = 20
-"""A photo with fewer of them takes the range from all points."""
+FEW_POINTS = 20  # a photo with fewer of them takes the range from all points
 
 MOST_PIXELS = 12_000_000
 """Of all photos together at that size; more photos are matched at a smaller one."""
@@ -159,23 +154,17 @@ TEXTURE_VARIANCE = 20.0
 class DepthMap:
     """What stereo found in one photo."""
 
-    camera: Camera
-    """Of this size, scene frame."""
-    depth: np.ndarray
-    """(h, w) float32 z-depth of the best plane, scene units, confirmed or not."""
-    normal: np.ndarray
-    """(h, w, 3) float32 unit normals towards the camera, scene frame."""
+    camera: Camera  # of this size, scene frame
+    depth: np.ndarray  # (h, w) float32 z-depth of the best plane, scene units, confirmed or not
+    normal: np.ndarray  # (h, w, 3) float32 unit normals towards the camera, scene frame
     confidence: np.ndarray
     """(h, w) float32 in [0, 1], 0 where sources do not confirm the depth or a mask excludes the
     pixel; an order, no probability."""
-    agreeing: np.ndarray
-    """(h, w) uint8 number of sources whose depth agrees."""
+    agreeing: np.ndarray  # (h, w) uint8 number of sources whose depth agrees
     cost: np.ndarray
     """(h, w) float32 mean cost in the two best sources; about 1 where nothing matches."""
-    color: np.ndarray
-    """(h, w, 3) uint8."""
-    mask: np.ndarray | None
-    """(h, w) bool, true where the photo counts."""
+    color: np.ndarray  # (h, w, 3) uint8
+    mask: np.ndarray | None  # (h, w) bool, true where the photo counts
     free: np.ndarray | None = None
     """(h, w) float32 z-depth of parts without texture but for their borders, 0 elsewhere: the
     photo shows nothing before it. ``None`` until such parts were looked for."""
@@ -419,14 +408,11 @@ def least_divisor(side_px: float, pixels: float, most_px: int) -> int:
 # -- Parts of photos where stereo finds nothing: sky, far distance, what other photos do not show
 
 
-CELL_PX = 8
-"""Side of the cells of a photo, at the size it was matched at."""
+CELL_PX = 8  # side of the cells of a photo, at the size it was matched at
 
-OPEN_SHARE = 0.75
-"""Share of a cell's pixels that must be unexplained for the cell to be open."""
+OPEN_SHARE = 0.75  # share of a cell's pixels that must be unexplained for the cell to be open
 
-BEHIND_COST = 0.7
-"""Matching cost from which a pixel is unexplained: nothing matches."""
+BEHIND_COST = 0.7  # matching cost from which a pixel is unexplained: nothing matches
 
 
 def open_cells(depth_map: DepthMap) -> np.ndarray:
@@ -466,8 +452,7 @@ def by_cell(image: np.ndarray) -> np.ndarray:
 # -- Points with normals, colours and sizes from depth maps (docs/method.md, section 11.7) --------
 
 
-LIKE_NORMAL = 0.7
-"""Least cosine between the normals of pixels of one surface."""
+LIKE_NORMAL = 0.7  # least cosine between the normals of pixels of one surface
 
 OUTLIER_SIGMAS = 1.5
 """Pixels farther from the mean along the normal are left out of the second mean."""
@@ -589,20 +574,16 @@ def _cells(pixels: DensePoints, size: float) -> np.ndarray:
 MOST_COST = 0.7
 """A depth that no source confirms is a guess if it costs less; else nothing is known."""
 
-UNCONFIRMED_WEIGHT = 0.2
-"""Weight of a depth that no source confirms; each source adds as much."""
+UNCONFIRMED_WEIGHT = 0.2  # Weight of a depth that no source confirms; each source adds as much.
 
-CLEARANCE = 0.5
-"""Sizes of a point from confirmed ones within which it is left out."""
+CLEARANCE = 0.5  # sizes of a point from confirmed ones within which it is left out
 
 SEEN_THROUGH_SHARE = 0.03
 """A confirmed depth this much larger than a point's sees through the point."""
 
-SEEN_THROUGH_VIEWS = 2
-"""Views that must see through a point for it to be left out."""
+SEEN_THROUGH_VIEWS = 2  # views that must see through a point for it to be left out
 
-OPEN_VIEWS = 2
-"""Views that must show a point where nothing matches for it to be left out."""
+OPEN_VIEWS = 2  # views that must show a point where nothing matches for it to be left out
 
 
 def fill_gaps(depth_maps: Sequence[DepthMap], confirmed: DensePoints, wanted: int) -> DensePoints:
@@ -669,12 +650,10 @@ and there training finds the surface better than windows do."""
 class DepthPrior:
     """What is known of the depths of one photo."""
 
-    camera: Camera
-    """Of this size, scene frame."""
+    camera: Camera  # of this size, scene frame
     depth: np.ndarray
     """(h, w) float32 z-depth, scene units; 0 where nothing is confirmed or planar."""
-    confidence: np.ndarray
-    """(h, w) float32 in [0, 1]; 0 where nothing is confirmed."""
+    confidence: np.ndarray  # (h, w) float32 in [0, 1]; 0 where nothing is confirmed.
     known: np.ndarray
     """(h, w) float32 confirmed z-depth, of planes or not; 0 where nothing is confirmed."""
     free: np.ndarray

@@ -45,11 +45,9 @@ confirmed."""
 BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG = 12.0, 5.0, 12.0
 """Angle between two rays to a point at which matching is best, and how fast it gets worse."""
 
-LEAST_GAIN = 1e-3
-"""Least share of the points for which a source is of use."""
+LEAST_GAIN = 1e-3  # least share of the points for which a source is of use
 
-_MOST_POINTS = 1500
-"""Points that decide, subsampled from those given."""
+_MOST_POINTS = 1500  # points that decide, subsampled from those given
 
 
 def source_views(cameras: Sequence[Camera], points: np.ndarray) -> list[np.ndarray]:
@@ -113,17 +111,13 @@ def _sources_of(view: int, inside: np.ndarray, scale: np.ndarray, rays: np.ndarr
 KEPT_SOURCES = 2
 """Sources in which a pixel is judged: its best ones. The others may not see its surface."""
 
-REFINEMENTS = 2
-"""Random changes tried per pixel and sweep, the second half as large as the first."""
+REFINEMENTS = 2  # random changes tried per pixel and sweep, the second half as large as the first
 
-LEAST_COSINE = F32(0.12)
-"""Between ray and normal, 83 degrees: more grazing planes are not tried."""
+LEAST_COSINE = F32(0.12)  # between ray and normal, 83 degrees: more grazing planes are not tried
 
-GOOD_COST = F32(0.3)
-"""A pixel that costs less in the sources it kept is not judged in the others."""
+GOOD_COST = F32(0.3)  # a pixel that costs less in the sources it kept is not judged in the others
 
-RANDOM_ABOVE = F32(0.5)
-"""A random plane is tried where the cost is at least this."""
+RANDOM_ABOVE = F32(0.5)  # a random plane is tried where the cost is at least this
 
 SAME_SHARE = F32(0.001)
 """Planes nearer than this share of the depth over the whole window are the same: under 0.1 px."""
@@ -132,8 +126,7 @@ NEAR_VARIANCE_PX = 25.0
 ALIKE_LEVELS = 12.0
 """Widths of the two factors of a sample's weight: distance from the centre, difference in grey."""
 
-NORMAL_SPREAD = F32(20)
-"""Relative change of the normal per relative change of the depth, at most 1."""
+NORMAL_SPREAD = F32(20)  # relative change of the normal per relative change of the depth, at most 1
 
 PRIOR_STRENGTH, PRIOR_TEXTURE, PRIOR_SHARE = F32(0.25), F32(20), F32(0.01)
 """Largest cost of leaving the prior's plane; variance of grey at which half of it is left; share of
@@ -357,8 +350,7 @@ _FIRST_SPAN, _LATER_SPAN = 0.1, 0.02
 _MEAN_PX = 5
 """Side of the window over which grey levels are averaged to compare the brightness of photos."""
 
-_MOST_SEED = 2**32 - 1
-"""Seeds of a sweep lie between 1 and this: the generator would stay at 0."""
+_MOST_SEED = 2**32 - 1  # seeds of a sweep lie between 1 and this: the generator would stay at 0
 
 NO_PRIOR = np.zeros((0, 0, 3), np.float32)
 NO_DEPTHS = np.zeros(1, np.float32)

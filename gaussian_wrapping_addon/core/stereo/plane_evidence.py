@@ -30,8 +30,7 @@ from .plane_fitting import (
 # -- Kernels that look points up in all photos ----------------------------------------------------
 
 
-AGREEING, ALIKE, THROUGH, UNLIKE, NEARER = range(5)
-"""Columns of what :func:`count_votes` counts."""
+AGREEING, ALIKE, THROUGH, UNLIKE, NEARER = range(5)  # columns of what :func:`count_votes` counts
 
 AGREEING_SHARE = 0.02
 """Largest relative difference of a point's depth and a photo's own, of those that agree."""
@@ -169,8 +168,7 @@ def correlate(
 # -- All photos packed, to ask them what they say about points on a plane -------------------------
 
 
-MOST_ASKED = 40
-"""Photos asked about the points of one; a regular choice of more."""
+MOST_ASKED = 40  # Photos asked about the points of one; a regular choice of more.
 
 LEAST_SHOWN = 0.9
 """Share of the pixels that must show a plane; photos need not be asked about another."""
@@ -178,18 +176,15 @@ LEAST_SHOWN = 0.9
 GAIN_PIXELS, LEAST_PAIRS = 600, 30
 """Confirmed pixels of a photo that gains are measured on, and least number of a pair of photos."""
 
-_DARK = 4.0
-"""Added to colours before ratios are taken, so that dark pixels do not decide."""
+_DARK = 4.0  # added to colours before ratios are taken, so that dark pixels do not decide
 
 
 @dataclass(frozen=True)
 class Votes:
     """What the other photos say about points, as shares of all that could contradict."""
 
-    like: float
-    """Depth agrees, or nothing is known there and the colour is like."""
-    through: float
-    """The depth there lies behind."""
+    like: float  # depth agrees, or nothing is known there and the colour is like
+    through: float  # the depth there lies behind
 
 
 @dataclass(frozen=True)
@@ -325,22 +320,18 @@ MOST_NOISE_LEVELS, MOST_COARSENING = 0.2, 4.0
 Noise lowers every correlation: those of a rendered room's true planes fell to .13 to .31
 where its photos were matched at full size."""
 
-NOISY_PHOTOS = 0.8
-"""Quantile of the photos' noise that the scales are made for."""
+NOISY_PHOTOS = 0.8  # quantile of the photos' noise that the scales are made for
 
 STEPS = ((0.01, 0.005), (0.0025, 0.00125, 0.0006, 0.0003))
 """Of the search at each scale, as shares of the depth at the edges of the plane's segments."""
-TURNS = 6
-"""Most turns of the search with one step."""
+TURNS = 6  # most turns of the search with one step
 
 PENALTY, PENALTY_STEP = 0.03, 0.015
 """Correlation that a change of the plane by such a share of the depth must gain at least."""
 
-CLIPPED_LEVELS = 4.0
-"""Texture is clipped at this many grey levels."""
+CLIPPED_LEVELS = 4.0  # texture is clipped at this many grey levels
 
-MOST_SAMPLES, LEAST_SAMPLES = 1200, 200
-"""Pixels of a segment that take part, and that it needs to."""
+MOST_SAMPLES, LEAST_SAMPLES = 1200, 200  # pixels of a segment that take part, and that it needs to
 
 MOST_SOURCES = 6
 LEAST_INSIDE = 0.3

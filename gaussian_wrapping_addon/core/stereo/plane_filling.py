@@ -37,11 +37,9 @@ from .plane_fitting import (
 # -- Which plane, or which two, a plain segment lies on -------------------------------------------
 
 
-LEAST_BORDER = 0.12
-"""Share of a segment's known depths, weighed, that its plane must explain."""
+LEAST_BORDER = 0.12  # share of a segment's known depths, weighed, that its plane must explain
 
-PAIR_GAIN = 0.06
-"""Share that a second plane must explain besides."""
+PAIR_GAIN = 0.06  # share that a second plane must explain besides
 
 LEAST_LIKE = 0.85
 """Share of the other photos' votes that must not contradict a plane (:class:`.Votes`)."""
@@ -53,8 +51,7 @@ photos."""
 LATER_SPREAD = 0.12
 """As :data:`~.plane_fitting.LEAST_SPREAD`, once planes are known from several photos."""
 
-FEW_VIEWS = 2.0
-"""A plane of n views counts n / (n + this)."""
+FEW_VIEWS = 2.0  # a plane of n views counts n / (n + this)
 
 MOST_RANKED, MOST_PAIRED, MOST_TRIED = 14, 6, 20
 """Planes of a segment that are looked at, of these put together in pairs, and choices whose votes
@@ -71,8 +68,7 @@ ground goes on beyond a rod."""
 NEIGHBOURS, SPREADING_TURNS = 3, 4
 
 
-FAR_DISTANCE = 1e6
-"""Of points that stand for what lies too far away for parallax, scene units."""
+FAR_DISTANCE = 1e6  # of points that stand for what lies too far away for parallax, scene units
 
 FAR_SHARE, FAR_VOTES = 0.85, 2.0
 """Share of the other photos' votes that must be for the same colour and unknown depth, and votes a
@@ -294,16 +290,12 @@ _logger = logging.getLogger(__name__)
 LEAST_UNKNOWN = 0.4
 """Share of a large segment's pixels without confirmed depth from which it is looked into."""
 
-TURNS = 3
-"""Turns of assigning segments and fitting planes; the planes are aligned after the last."""
+TURNS = 3  # Turns of assigning segments and fitting planes; the planes are aligned after the last.
 
-LEAST_VIEWS = 2
-"""Photos whose segments a plane needs after the first turn."""
+LEAST_VIEWS = 2  # photos whose segments a plane needs after the first turn
 
-NORMAL_COSINE = 0.95
-"""Of a confirmed pixel's normal with that of a plane it is fitted to."""
-FITTED_SHARE = 0.03
-"""Distance of such a pixel from the plane over that from the camera, at most."""
+NORMAL_COSINE = 0.95  # of a confirmed pixel's normal with that of a plane it is fitted to
+FITTED_SHARE = 0.03  # distance of such a pixel from the plane over that from the camera, at most
 FITTED_PIXELS, LEAST_FITTED = 1500, 300
 """Of a segment at most; known depths of any normal are taken where a plane has fewer in all."""
 
@@ -318,8 +310,7 @@ AGREEING_PER_THROUGH, AGREEING_PER_NEARER = 2, 0.5
 """Photos that must agree with a filled pixel for each that sees through it or shows something
 before it."""
 
-KEPT_SHARE = 0.003
-"""A confirmed depth that differs less from the plane is kept."""
+KEPT_SHARE = 0.003  # a confirmed depth that differs less from the plane is kept
 
 FILLED_CONFIDENCE, FILLED_AGREEING = 0.5, 2
 

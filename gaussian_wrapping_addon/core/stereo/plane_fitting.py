@@ -18,8 +18,7 @@ from .depth_maps import DepthMap, points_in_view
 # -- Noise of photos in their plain parts (docs/method.md, section 11.12) -------------------------
 
 
-DARKEST, BRIGHTEST = 1.0, 254.0
-"""Grey levels between which noise shows."""
+DARKEST, BRIGHTEST = 1.0, 254.0  # grey levels between which noise shows
 
 SIDES_PX = (1, 2)
 """Of the squares whose means are looked at. Resizing and JPEG take noise of single pixels away and
@@ -93,21 +92,17 @@ SMOOTHING_PX = (0.7, 1.0, 1.4, 2.0, 2.8)
 CLEAR_OF_NOISE = 4.5
 """The first width is taken at which that difference is so many standard deviations of noise."""
 
-LEAST_SHARE = 0.0008
-"""Of the pixels of a photo that a segment needs."""
+LEAST_SHARE = 0.0008  # of the pixels of a photo that a segment needs
 
 LARGE_SHARE = 0.004
 """Of the pixels of a photo from which a segment proposes planes; smaller ones may take over those
 of their neighbours."""
 
-BORDER_PX = 5
-"""Width of the band around a segment whose confirmed depths count."""
+BORDER_PX = 5  # width of the band around a segment whose confirmed depths count
 
-MOST_BORDER = 600
-"""Known depths of a segment, at most; a regular choice of more."""
+MOST_BORDER = 600  # Known depths of a segment, at most; a regular choice of more.
 
-SPARSE_WEIGHT = 3.0
-"""Of a sparse point inside a segment; confirmed pixels of the border weigh 1."""
+SPARSE_WEIGHT = 3.0  # Of a sparse point inside a segment; confirmed pixels of the border weigh 1.
 
 INSIDE_WEIGHT = 0.3
 """Of a confirmed pixel inside: windows without texture also agree where they should not."""
@@ -117,8 +112,7 @@ INSIDE_WEIGHT = 0.3
 class Segment:
     """Connected pixels without texture."""
 
-    view: int
-    """Number of the depth map."""
+    view: int  # number of the depth map
     rows: np.ndarray  # (p,) int64
     columns: np.ndarray  # (p,) int64
     places: np.ndarray  # (b, 2) float64 pixels of known depths in and around it, centres whole
@@ -267,12 +261,9 @@ class Plane:
     center: np.ndarray  # (3,) of the points
     points: np.ndarray  # (n, 3)
     weights: np.ndarray  # (n,) over squared depth, so that residuals count relative to it
-    support: float
-    """Sum of the weights of the known depths of segments."""
-    views: frozenset[int]
-    """Depth maps whose segments speak for it."""
-    distance: float
-    """Of the points from a camera that sees them."""
+    support: float  # sum of the weights of the known depths of segments
+    views: frozenset[int]  # depth maps whose segments speak for it
+    distance: float  # of the points from a camera that sees them
 
     def moved(self, normal: np.ndarray, offset: float) -> Plane:
         """Return the same evidence for another place."""
@@ -376,8 +367,7 @@ FULL_SPREAD, LEAST_SPREAD = 0.5, 0.25
 a proposal counts fully, and which it needs: depths along a single edge, as where a wall meets the
 floor, fit every plane through that edge."""
 
-SAME_INLIERS = 0.7
-"""Share of inliers in common with a better proposal from which one is left out."""
+SAME_INLIERS = 0.7  # share of inliers in common with a better proposal from which one is left out
 
 
 def proposed_planes(

@@ -282,14 +282,11 @@ def _text(value: Any) -> str:
 # -- Warnings of a report: those of the stages, and those derived from its figures ----------------
 
 
-FEW_HELD_OUT = 3
-"""The mean over fewer photos is not reliable."""
+FEW_HELD_OUT = 3  # the mean over fewer photos is not reliable
 
-LOW_COVERAGE = 0.5
-"""Below half, most of the texture is filled in and not photographed."""
+LOW_COVERAGE = 0.5  # below half, most of the texture is filled in and not photographed
 
-GAP_DB = 20.0 * math.log10(2.0)
-"""Held-out photos have more than twice the error of training photos."""
+GAP_DB = 20.0 * math.log10(2.0)  # held-out photos have more than twice the error of training photos
 
 TEXELLESS_SHARE = 0.005
 """Share of the area in faces smaller than a texel that is worth a warning: scattered slivers take
@@ -298,18 +295,15 @@ the colour of their neighbours."""
 MAX_RESIDUAL = 0.25
 """``|v - 0.5|`` beyond which a vertex is nearer to "empty" or "solid" than to the surface."""
 
-REPROJECTION_PX = 2.0
-"""Half of the 4 px at which structure from motion rejects a point."""
+REPROJECTION_PX = 2.0  # half of the 4 px at which structure from motion rejects a point
 
 
 @dataclass(frozen=True)
 class StageWarning:
     """One warning of one stage."""
 
-    stage: str
-    """``cameras``, ``training``, ``mesh NAME`` or ``texture NAME``."""
-    code: str
-    """Stable identifier; empty for texts of version 0.1.0."""
+    stage: str  # ``cameras``, ``training``, ``mesh NAME`` or ``texture NAME``
+    code: str  # Stable identifier; empty for texts of version 0.1.0.
     text: str
     hint: str = ""
     """What the user can do; empty if no remedy is known."""

@@ -182,14 +182,11 @@ def write_svg(panels: Sequence[Panel], path: Path, *, columns: int = 3) -> None:
 # -- Pictures of a report: held-out photos beside their renderings, and the learning curve --------
 
 
-MAX_PICTURES = 4
-"""Number of held-out photos shown: the worst, the best, and some between."""
+MAX_PICTURES = 4  # number of held-out photos shown: the worst, the best, and some between
 
-STRIP_PX = 1500
-"""Maximum width of a strip of three images; a wider one is scaled down."""
+STRIP_PX = 1500  # Maximum width of a strip of three images; a wider one is scaled down.
 
-ERROR_GAIN = 4.0
-"""Factor applied to the errors: the scale ends at a quarter of full brightness."""
+ERROR_GAIN = 4.0  # factor applied to the errors: the scale ends at a quarter of full brightness
 
 GAP_PX = 6
 CAPTION_PX = 24
