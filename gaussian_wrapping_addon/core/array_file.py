@@ -36,13 +36,9 @@ _HEADERS = {
 
 
 def read_arrays(
-    path: Path,
-    names: Iterable[str] | None = None,
-    *,
-    optional: Iterable[str] = (),
-    most_bytes: int | None = None,
-    hint: str = "",
-) -> dict[str, np.ndarray]:
+    path: Path, names: Iterable[str] | None = None, *, optional: Iterable[str] = (),
+    most_bytes: int | None = None, hint: str = "",
+) -> dict[str, np.ndarray]:  # fmt: skip
     """Read arrays of a file written by ``numpy.savez``.
 
     Parameters

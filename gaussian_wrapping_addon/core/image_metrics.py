@@ -332,13 +332,9 @@ def ssim(
 
 
 def score_images(
-    image: np.ndarray,
-    photo: np.ndarray,
-    mask: np.ndarray | None = None,
-    *,
-    lpips: Lpips | None = None,
-    threads: int = 1,
-) -> ViewScores:
+    image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None, *,
+    lpips: Lpips | None = None, threads: int = 1,
+) -> ViewScores:  # fmt: skip
     """Return all metrics of an image and its photo, as for :func:`psnr`.
 
     PSNR is over the pixels of the mask; SSIM over the windows centred on them, both images black
@@ -369,14 +365,9 @@ def has_windows(shape: tuple[int, ...], mask: np.ndarray | None = None) -> bool:
 
 
 def compare(
-    image: np.ndarray,
-    photo: np.ndarray,
-    mask: np.ndarray | None = None,
-    *,
-    weights: tuple[float, float] | None = None,
-    threads: int = 1,
-    out: np.ndarray | None = None,
-) -> Comparison:
+    image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None, *,
+    weights: tuple[float, float] | None = None, threads: int = 1, out: np.ndarray | None = None,
+) -> Comparison:  # fmt: skip
     """Return the mean errors and the mean SSIM, with their gradient if weights are given.
 
     The window of SSIM is 11 x 11, Gaussian with sigma 1.5, "valid" padding. With a mask, both

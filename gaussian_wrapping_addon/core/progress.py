@@ -45,15 +45,10 @@ class Progress:
     """
 
     def __init__(
-        self,
-        stage: str = "",
-        sink: Callable[[ProgressEvent], None] | None = None,
-        is_cancelled: Callable[[], bool] | None = None,
-        *,
-        start: float = 0.0,
-        end: float = 1.0,
+        self, stage: str = "", sink: Callable[[ProgressEvent], None] | None = None,
+        is_cancelled: Callable[[], bool] | None = None, *, start: float = 0.0, end: float = 1.0,
         begun_s: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.stage, self._sink, self._is_cancelled = stage, sink, is_cancelled
         self._start, self._end = start, end
         self._begun_s = time.monotonic() if begun_s is None else begun_s

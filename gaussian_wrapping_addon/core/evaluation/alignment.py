@@ -135,16 +135,10 @@ class TanksRefinement:
 
 
 def icp(
-    source: np.ndarray,
-    target: np.ndarray,
-    start: Similarity,
-    *,
-    max_distance: float,
-    iterations: int = ICP_ITERATIONS,
-    with_scale: bool,
-    tolerance: float = ICP_TOLERANCE,
+    source: np.ndarray, target: np.ndarray, start: Similarity, *, max_distance: float,
+    iterations: int = ICP_ITERATIONS, with_scale: bool, tolerance: float = ICP_TOLERANCE,
     threads: int = 1,
-) -> IcpResult:
+) -> IcpResult:  # fmt: skip
     """Refine an alignment by the iterative closest point algorithm.
 
     Point to point (Besl and McKay 1992). It ends when no correspondence changes, when fitness and
@@ -220,14 +214,9 @@ def icp(
 
 
 def refine_as_tanks(
-    source: np.ndarray,
-    target: np.ndarray,
-    start: Similarity,
-    threshold: float,
-    *,
-    inside: Callable[[np.ndarray], np.ndarray],
-    threads: int = 1,
-) -> TanksRefinement:
+    source: np.ndarray, target: np.ndarray, start: Similarity, threshold: float, *,
+    inside: Callable[[np.ndarray], np.ndarray], threads: int = 1,
+) -> TanksRefinement:  # fmt: skip
     """Refine an alignment as Tanks and Temples does: ICP with scale in three stages.
 
     See docs/method.md, section 9.1.

@@ -176,22 +176,10 @@ def _harmonics(x: Any, y: Any, z: Any, basis: Any) -> None:
 
 @kernel(fast=True)
 def normal_product(
-    begin: int,
-    end: int,
-    coarse_starts: Any,
-    fine_starts: Any,
-    fine_corners: Any,
-    coarse_corners: Any,
-    places: Any,
-    sub_places: Any,
-    directions: Any,
-    colors: Any,
-    share: Any,
-    fine: Any,
-    coarse: Any,
-    fine_sums: Any,
-    coarse_sums: Any,
-) -> None:
+    begin: int, end: int, coarse_starts: Any, fine_starts: Any, fine_corners: Any,
+    coarse_corners: Any, places: Any, sub_places: Any, directions: Any, colors: Any, share: Any,
+    fine: Any, coarse: Any, fine_sums: Any, coarse_sums: Any,
+) -> None:  # fmt: skip
     """Write ``A^T (A p - share y)`` of the coarse cells from begin to end, by cell and corner.
 
     ``coarse_starts`` (c + 1,) numbers the fine cells of each coarse cell, ``fine_starts`` (f + 1,)
@@ -264,16 +252,9 @@ def normal_product(
 
 @kernel(fast=True)
 def diagonal(
-    begin: int,
-    end: int,
-    coarse_starts: Any,
-    fine_starts: Any,
-    places: Any,
-    sub_places: Any,
-    directions: Any,
-    fine_sums: Any,
-    coarse_sums: Any,
-) -> None:
+    begin: int, end: int, coarse_starts: Any, fine_starts: Any, places: Any, sub_places: Any,
+    directions: Any, fine_sums: Any, coarse_sums: Any,
+) -> None:  # fmt: skip
     """Write the diagonal of ``A^T A`` by cell and corner: (f, 8, 1) and (c, 8, 9)."""
     weights = np.empty(8, np.float32)
     basis = np.empty(9, np.float32)
@@ -317,17 +298,9 @@ def gather(begin: int, end: int, incident: Any, sums: Any, out: Any) -> None:
 
 @kernel(fast=True)
 def field_colors(
-    begin: int,
-    end: int,
-    fine_vertices: Any,
-    coarse_vertices: Any,
-    places: Any,
-    coarse_places: Any,
-    directions: Any,
-    fine: Any,
-    coarse: Any,
-    out: Any,
-) -> None:
+    begin: int, end: int, fine_vertices: Any, coarse_vertices: Any, places: Any,
+    coarse_places: Any, directions: Any, fine: Any, coarse: Any, out: Any,
+) -> None:  # fmt: skip
     """Write the colours (n, 3) at points whose corners are given, -1 where there is no vertex.
 
     A missing fine vertex has the value 0; missing coarse ones leave their weight to the others.
@@ -419,13 +392,9 @@ class ColorField:
 
 
 def fit_color_field(
-    samples: Samples,
-    contraction: Contraction,
-    settings: ColorFieldSettings,
-    progress: Progress,
-    *,
-    threads: int = 1,
-) -> ColorField:
+    samples: Samples, contraction: Contraction, settings: ColorFieldSettings, progress: Progress,
+    *, threads: int = 1,
+) -> ColorField:  # fmt: skip
     """Return the field of least squared error at the samples, by conjugate gradients.
 
     There must be a sample; the result does not depend on ``threads``.
@@ -471,18 +440,13 @@ class _System:
         view = np.full(COARSE_VALUES, settings.view_ridge, np.float32)
         view[:3] = settings.mean_ridge
         return cls(
-            cell,
-            mean,
-            (fine, coarse),
-            np.append(coarse_first, len(fine_keys)),
-            np.append(first, len(keys)),
-            np.ascontiguousarray(places[order]),
+            cell, mean, (fine, coarse), np.append(coarse_first, len(fine_keys)),
+            np.append(first, len(keys)), np.ascontiguousarray(places[order]),
             ((fine_indices % RATIO) / RATIO).astype(np.float32),
             np.ascontiguousarray(samples.directions[order], np.float32),
             np.ascontiguousarray(samples.colors[order] - mean, np.float32),
-            (np.full(3, settings.fine_ridge, np.float32), view),
-            threads,
-        )
+            (np.full(3, settings.fine_ridge, np.float32), view), threads,
+        )  # fmt: skip
 
     def solve(self, iterations: int, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
         """Run conjugate gradients from 0 with the diagonal as preconditioner."""

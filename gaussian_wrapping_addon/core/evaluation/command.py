@@ -150,12 +150,9 @@ def read_cameras(path: Path) -> list[Camera]:
 
 
 def evaluate_mesh(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    cameras: Sequence[Camera],
-    request: EvaluationRequest,
+    vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera], request: EvaluationRequest,
     progress: Progress,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Align and score a mesh of vertices (v, 3) and faces (f, 3).
 
     The cameras are those of the reconstruction, in the mesh's frame, or none if unknown. Returns

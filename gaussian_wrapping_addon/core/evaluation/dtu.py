@@ -271,14 +271,9 @@ def align_to_scan(cameras: Sequence[Camera], truth: DtuScan) -> DtuAlignment:
 
 
 def score_dtu(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    truth: DtuScan,
-    truth_from_job: Similarity,
-    *,
-    seed: int = 0,
-    threads: int = 1,
-) -> DtuScore:
+    vertices: np.ndarray, faces: np.ndarray, truth: DtuScan, truth_from_job: Similarity, *,
+    seed: int = 0, threads: int = 1,
+) -> DtuScore:  # fmt: skip
     """Align a mesh, resample it as points, and compare (see :func:`~.dtu_chamfer.dtu_chamfer`).
 
     Faces farther than the patch from the observed box are left out, as they would not count.

@@ -95,17 +95,10 @@ class DtuScore:
 
 
 def dtu_chamfer(
-    points: np.ndarray,
-    truth_points: np.ndarray,
-    mask: ObservationMask,
-    plane: np.ndarray,
-    *,
-    density: float = DENSITY_MM,
-    patch: float = PATCH_MM,
-    max_distance: float = MAX_DISTANCE_MM,
-    seed: int = 0,
-    threads: int = 1,
-) -> DtuScore:
+    points: np.ndarray, truth_points: np.ndarray, mask: ObservationMask, plane: np.ndarray, *,
+    density: float = DENSITY_MM, patch: float = PATCH_MM, max_distance: float = MAX_DISTANCE_MM,
+    seed: int = 0, threads: int = 1,
+) -> DtuScore:  # fmt: skip
     """Compare points with a scan by the protocol of the data set (Jensen et al., CVPR 2014).
 
     1. Predicted points farther than ``patch`` outside the mask's box are removed.

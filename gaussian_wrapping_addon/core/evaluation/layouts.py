@@ -435,19 +435,10 @@ def align_to_log(cameras: Sequence[Camera], scene: TanksScene, *, seed: int) -> 
 
 
 def score_tanks(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    cameras: Sequence[Camera],
-    scene: TanksScene,
-    start: Similarity,
-    *,
-    refine: bool,
-    protocols: Sequence[str],
-    samples: int = SAMPLES,
-    seed: int = 0,
-    threads: int = 1,
-    progress: Progress | None = None,
-) -> dict[str, dict[str, Any]]:
+    vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera], scene: TanksScene,
+    start: Similarity, *, refine: bool, protocols: Sequence[str], samples: int = SAMPLES,
+    seed: int = 0, threads: int = 1, progress: Progress | None = None,
+) -> dict[str, dict[str, Any]]:  # fmt: skip
     """Score a mesh by the data set's protocol: sampling, refinement, crop, voxel tau / 2, F1.
 
     ``uniform`` samples uniformly (1e6 samples, or ``samples`` if that is less, for the refinement);

@@ -52,16 +52,9 @@ class _PhotoSubset:
 
 
 def bake_held_out_texture(
-    textured: TexturedMesh,
-    scene: Scene,
-    photos: PhotoSource,
-    names: Collection[str],
-    reduction: int,
-    work_folder: Path,
-    progress: Progress,
-    *,
-    threads: int,
-) -> TexturedMesh:
+    textured: TexturedMesh, scene: Scene, photos: PhotoSource, names: Collection[str],
+    reduction: int, work_folder: Path, progress: Progress, *, threads: int,
+) -> TexturedMesh:  # fmt: skip
     """Bake the colours again on the same UVs from all photos except the named ones.
 
     At least one photo must remain. The result has no normal map and no occlusion, which unlit
@@ -202,17 +195,11 @@ class MeshBasedRendering:
 
 
 def mesh_based_rendering(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    training: Sequence[PhotoView],
-    test: Sequence[PhotoView],
-    settings: MeshBasedSettings | None = None,
-    *,
-    lpips: Lpips | None = None,
-    threads: int = 0,
-    progress: Progress | None = None,
+    vertices: np.ndarray, faces: np.ndarray, training: Sequence[PhotoView],
+    test: Sequence[PhotoView], settings: MeshBasedSettings | None = None, *,
+    lpips: Lpips | None = None, threads: int = 0, progress: Progress | None = None,
     on_view: OnView | None = None,
-) -> MeshBasedRendering:
+) -> MeshBasedRendering:  # fmt: skip
     """Fit colours on the mesh to the training photos, and compare with the test photos.
 
     A pixel is covered if the ray through its centre meets a face from either side. An uncovered
@@ -369,13 +356,9 @@ def _draw(
 
 
 def _compare(
-    surface: _Surface,
-    color_field: ColorField | None,
-    view: PhotoView,
-    settings: MeshBasedSettings,
-    lpips: Lpips | None,
-    on_view: OnView | None,
-) -> MeshBasedView | None:
+    surface: _Surface, color_field: ColorField | None, view: PhotoView,
+    settings: MeshBasedSettings, lpips: Lpips | None, on_view: OnView | None,
+) -> MeshBasedView | None:  # fmt: skip
     camera, target = view.camera, _target(view)
     depth = surface.depth(camera)
     covered = np.isfinite(depth)

@@ -113,17 +113,9 @@ def _pixel_sums(rays: np.ndarray) -> np.ndarray:
 
 @kernel(fast=False)
 def _shade(
-    hit: Any,
-    begin: int,
-    end: int,
-    local: Any,
-    faces: Any,
-    uvs: Any,
-    intrinsics: Any,
-    pixels: Any,
-    levels: Any,
-    image: Any,
-) -> None:
+    hit: Any, begin: int, end: int, local: Any, faces: Any, uvs: Any, intrinsics: Any, pixels: Any,
+    levels: Any, image: Any,
+) -> None:  # fmt: skip
     side_x, side_y = float(levels[0, 1]), float(levels[0, 2])
     normal = np.empty(3)
     for row in range(begin, end):
@@ -240,16 +232,10 @@ class MeshRenderingScore:
 
 
 def render_views(
-    textured: TexturedMesh,
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    *,
-    masks: Sequence[np.ndarray] | None = None,
-    counted: Sequence[np.ndarray | None] | None = None,
-    lpips: Lpips | None = None,
-    threads: int = 0,
-    on_view: OnView | None = None,
-) -> MeshRenderingScore:
+    textured: TexturedMesh, cameras: Sequence[Camera], images: Sequence[np.ndarray], *,
+    masks: Sequence[np.ndarray] | None = None, counted: Sequence[np.ndarray | None] | None = None,
+    lpips: Lpips | None = None, threads: int = 0, on_view: OnView | None = None,
+) -> MeshRenderingScore:  # fmt: skip
     """Render the mesh from each camera and compare with its photo.
 
     PSNR, SSIM and LPIPS are those of :func:`~.image_metrics.score_images` over the valid

@@ -170,16 +170,9 @@ NOTE_GAUSSIANS = (
 
 
 def compare_with_photos(
-    textured: TexturedMesh,
-    scene: Scene,
-    photos: PhotoSource,
-    held_out: Collection[str],
-    folder: Path,
-    progress: Progress,
-    *,
-    from_gaussians: bool = False,
-    threads: int = 0,
-) -> dict[str, Any]:
+    textured: TexturedMesh, scene: Scene, photos: PhotoSource, held_out: Collection[str],
+    folder: Path, progress: Progress, *, from_gaussians: bool = False, threads: int = 0,
+) -> dict[str, Any]:  # fmt: skip
     """Evaluate mesh-based rendering over covered pixels, and write some of the comparisons.
 
     Comparison with a photo from which the texture was baked is biased. If photos were held out, a
@@ -311,13 +304,8 @@ def _crop(textured: TexturedMesh, camera: Camera, threads: int) -> tuple[int, in
 
 
 def write_preview(
-    textured: TexturedMesh,
-    scene: Scene,
-    photos: PhotoSource,
-    path: Path,
-    *,
-    threads: int = 0,
-) -> None:
+    textured: TexturedMesh, scene: Scene, photos: PhotoSource, path: Path, *, threads: int = 0,
+) -> None:  # fmt: skip
     """Write a PNG: left the part of a photo that shows the mesh best, right its rendering.
 
     With 0 threads, every core is used.

@@ -133,13 +133,9 @@ def sample_legacy(vertices: np.ndarray, faces: np.ndarray) -> SurfaceSamples:
 
 
 def scan_virtually(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    cameras: Sequence[Camera],
-    *,
-    threads: int = 1,
+    vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera], *, threads: int = 1,
     step_px: float = 1.0,
-) -> SurfaceSamples:
+) -> SurfaceSamples:  # fmt: skip
     """Collect the first hits of all pixels of cameras on a mesh (docs/method.md, section 9.1).
 
     No near plane and no back-face culling: faces occlude from both sides. Points lie on their faces
@@ -413,13 +409,9 @@ def read_truth(folder: Path) -> Truth:
     )
     try:
         return Truth(
-            samples,
-            entries["vertices"].astype(np.float64),
-            faces,
-            entries["thin"],
-            entries["seen"].astype(np.int32),
-            read_region(Path(folder) / CROP_FILE),
-        )
+            samples, entries["vertices"].astype(np.float64), faces, entries["thin"],
+            entries["seen"].astype(np.int32), read_region(Path(folder) / CROP_FILE),
+        )  # fmt: skip
     except ParseError:
         raise
     except DatasetError as error:
@@ -501,14 +493,9 @@ class CloudScore:
 
 
 def score_surface(
-    predicted: SurfaceSamples,
-    predicted_mesh: _Mesh | None,
-    truth: Truth,
-    thresholds: Sequence[float],
-    *,
-    reached: SurfaceSamples | None = None,
-    threads: int = 1,
-) -> SurfaceScore:
+    predicted: SurfaceSamples, predicted_mesh: _Mesh | None, truth: Truth,
+    thresholds: Sequence[float], *, reached: SurfaceSamples | None = None, threads: int = 1,
+) -> SurfaceScore:  # fmt: skip
     """Compare samples of a surface with the truth.
 
     The crop selects the samples that are evaluated, on either side, but not what they are compared
@@ -569,39 +556,25 @@ def score_surface(
     means = _mean(accuracy), _mean(completeness)
     medians = _median(accuracy), _median(completeness)
     return SurfaceScore(
-        thresholds=limits,
-        precision=precision,
-        recall=recall,
+        thresholds=limits, precision=precision, recall=recall,
         f1=tuple(_f1(p, r) for p, r in zip(precision, recall, strict=True)),
         visible_recall=_shares(completeness[visible], limits) if knows_seen else None,
         thin_recall=_shares(completeness[thin], limits) if thin.any() else None,
-        accuracy_mean=means[0],
-        accuracy_median=medians[0],
-        completeness_mean=means[1],
-        completeness_median=medians[1],
-        chamfer_mean=(means[0] + means[1]) / 2,
+        accuracy_mean=means[0], accuracy_median=medians[0], completeness_mean=means[1],
+        completeness_median=medians[1], chamfer_mean=(means[0] + means[1]) / 2,
         chamfer_median=(medians[0] + medians[1]) / 2,
         normal_consistency=_symmetric_mean([np.abs(values) for values in pairs]),
         normal_agreement=_symmetric_mean([(values > 0).astype(np.float64) for values in pairs]),
-        predicted_count=len(shown),
-        truth_count=len(true),
-        visible_count=int(visible.sum()) if knows_seen else 0,
-        thin_count=int(thin.sum()),
-    )
+        predicted_count=len(shown), truth_count=len(true),
+        visible_count=int(visible.sum()) if knows_seen else 0, thin_count=int(thin.sum()),
+    )  # fmt: skip
 
 
 def score_protocols(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    truth: Truth,
-    cameras: Sequence[Camera],
-    thresholds: Sequence[float],
-    *,
-    count: int = 200_000,
-    seed: int = 0,
-    threads: int = 1,
+    vertices: np.ndarray, faces: np.ndarray, truth: Truth, cameras: Sequence[Camera],
+    thresholds: Sequence[float], *, count: int = 200_000, seed: int = 0, threads: int = 1,
     protocols: Sequence[str] = PROTOCOLS,
-) -> dict[str, SurfaceScore]:
+) -> dict[str, SurfaceScore]:  # fmt: skip
     """Score a mesh by several protocols (docs/method.md, section 9.1).
 
     - ``uniform``: ``count`` samples uniform over the mesh; recall is measured against the mesh
@@ -674,13 +647,9 @@ def score_protocols(
 
 
 def score_clouds(
-    predicted_points: np.ndarray,
-    truth_points: np.ndarray,
-    threshold: float,
-    *,
-    voxel: float | None,
-    threads: int = 1,
-) -> CloudScore:
+    predicted_points: np.ndarray, truth_points: np.ndarray, threshold: float, *,
+    voxel: float | None, threads: int = 1,
+) -> CloudScore:  # fmt: skip
     """Compare point clouds by the protocol of Tanks and Temples, after alignment and crop.
 
     See docs/method.md, section 9.1.

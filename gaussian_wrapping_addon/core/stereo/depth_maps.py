@@ -171,15 +171,9 @@ class DepthMap:
 
 
 def estimate_depth_maps(
-    photos: PhotoSource,
-    views: Sequence[int],
-    points: np.ndarray,
-    progress: Progress,
-    *,
-    side_px: int,
-    seed: int = 0,
-    threads: int = 0,
-) -> list[DepthMap]:
+    photos: PhotoSource, views: Sequence[int], points: np.ndarray, progress: Progress, *,
+    side_px: int, seed: int = 0, threads: int = 0,
+) -> list[DepthMap]:  # fmt: skip
     """Estimate the depth maps of photos; the result does not depend on ``threads``.
 
     Parameters

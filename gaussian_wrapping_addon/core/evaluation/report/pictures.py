@@ -250,14 +250,9 @@ def worst_to_best(figures: Sequence[float]) -> list[int]:
 
 
 def write_held_out(
-    gaussians: OrientedGaussians,
-    photos: PhotoSource,
-    views: Sequence[tuple[int, str, float]],
-    folder: Path,
-    *,
-    threads: int,
-    renderer: Renderer | None = None,
-) -> list[dict[str, Any]]:
+    gaussians: OrientedGaussians, photos: PhotoSource, views: Sequence[tuple[int, str, float]],
+    folder: Path, *, threads: int, renderer: Renderer | None = None,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Render held-out views as the trainer does, and write photo, rendering and error.
 
     Parameters
