@@ -103,7 +103,6 @@ def trilinear(
 
 
 LANES = 16  # Values per run. LLVM splits a run into as many registers as needed.
-
 TAPS = 11
 HALF = TAPS // 2 + 1
 RING = TAPS + 1

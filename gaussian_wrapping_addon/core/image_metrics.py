@@ -33,7 +33,6 @@ C1 = 0.01**2
 C2 = 0.03**2
 
 BLOCK_PX = 512  # width of a column block: the buffered last rows of one fit a cache of 1 MB
-
 _AVERAGED = 4  # x, y, x^2 + y^2, x y: SSIM only needs the sum of the two variances
 _MAPS = 3  # derivatives of SSIM with respect to E[x], E[x^2] and E[x y] of its window
 _MARGIN = 3 * REACH
@@ -269,7 +268,6 @@ def compare_rows(  # type: ignore[no-untyped-def]
 
 
 PSNR_CAP_DB = 100.0  # replaces the infinite PSNR of equal images in averages and reports
-
 _NO_MASK = np.zeros((0, 0), np.bool_)
 
 
@@ -441,7 +439,6 @@ def compare(
 _logger = logging.getLogger(__name__)
 
 BACKBONE_PATTERN = "alexnet-owt-*.pth"  # name of torchvision's AlexNet weights in torch's hub cache
-
 MIN_SIDE_PX = 31  # for smaller images, the last layers of AlexNet have no pixel
 
 

@@ -76,7 +76,6 @@ SCENE_RADIUS = 5.0
 """Scenes are scaled so that 1.1 x the largest distance of a camera from their mean equals this."""
 
 FAR_RADIUS = 10.0 * SCENE_RADIUS  # from here on a Gaussian may stand for the sky
-
 POINT_REACH = 1e4 * SCENE_RADIUS
 """Sparse points farther than this from the centre of the cameras are not used.
 

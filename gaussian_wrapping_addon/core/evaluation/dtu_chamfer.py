@@ -21,7 +21,6 @@ from ..mesh.sampling import distances_to_cloud, thin
 DENSITY_MM = 0.2  # minimum distance of predicted points, and maximum gap of a resampled mesh
 PATCH_MM = 60.0  # predicted points farther than this outside the observed box are ignored
 MAX_DISTANCE_MM = 20.0  # distances of this or more are dropped from the means
-
 MAX_CELLS = 2e6
 """Maximum extent in densities: indices of cells over three such axes fit into 64 bits."""
 ROW_SHARE = math.sqrt(0.75)

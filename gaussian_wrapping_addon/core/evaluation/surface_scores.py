@@ -432,7 +432,6 @@ SCAN_RAYS = 4_000_000
 """Rays of a virtual scan, which steps over pixels of more: at most about 400 MB of points."""
 
 Shares = tuple[float, ...]  # one number in [0, 1] for each threshold
-
 _Mesh = tuple[np.ndarray, np.ndarray]
 
 

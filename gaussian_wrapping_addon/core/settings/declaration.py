@@ -113,7 +113,6 @@ SELECTION_MODES = ("auto", "on", "off")
 SWITCH = ("off", "on")
 
 DEVICE = r"auto|cpu|cuda(:[0-9]{1,3})?"  # pattern of the devices that a job can be given
-
 COMPUTERS = r"|local|(tcp|tls)://(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253}):[0-9]{1,5}"
 """Pattern of where the parts of a job run; empty: here, in one process."""
 MAX_PROCESSES = 64
@@ -171,7 +170,6 @@ PanelName = Literal[
 """A panel in Blender."""
 
 JOB = "job"  # group of the settings that are direct fields of the job's settings
-
 _SCOPES: Mapping[str, Scope] = {
     JOB: "training", "training": "training", "meshing": "region", "texture": "region",
 }  # fmt: skip

@@ -27,14 +27,11 @@ from .matching import NO_PRIOR, MatchingLevel, grey_levels, in_image, source_vie
 
 
 LEAST_COSINE = 0.15  # between ray and normal: steeper triangles mostly bridge the edge of a thing
-
 HIDDEN_SHARE = 1.25
 """A point this much farther away than the nearest one of its cell counts as hidden."""
 
 BEHIND_SHARE = 1.05  # a point this much farther away than the pixel's own depth is hidden
-
 _CELLS = 24  # cells along the long side of an image
-
 _LEAST_AREA = 1e-9
 
 
@@ -118,7 +115,6 @@ COARSE_SWEEPS, COARSE_GEOMETRIC_SWEEPS, FINE_SWEEPS = 3, 2, 2
 """Sweeps at the coarse level before and after photos are compared, and at the fine level."""
 
 GEOMETRIC_COST = 0.15  # of a pixel of forward-backward error
-
 RANDOM_SHARE = 0.25
 """Share of the pixels that start with a random plane although triangles cover them."""
 
@@ -126,7 +122,6 @@ NEAREST_FACTOR, FARTHEST_FACTOR = 1.5, 0.02
 """Range of the inverse depths over that of the sparse points."""
 
 FEW_POINTS = 20  # a photo with fewer of them takes the range from all points
-
 MOST_PIXELS = 12_000_000
 """Of all photos together at that size; more photos are matched at a smaller one."""
 
@@ -403,9 +398,7 @@ def least_divisor(side_px: float, pixels: float, most_px: int) -> int:
 
 
 CELL_PX = 8  # side of the cells of a photo, at the size it was matched at
-
 OPEN_SHARE = 0.75  # share of a cell's pixels that must be unexplained for the cell to be open
-
 BEHIND_COST = 0.7  # matching cost from which a pixel is unexplained: nothing matches
 
 
@@ -447,7 +440,6 @@ def by_cell(image: np.ndarray) -> np.ndarray:
 
 
 LIKE_NORMAL = 0.7  # least cosine between the normals of pixels of one surface
-
 OUTLIER_SIGMAS = 1.5
 """Pixels farther from the mean along the normal are left out of the second mean."""
 
@@ -569,14 +561,11 @@ MOST_COST = 0.7
 """A depth that no source confirms is a guess if it costs less; else nothing is known."""
 
 UNCONFIRMED_WEIGHT = 0.2  # Weight of a depth that no source confirms; each source adds as much.
-
 CLEARANCE = 0.5  # sizes of a point from confirmed ones within which it is left out
-
 SEEN_THROUGH_SHARE = 0.03
 """A confirmed depth this much larger than a point's sees through the point."""
 
 SEEN_THROUGH_VIEWS = 2  # views that must see through a point for it to be left out
-
 OPEN_VIEWS = 2  # views that must show a point where nothing matches for it to be left out
 
 

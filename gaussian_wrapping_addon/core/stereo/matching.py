@@ -46,7 +46,6 @@ BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG = 12.0, 5.0, 12.0
 """Angle between two rays to a point at which matching is best, and how fast it gets worse."""
 
 LEAST_GAIN = 1e-3  # least share of the points for which a source is of use
-
 _MOST_POINTS = 1500  # points that decide, subsampled from those given
 
 
@@ -112,13 +111,9 @@ KEPT_SOURCES = 2
 """Sources in which a pixel is judged: its best ones. The others may not see its surface."""
 
 REFINEMENTS = 2  # random changes tried per pixel and sweep, the second half as large as the first
-
 LEAST_COSINE = F32(0.12)  # between ray and normal, 83 degrees: more grazing planes are not tried
-
 GOOD_COST = F32(0.3)  # a pixel that costs less in the sources it kept is not judged in the others
-
 RANDOM_ABOVE = F32(0.5)  # a random plane is tried where the cost is at least this
-
 SAME_SHARE = F32(0.001)
 """Planes nearer than this share of the depth over the whole window are the same: under 0.1 px."""
 
@@ -127,7 +122,6 @@ ALIKE_LEVELS = 12.0
 """Widths of the two factors of a sample's weight: distance from the centre, difference in grey."""
 
 NORMAL_SPREAD = F32(20)  # relative change of the normal per relative change of the depth, at most 1
-
 PRIOR_STRENGTH, PRIOR_TEXTURE, PRIOR_SHARE = F32(0.25), F32(20), F32(0.01)
 """Largest cost of leaving the prior's plane; variance of grey at which half of it is left; share of
 the depth that counts as leaving it."""
@@ -351,7 +345,6 @@ _MEAN_PX = 5
 """Side of the window over which grey levels are averaged to compare the brightness of photos."""
 
 _MOST_SEED = 2**32 - 1  # seeds of a sweep lie between 1 and this: the generator would stay at 0
-
 NO_PRIOR = np.zeros((0, 0, 3), np.float32)
 NO_DEPTHS = np.zeros(1, np.float32)
 

@@ -91,16 +91,13 @@ AGREEING_SHARE = F32(0.01)
 """Largest forward-backward error and relative difference in depth of two views that agree."""
 
 LEAST_LEVEL = 16.0  # darker pixels tell no gain
-
 LEAST_TOLERANCE_LEVELS = 2.0
 TOLERANCE_PER_SPREAD = 3.0
 """Difference in grey levels that is as bad as any larger one: so many times the median difference
 of agreeing pixels, and at least that."""
 
 LEAST_PAIRS = 50  # agreeing pixels of two photos below which their brightness is not compared
-
 MOST_PAIRS = 20_000  # pixels of a photo that are looked at, at most
-
 GAIN, RATE = 0, 1
 """Columns of a brightness: factor of the source's grey levels, and one over the tolerance, 0 where
 brightness is not compared."""

@@ -31,7 +31,6 @@ from .plane_fitting import (
 
 
 AGREEING, ALIKE, THROUGH, UNLIKE, NEARER = range(5)  # columns of what :func:`count_votes` counts
-
 AGREEING_SHARE = 0.02
 """Largest relative difference of a point's depth and a photo's own, of those that agree."""
 
@@ -169,7 +168,6 @@ def correlate(
 
 
 MOST_ASKED = 40  # Photos asked about the points of one; a regular choice of more.
-
 LEAST_SHOWN = 0.9
 """Share of the pixels that must show a plane; photos need not be asked about another."""
 
@@ -321,18 +319,14 @@ Noise lowers every correlation: those of a rendered room's true planes fell to .
 where its photos were matched at full size."""
 
 NOISY_PHOTOS = 0.8  # quantile of the photos' noise that the scales are made for
-
 STEPS = ((0.01, 0.005), (0.0025, 0.00125, 0.0006, 0.0003))
 """Of the search at each scale, as shares of the depth at the edges of the plane's segments."""
 TURNS = 6  # most turns of the search with one step
-
 PENALTY, PENALTY_STEP = 0.03, 0.015
 """Correlation that a change of the plane by such a share of the depth must gain at least."""
 
 CLIPPED_LEVELS = 4.0  # texture is clipped at this many grey levels
-
 MOST_SAMPLES, LEAST_SAMPLES = 1200, 200  # pixels of a segment that take part, and that it needs to
-
 MOST_SOURCES = 6
 LEAST_INSIDE = 0.3
 """Share of a segment's samples that must land on plain pixels of a source."""

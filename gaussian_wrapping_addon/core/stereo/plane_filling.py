@@ -38,9 +38,7 @@ from .plane_fitting import (
 
 
 LEAST_BORDER = 0.12  # share of a segment's known depths, weighed, that its plane must explain
-
 PAIR_GAIN = 0.06  # share that a second plane must explain besides
-
 LEAST_LIKE = 0.85
 """Share of the other photos' votes that must not contradict a plane (:class:`.Votes`)."""
 
@@ -52,7 +50,6 @@ LATER_SPREAD = 0.12
 """As :data:`~.plane_fitting.LEAST_SPREAD`, once planes are known from several photos."""
 
 FEW_VIEWS = 2.0  # a plane of n views counts n / (n + this)
-
 MOST_RANKED, MOST_PAIRED, MOST_TRIED = 14, 6, 20
 """Planes of a segment that are looked at, of these put together in pairs, and choices whose votes
 are counted."""
@@ -69,7 +66,6 @@ NEIGHBOURS, SPREADING_TURNS = 3, 4
 
 
 FAR_DISTANCE = 1e6  # of points that stand for what lies too far away for parallax, scene units
-
 FAR_SHARE, FAR_VOTES = 0.85, 2.0
 """Share of the other photos' votes that must be for the same colour and unknown depth, and votes a
 pixel needs on average, for a segment without a plane to lie far away: photos see the sky alike in
@@ -291,9 +287,7 @@ LEAST_UNKNOWN = 0.4
 """Share of a large segment's pixels without confirmed depth from which it is looked into."""
 
 TURNS = 3  # Turns of assigning segments and fitting planes; the planes are aligned after the last.
-
 LEAST_VIEWS = 2  # photos whose segments a plane needs after the first turn
-
 NORMAL_COSINE = 0.95  # of a confirmed pixel's normal with that of a plane it is fitted to
 FITTED_SHARE = 0.03  # distance of such a pixel from the plane over that from the camera, at most
 FITTED_PIXELS, LEAST_FITTED = 1500, 300
@@ -311,7 +305,6 @@ AGREEING_PER_THROUGH, AGREEING_PER_NEARER = 2, 0.5
 before it."""
 
 KEPT_SHARE = 0.003  # a confirmed depth that differs less from the plane is kept
-
 FILLED_CONFIDENCE, FILLED_AGREEING = 0.5, 2
 
 BEHIND_MARGIN_PX, BEHIND_VIEWS, BEHIND_PER_AGREEING = 2, 2, 2

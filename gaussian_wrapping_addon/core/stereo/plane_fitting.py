@@ -19,7 +19,6 @@ from .depth_maps import DepthMap, points_in_view
 
 
 DARKEST, BRIGHTEST = 1.0, 254.0  # grey levels between which noise shows
-
 SIDES_PX = (1, 2)
 """Of the squares whose means are looked at. Resizing and JPEG take noise of single pixels away and
 leave that of squares, which texture is made of, too; squares of 4 px show faint texture itself."""
@@ -93,17 +92,13 @@ CLEAR_OF_NOISE = 4.5
 """The first width is taken at which that difference is so many standard deviations of noise."""
 
 LEAST_SHARE = 0.0008  # of the pixels of a photo that a segment needs
-
 LARGE_SHARE = 0.004
 """Of the pixels of a photo from which a segment proposes planes; smaller ones may take over those
 of their neighbours."""
 
 BORDER_PX = 5  # width of the band around a segment whose confirmed depths count
-
 MOST_BORDER = 600  # Known depths of a segment, at most; a regular choice of more.
-
 SPARSE_WEIGHT = 3.0  # Of a sparse point inside a segment; confirmed pixels of the border weigh 1.
-
 INSIDE_WEIGHT = 0.3
 """Of a confirmed pixel inside: windows without texture also agree where they should not."""
 

@@ -283,11 +283,8 @@ def _text(value: Any) -> str:
 
 
 FEW_HELD_OUT = 3  # the mean over fewer photos is not reliable
-
 LOW_COVERAGE = 0.5  # below half, most of the texture is filled in and not photographed
-
 GAP_DB = 20.0 * math.log10(2.0)  # held-out photos have more than twice the error of training photos
-
 TEXELLESS_SHARE = 0.005
 """Share of the area in faces smaller than a texel that is worth a warning: scattered slivers take
 the colour of their neighbours."""

@@ -183,11 +183,8 @@ def write_svg(panels: Sequence[Panel], path: Path, *, columns: int = 3) -> None:
 
 
 MAX_PICTURES = 4  # number of held-out photos shown: the worst, the best, and some between
-
 STRIP_PX = 1500  # Maximum width of a strip of three images; a wider one is scaled down.
-
 ERROR_GAIN = 4.0  # factor applied to the errors: the scale ends at a quarter of full brightness
-
 GAP_PX = 6
 CAPTION_PX = 24
 MAX_DOTS = 20
