@@ -277,8 +277,7 @@ class ViewScores:
 
     psnr: float  # dB, at most :data:`PSNR_CAP_DB`
     ssim: float
-    lpips: float | None = None
-    """``None`` where it was not measured."""
+    lpips: float | None = None  # ``None`` where it was not measured
 
     def to_json(self) -> dict[str, float]:
         """Return plain JSON values; ``lpips`` only where it was measured."""

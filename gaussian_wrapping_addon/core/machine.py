@@ -155,14 +155,12 @@ def _reclaimable(folder: Path, key: str) -> int:
 def describe_machine(threads: int) -> dict[str, Any]:
     """Return processor, cores, memory, Python and package versions as plain JSON values."""
     return {
-        "processor": processor_name(),
-        "cores": os.cpu_count(),
-        "threads": threads,
+        "processor": processor_name(), "cores": os.cpu_count(), "threads": threads,
         "memory_bytes": total_memory_bytes(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
-    }
+    }  # fmt: skip
 
 
 def _version(package: str) -> str:

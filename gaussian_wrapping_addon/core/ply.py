@@ -52,8 +52,7 @@ class PlyHeader:
     encoding: str  # ``"ascii"``, or the byte order ``"<"`` or ``">"``
     elements: tuple[PlyElement, ...]
     comments: tuple[str, ...]
-    begin: int
-    """Offset of the body in bytes."""
+    begin: int  # offset of the body in bytes
 
     def count(self, element: str) -> int:
         """Return the declared count of an element, 0 if it is not declared."""

@@ -33,8 +33,7 @@ class ProgressEvent:
     message: str
     figures: dict[str, float] = field(default_factory=dict)
     seconds_left: float | None = None
-    phase: str = ""
-    """Phase for programs, such as :data:`COMPILING`."""
+    phase: str = ""  # phase for programs, such as :data:`COMPILING`
 
 
 class Progress:

@@ -364,8 +364,7 @@ class ColorField:
     """A fitted field."""
 
     contraction: Contraction
-    cell: float
-    """Side of a fine cell, contracted units."""
+    cell: float  # side of a fine cell, contracted units
     mean: np.ndarray  # (3,) float32: colour far from every sample
     levels: tuple[Level, Level]  # fine and coarse
     fine: np.ndarray  # (v, 3) float32

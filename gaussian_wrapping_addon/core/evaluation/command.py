@@ -236,17 +236,14 @@ def _surface(
         protocols=protocols,
     )  # fmt: skip
     return {
-        "diagonal": diagonal,
-        "distances": list(distances),
+        "diagonal": diagonal, "distances": list(distances),
         "shares_of_diagonal": None if shares is None else list(shares),
-        "samples": request.samples or SAMPLES,
-        "truth_samples": len(truth.samples),
+        "samples": request.samples or SAMPLES, "truth_samples": len(truth.samples),
         "alignment": {**alignment, "transform": transform.to_json()},
-        "pose_errors": None if poses is None else poses.to_json(),
-        "pose_note": pose_note,
+        "pose_errors": None if poses is None else poses.to_json(), "pose_note": pose_note,
         "scan_cameras": len(viewers) if "scan" in protocols else 0,
         "scores": {name: score.to_json() for name, score in scores.items()},
-    }
+    }  # fmt: skip
 
 
 def _scene_diagonal(path: Path) -> float:
@@ -331,15 +328,10 @@ def _tanks(
         seed=request.seed, threads=request.threads, progress=progress.span(0.1, 1.0),
     )  # fmt: skip
     return {
-        "scene": scene.name,
-        "distances": [scene.threshold],
-        "voxel": scene.threshold / 2,
-        "samples": samples,
-        "truth_samples": len(scene.cloud),
-        "alignment": alignment,
-        "scan_cameras": len(cameras) if "scan" in protocols else 0,
-        "scores": scores,
-    }
+        "scene": scene.name, "distances": [scene.threshold], "voxel": scene.threshold / 2,
+        "samples": samples, "truth_samples": len(scene.cloud), "alignment": alignment,
+        "scan_cameras": len(cameras) if "scan" in protocols else 0, "scores": scores,
+    }  # fmt: skip
 
 
 def _dtu(
@@ -366,14 +358,11 @@ def _dtu(
     progress.update(0.2, "measuring distances")
     score = score_dtu(*mesh, truth, transform, seed=request.seed, threads=request.threads)
     return {
-        "scan": truth.scan,
-        "density_mm": DENSITY_MM,
-        "patch_mm": PATCH_MM,
-        "max_distance_mm": MAX_DISTANCE_MM,
-        "truth_samples": len(truth.cloud),
+        "scan": truth.scan, "density_mm": DENSITY_MM, "patch_mm": PATCH_MM,
+        "max_distance_mm": MAX_DISTANCE_MM, "truth_samples": len(truth.cloud),
         "alignment": {"transform": transform.to_json(), **alignment},
         "scores": {"dtu": score.to_json()},
-    }
+    }  # fmt: skip
 
 
 def table(result: dict[str, Any]) -> list[str]:

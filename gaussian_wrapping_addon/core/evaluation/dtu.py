@@ -33,11 +33,9 @@ class DtuScan:
     """Ground truth of one scan, millimetres."""
 
     scan: int
-    cloud: np.ndarray
-    """(n, 3) float64."""
+    cloud: np.ndarray  # (n, 3) float64
     mask: ObservationMask
-    plane: np.ndarray
-    """(4,) ground plane; true points with ``plane . [x, 1] > 0`` are evaluated."""
+    plane: np.ndarray  # (4,) ground plane; true points with ``plane . [x, 1] > 0`` are evaluated.
     camera_numbers: np.ndarray  # (m,) int64; empty if no camera files were found.
     camera_centers: np.ndarray  # (m, 3) float64
     camera_source: str  # name of the file or folder of the cameras

@@ -211,11 +211,9 @@ class TanksScene:
 
     name: str
     threshold: float
-    cloud: np.ndarray
-    """(n, 3) float64."""
+    cloud: np.ndarray  # (n, 3) float64
     crop: PolygonVolume
-    log_numbers: np.ndarray
-    """(m,) int64, photo number of each entry of the trajectory."""
+    log_numbers: np.ndarray  # (m,) int64, photo number of each entry of the trajectory
     log_centers: np.ndarray
     """(m, 3) camera centres of the trajectory, transformed by ``_trans.txt``."""
 

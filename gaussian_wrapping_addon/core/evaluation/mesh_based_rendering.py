@@ -26,7 +26,7 @@ from ..settings import TextureSettings
 from ..texture.texture_mesh import texture_mesh
 from ..texture.unwrap.unwrap import Unwrap
 from .color_field import ColorField, ColorFieldSettings, Contraction, Samples, fit_color_field
-from .mesh_rendering import OnView
+from .mesh_rendering import OnView, check_sizes
 
 # -- Bake a mesh's texture again without some photos, for an unbiased comparison with them --------
 
@@ -132,8 +132,7 @@ class MeshBasedView:
     """Figures of one test photo."""
 
     name: str
-    scores: ViewScores
-    """Over the compared pixels; uncovered ones are black."""
+    scores: ViewScores  # Over the compared pixels; uncovered ones are black.
     covered_psnr: float | None
     """dB, over compared pixels that a face covers; ``None`` if there are none."""
     inside_psnr: float | None
@@ -159,8 +158,7 @@ class MeshBasedRendering:
     """Figures of all test photos; means are over photos with equal weights."""
 
     views: tuple[MeshBasedView, ...]
-    left_out: int
-    """Test photos without a pixel to compare."""
+    left_out: int  # test photos without a pixel to compare
     training_views: int
     training_pixels: int
     """Pixels of training photos that a face covers."""
@@ -180,17 +178,12 @@ class MeshBasedRendering:
         names = ("psnr", "ssim", "lpips", "covered_psnr", "inside_psnr", "uncovered", "beyond")
         means = {name: self.mean(name) for name in names}
         values = {
-            **means,
-            "views": [view.to_json() for view in self.views],
-            "left_out": self.left_out,
-            "background": "black",
-            "training_views": self.training_views,
-            "training_pixels": self.training_pixels,
-            "samples": self.samples,
-            "training_psnr": self.training_psnr,
-            "field_vertices": list(self.field_vertices),
+            **means, "views": [view.to_json() for view in self.views], "left_out": self.left_out,
+            "background": "black", "training_views": self.training_views,
+            "training_pixels": self.training_pixels, "samples": self.samples,
+            "training_psnr": self.training_psnr, "field_vertices": list(self.field_vertices),
             "settings": asdict(self.settings),
-        }
+        }  # fmt: skip
         return {key: value for key, value in values.items() if value is not None}
 
 
@@ -276,14 +269,7 @@ def _check(training: Sequence[PhotoView], test: Sequence[PhotoView]) -> None:
             "Hold photos out of training, or give a folder of test photos.",
         )
     for view in (*training, *test):
-        size = view.camera.height, view.camera.width
-        for picture in (view.photo, view.counted, view.outline):
-            if picture is not None and picture.shape[:2] != size:
-                raise UsageError(
-                    f"{view.camera.name}: a picture of {picture.shape[:2]} pixels (height, width) "
-                    f"for a camera of {size}.",
-                    "Resize the camera or the picture.",
-                )
+        check_sizes(view.camera, view.photo, view.counted, view.outline)
     centers = np.array([view.camera.center for view in training])
     spread = max(float(np.ptp(centers, axis=0).max()), float(np.finfo(np.float64).tiny))
     for view in test:

@@ -192,12 +192,9 @@ class MeshView:
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; ``lpips`` only if measured."""
         return {
-            "name": self.name,
-            **self.scores.to_json(),
-            "covered": self.covered,
-            "uncovered": self.uncovered,
-            "whole_psnr": self.whole_psnr,
-        }
+            "name": self.name, **self.scores.to_json(), "covered": self.covered,
+            "uncovered": self.uncovered, "whole_psnr": self.whole_psnr,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -276,7 +273,7 @@ def render_views(
         _one_each(counted, cameras, "masks"),
         strict=True,
     ):
-        _check_sizes(camera, photo, mask, may_count)
+        check_sizes(camera, photo, mask, may_count)
         view = renderer.render(camera)
         candidates = np.ones(view.covered.shape, np.bool_)
         for part in (mask, may_count):
@@ -288,15 +285,10 @@ def render_views(
             continue
         scores = score_images(view.image, photo, judged, lpips=lpips, threads=threads)
         count = np.count_nonzero(candidates)
-        views.append(
-            MeshView(
-                camera.name,
-                scores,
-                np.count_nonzero(view.covered & candidates) / count,
-                np.count_nonzero((view.coverage == 0.0) & candidates) / count,
-                min(psnr(view.on_black(), photo, candidates), PSNR_CAP_DB),
-            )
-        )
+        covered = np.count_nonzero(view.covered & candidates) / count
+        uncovered = np.count_nonzero((view.coverage == 0.0) & candidates) / count
+        whole = min(psnr(view.on_black(), photo, candidates), PSNR_CAP_DB)
+        views.append(MeshView(camera.name, scores, covered, uncovered, whole))
         if on_view is not None:
             on_view(camera.name, photo, view.image)
     pixels = "covered" if masks is None else "mask"
@@ -313,7 +305,8 @@ def _one_each(given: Sequence[Any] | None, cameras: Sequence[Camera], what: str)
     return given
 
 
-def _check_sizes(camera: Camera, *pictures: np.ndarray | None) -> None:
+def check_sizes(camera: Camera, *pictures: np.ndarray | None) -> None:
+    """Raise ``UsageError`` if a picture differs in size from its camera."""
     for picture in pictures:
         if picture is not None and picture.shape[:2] != (camera.height, camera.width):
             raise UsageError(

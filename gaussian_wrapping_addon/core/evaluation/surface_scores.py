@@ -314,8 +314,7 @@ class Truth:
     """
 
     samples: SurfaceSamples
-    vertices: np.ndarray | None = None
-    """(v, 3) float64, or ``None`` if only a cloud is known."""
+    vertices: np.ndarray | None = None  # (v, 3) float64, or ``None`` if only a cloud is known
     faces: np.ndarray | None = None  # (f, 3) int
     thin: np.ndarray | None = None
     """(n,) bool: the sample lies on a thin structure; ``None`` if not labelled."""

@@ -33,8 +33,7 @@ class Range:
 
     low: float
     high: float = math.inf
-    zero: str = ""
-    """Meaning of 0, if it is allowed in addition to the range."""
+    zero: str = ""  # meaning of 0, if it is allowed in addition to the range
     words: str = ""  # replaces the generated description
     below_high: bool = False  # whether ``high`` itself is excluded
 
@@ -256,8 +255,7 @@ class Declaration:
     """The declaration of one setting."""
 
     default: Any
-    help: str
-    """What the setting does, in full sentences."""
+    help: str  # what the setting does, in full sentences
     check: Check | None = None
     unit: str = ""
     presets: Mapping[str, Any] = field(default_factory=dict)

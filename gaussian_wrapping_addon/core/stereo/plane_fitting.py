@@ -114,8 +114,7 @@ class Segment:
     inverse_depths: np.ndarray  # (b,) of those
     weights: np.ndarray  # (b,)
     large: bool
-    unknown: float
-    """Share of its pixels whose depth no source confirms."""
+    unknown: float  # share of its pixels whose depth no source confirms
     noise: float
     """Standard deviation of white noise as strong as that of its photo's grey levels, as taken."""
 
@@ -213,19 +212,13 @@ def _segments(depth_map: DepthMap, view: int, points: np.ndarray) -> list[Segmen
         rows, columns, weight = rows[chosen], columns[chosen], weight[chosen]
         own = numbers[sparse_at[:, 1], sparse_at[:, 0]] == number
         row, column = np.nonzero(inside)
-        found.append(
-            Segment(
-                view,
-                row + corner[1],
-                column + corner[0],
-                np.concatenate([np.stack([columns, rows], 1), sparse_px[own]]),
-                np.concatenate([inverse[rows, columns], sparse_inverse[own]]),
-                np.concatenate([weight, np.full(int(own.sum()), SPARSE_WEIGHT)]),
-                bool(sizes[number] >= LARGE_SHARE * plain.size),
-                1.0 - len(inner_row) / len(row),
-                noise,
-            )
-        )
+        places = np.concatenate([np.stack([columns, rows], 1), sparse_px[own]])
+        known = np.concatenate([inverse[rows, columns], sparse_inverse[own]])
+        weights = np.concatenate([weight, np.full(int(own.sum()), SPARSE_WEIGHT)])
+        large = bool(sizes[number] >= LARGE_SHARE * plain.size)
+        unknown = 1.0 - len(inner_row) / len(row)
+        row, column = row + corner[1], column + corner[0]
+        found.append(Segment(view, row, column, places, known, weights, large, unknown, noise))
     return found
 
 

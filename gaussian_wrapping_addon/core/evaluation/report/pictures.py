@@ -41,8 +41,7 @@ class Series:
     name: str
     points: Sequence[tuple[float, float]]
     line: bool = True
-    labels: Sequence[str] = ()
-    """Labels beside the points; none, or one for each point."""
+    labels: Sequence[str] = ()  # Labels beside the points; none, or one for each point.
     dots: bool = True
 
 
@@ -54,8 +53,7 @@ class Panel:
     x_label: str
     y_label: str
     series: Sequence[Series]
-    legend_low: bool = False
-    """Legend at the lower left instead of the upper left."""
+    legend_low: bool = False  # legend at the lower left instead of the upper left
     x_log: bool = True
     y_log: bool = True
 
