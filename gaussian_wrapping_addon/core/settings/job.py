@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -120,12 +120,12 @@ def are_markers(text: str) -> bool:
 # -- All settings of one job, and its presets -----------------------------------------------------
 
 
-def _formats(text: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(word for word in text.split(",") if word))
-
-
-def _distinct(words: list[str]) -> tuple[str, ...]:
+def _distinct(words: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(words))
+
+
+def _path(text: str) -> str:
+    return str(Path(text))
 
 
 # Packed, as a survey of all settings needs few lines.
@@ -234,7 +234,7 @@ class JobSettings:
         "variable GW_CERTIFICATES names.",
         option=Option(
             "--certificates", "DIR", "certificates for tls:// addresses", scope="region",
-            parse=lambda text: str(Path(text)), own=True,
+            parse=_path, own=True,
         ),
         affects_result=False, since="0.2.0",
     )
@@ -252,15 +252,14 @@ class JobSettings:
         ("glb",), help="File formats that the meshes are written in.", check=Subset(JOB_FORMATS),
         option=Option(
             "--export", help=f"file formats, comma separated, of {','.join(JOB_FORMATS)}",
-            scope="region", parse=_formats, own=True,
+            scope="region", parse=lambda text: _distinct(filter(None, text.split(","))), own=True,
         ),
     )
     start_splat: str = setting(
         "", help="PLY of Gaussians that training starts from; empty starts from the sparse points.",
         option=Option(
             "--start-splat", "FILE.ply",
-            "Gaussians that training starts from, instead of the sparse points",
-            parse=lambda text: str(Path(text)),
+            "Gaussians that training starts from, instead of the sparse points", parse=_path,
         ),
         panel=PanelProperty(
             "Start from Splat",
@@ -368,8 +367,8 @@ class JobSettings:
         "gets their frame, in metres.",
         option=Option(
             "--control-points", "FILE.txt",
-            "known places and the pixels that show them: gives scale, place and up",
-            parse=lambda text: str(Path(text)), own=True,
+            "known places and the pixels that show them: gives scale, place and up", parse=_path,
+            own=True,
         ),
         panel=PanelProperty(
             "Control Points", "Text file of known places and the pixels of photos that show them",
@@ -402,7 +401,7 @@ class JobSettings:
         option=Option(
             "--mask-model", "FILE.onnx",
             "segmentation model that masks the photos; needs onnxruntime in the worker",
-            parse=lambda text: str(Path(text)),
+            parse=_path,
         ),
         panel=PanelProperty(
             "Mask Model",
