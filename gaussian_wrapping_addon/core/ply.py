@@ -134,8 +134,8 @@ def vertex_layout(
         raise ParseError(path, "header", "the first element is not named vertex.", hint)
     vertex = header.elements[0]
     if vertex.count > most:
-        text = f"{vertex.count} vertices; at most {most} are read."
-        raise ParseError(path, "header", text, hint)
+        problem = f"{vertex.count} vertices; at most {most} are read."
+        raise ParseError(path, "header", problem, hint)
     if not vertex.properties:
         raise ParseError(path, "header", "vertices without properties.", hint)
     if any(kind == LIST for _, kind in vertex.properties):
