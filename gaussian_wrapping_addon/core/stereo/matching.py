@@ -501,8 +501,8 @@ class MatchingLevel:
             back_maps.append(_map(lens_here, rotation.T, -rotation.T @ offset, lens_there))
             sizes.append((there.width - 1, there.height - 1))
         bases = np.asarray(self.sources[view], np.uint64) * np.uint64(self._photo_pixels)
-        there_and_back = (np.array(rows, np.float32).reshape(-1, 12) for rows in (maps, back_maps))
-        return (*there_and_back, np.array(sizes, np.float32).reshape(-1, 2), bases)
+        forth, back = (np.array(rows, np.float32).reshape(-1, 12) for rows in (maps, back_maps))
+        return forth, back, np.array(sizes, np.float32).reshape(-1, 2), bases
 
 
 def _matrix(camera: Camera) -> np.ndarray:
