@@ -51,6 +51,7 @@ def test_a_folder_is_read_as_written(tmp_path: Path) -> None:
     assert truth.seen is not None
     assert (truth.judged() == (values["points"][:, 2] >= 0)).all()
     assert (truth.visible() == (values["seen"] >= 2)).all()
+    assert (truth.visible(1) == (values["seen"] >= 1)).all()
     part = truth.kept(truth.thin)
     assert len(part.samples) == values["thin"].sum()
     assert part.seen is not None

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from benchmarks.plots import Panel, Series, write_svg
+from gaussian_wrapping_addon.core.evaluation.report.pictures import Panel, Series, write_svg
 
 SPACE = "{http://www.w3.org/2000/svg}"
 
