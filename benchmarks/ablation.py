@@ -15,8 +15,7 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from gaussian_wrapping_addon.core.evaluation.report.pictures import Panel, Series, write_svg
-
+from .plots import Panel, Series, write_svg
 from .provenance import write_page
 from .study import (
     MBR_NOTE,

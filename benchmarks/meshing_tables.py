@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.evaluation.report.pictures import Panel, Series, write_svg
 from gaussian_wrapping_addon.core.evaluation.surface_scores import (
     Truth,
     read_truth,
@@ -54,6 +53,7 @@ from .meshing_runs import (
     Made,
     Outcome,
 )
+from .plots import Panel, Series, write_svg
 from .tables import AT, MIDDLE, SHARES, Row, Table, table_of, thin_recall, three
 
 _logger = logging.getLogger(__name__)

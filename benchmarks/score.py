@@ -21,7 +21,6 @@ import numpy as np
 from PIL import Image
 
 from gaussian_wrapping_addon.core.evaluation.command import read_cameras
-from gaussian_wrapping_addon.core.evaluation.field_errors import depth_errors, vacancy_errors
 from gaussian_wrapping_addon.core.evaluation.mesh_rendering import render_views
 from gaussian_wrapping_addon.core.evaluation.surface_scores import (
     Truth,
@@ -45,6 +44,7 @@ from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
 from gaussian_wrapping_addon.core.scene.scene import Scene, load_saved_scene
 from gaussian_wrapping_addon.core.texture.file_checks import atlas_file
 
+from .field_errors import depth_errors, vacancy_errors
 from .runs import THRESHOLD_SHARES
 
 SURFACE_SAMPLES = 200_000

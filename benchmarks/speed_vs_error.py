@@ -19,7 +19,6 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from gaussian_wrapping_addon.core.evaluation.mesh_rendering import BACKGROUND, TexturedRenderer
-from gaussian_wrapping_addon.core.evaluation.report.pictures import Panel, Series, write_svg
 from gaussian_wrapping_addon.core.evaluation.surface_scores import read_truth
 from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
@@ -28,6 +27,7 @@ from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.scene.scene import load_saved_scene
 
 from .alpha_shape import make_alpha
+from .plots import Panel, Series, write_svg
 from .provenance import write_page
 from .runs import PRESETS, THRESHOLD_SHARES
 from .scenes.cache import ensure_scene
@@ -298,7 +298,7 @@ def write_comparison(scene: Path, runs: Sequence[tuple[str, Path]], path: Path) 
         distance = distances_to_mesh(centres, truth.vertices, truth.faces)[0] / diagonal
         colors = np.array(ERROR_COLORS, float)[np.searchsorted(THRESHOLD_SHARES, distance)]
         if truth.crop is not None:
-            colors[~truth.crop.inside(centres)] = NOT_JUDGED
+            colors[~truth.crop.contains(centres)] = NOT_JUDGED
         bottom.append((f"{label}: error", shade(mesh.vertices, mesh.faces, colors, camera, size)))
     rows = [
         np.concatenate([_labelled(image, text) for text, image in row], 1) for row in (top, bottom)

@@ -106,10 +106,10 @@ def compared(
         middle = ranked[len(ranked) // 2].name
         write_side_by_side(picture, *shown[middle], max_width_px=PICTURE_WIDTH_PX)
     return {
-        "psnr": score.psnr,
+        "psnr": score.mean("psnr"),
         "fitted_psnr": float(np.mean(fitted)),
-        "ssim": score.ssim,
-        "covered": score.covered,
+        "ssim": score.mean("ssim"),
+        "covered": score.mean("covered"),
         "views": len(score.views),
     }
 

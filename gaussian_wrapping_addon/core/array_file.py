@@ -44,23 +44,18 @@ def write_arrays(path: Path, **arrays: np.ndarray) -> None:
 
 
 def read_arrays(
-    path: Path,
-    names: Iterable[str] | None = None,
-    *,
-    optional: Iterable[str] = (),
-    most_bytes: int | None = None,
-    hint: str = "",
-) -> dict[str, np.ndarray]:
+    path: Path, names: Iterable[str] | None = None, *, optional: Iterable[str] = (),
+    most_bytes: int | None = None, hint: str = "",
+) -> dict[str, np.ndarray]:  # fmt: skip
     """Read arrays of a file written by ``numpy.savez``.
 
     Parameters
     ----------
     path : Path
         The file itself, not a link to it.
-    names : iterable of str, optional
-        Arrays that it must hold; ``None`` reads all that it holds.
-    optional : iterable of str
-        Arrays that it may hold; the others are not read.
+    names, optional : iterable of str
+        Arrays that it must hold and may hold, the others are not read; without names, all that it
+        holds.
     most_bytes : int, optional
         Largest size of those that are read when unpacked; without it compressed entries are
         refused.

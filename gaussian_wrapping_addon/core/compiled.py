@@ -154,15 +154,9 @@ FUSED_MATH = {"contract"}
 def kernel(*, fast: bool, fused: bool = False) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function on first call, with the GIL released.
 
-    Kernels are called from Python and never call one another: see :func:`part`.
-
-    Parameters
-    ----------
-    fast : bool
-        Allow reassociation and fused operations (float32 raster loops). ``False`` for geometry that
-        needs exact comparisons.
-    fused : bool
-        With ``fast=False``: allow fused multiply-adds.
+    Kernels are called from Python and never call one another: see :func:`part`. ``fast`` allows
+    reassociation and fused operations (float32 raster loops); without it, for geometry that needs
+    exact comparisons, ``fused`` allows fused multiply-adds.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:

@@ -17,19 +17,13 @@ EXIT_CANCELLED = 5
 DISK_FULL_ERRNOS = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG)
 """Error numbers of a full disk or an exhausted quota."""
 
-SHOWN_PATH = 80
-"""Characters of an over-long path that a message shows."""
+SHOWN_PATH = 80  # characters of an over-long path that a message shows
 
 
 class WrapError(Exception):
     """Base of all errors that are shown to users.
 
-    Parameters
-    ----------
-    message : str
-        One sentence: what is wrong and where.
-    hint : str
-        The next step for the user.
+    The message is one sentence: what is wrong and where; the hint is the next step for the user.
     """
 
     exit_code = EXIT_OTHER
@@ -38,8 +32,7 @@ class WrapError(Exception):
 
     def __init__(self, message: str, hint: str = "") -> None:
         super().__init__(message)
-        self.message = message
-        self.hint = hint
+        self.message, self.hint = message, hint
 
     def __str__(self) -> str:
         return f"{self.message} {self.hint}".strip()
@@ -54,18 +47,13 @@ class UsageError(WrapError):
 class SettingError(UsageError):
     """A setting out of range; ``called`` names the option that set it, if known.
 
-    Parameters
-    ----------
-    setting : str
-        Path in the job's settings, such as ``"meshing.tiles"``.
-    wanted : str
-        The allowed values.
+    ``setting`` is its path in the job's settings, such as ``"meshing.tiles"``; ``wanted`` tells the
+    allowed values.
     """
 
     def __init__(self, setting: str, wanted: str, *, called: str = "") -> None:
         super().__init__(f"{called or f'Setting {setting}'} is out of range.", f"Give {wanted}.")
-        self.setting = setting
-        self.wanted = wanted
+        self.setting, self.wanted = setting, wanted
 
 
 class DatasetError(WrapError):
@@ -77,18 +65,12 @@ class DatasetError(WrapError):
 class ParseError(DatasetError):
     """A file violates its format.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    location : str
-        Location in the file, such as ``"byte 120"``, ``"line 7"`` or ``"frames[3].file_path"``.
+    The location in it is such as ``"byte 120"``, ``"line 7"`` or ``"frames[3].file_path"``.
     """
 
     def __init__(self, path: str | Path, location: str, message: str, hint: str = "") -> None:
         super().__init__(f"{Path(path).name}, {location}: {message}", hint)
-        self.path = Path(path)
-        self.location = location
+        self.path, self.location = Path(path), location
 
 
 class ResourceError(WrapError):
@@ -117,10 +99,7 @@ class WorkerError(WrapError):
 class MissingExtraError(WorkerError):
     """The worker lacks optional packages that the input needs.
 
-    Parameters
-    ----------
-    extras : sequence of str
-        Their names, as ``set-up-worker --add`` takes them.
+    ``extras`` are their names, as ``set-up-worker --add`` takes them.
     """
 
     exit_code = EXIT_BAD_DATA

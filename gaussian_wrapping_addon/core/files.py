@@ -42,14 +42,9 @@ _HINT = "Remove it, or put the file that it stands for in its place."
 def open_regular(path: Path, mode: str = "rb", *, follow_links: bool = False) -> IO[bytes]:
     """Open a regular file and nothing else; never waits for the other end of a pipe.
 
-    Parameters
-    ----------
-    path : Path
-        The file. Only its last part is checked for links, see :func:`reject_foreign_entries`.
-    mode : str
-        ``"rb"``, ``"r+b"``, or ``"wb"`` and ``"ab"``, which create the file if it is missing.
-    follow_links : bool
-        Whether the path may be a link, as for files that the user has named.
+    The mode is ``"rb"``, ``"r+b"``, or ``"wb"`` and ``"ab"``, which create the file if it is
+    missing. Only the last part of the path is checked for links (:func:`reject_foreign_entries`),
+    unless ``follow_links``, as for files that the user has named.
 
     Raises
     ------
@@ -58,9 +53,9 @@ def open_regular(path: Path, mode: str = "rb", *, follow_links: bool = False) ->
     OSError
         It does not exist, or the system refuses.
     """
-    if not follow_links:
-        # Where O_NOFOLLOW is missing (Windows), this look is all there is.
-        _refuse_link(path)
+    # Where O_NOFOLLOW is missing (Windows), this look is all there is.
+    if not follow_links and is_link(path):
+        raise _not_regular(path, "a link")
     flags = _FLAGS[mode] | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
     # Without O_NONBLOCK, opening a named pipe waits until somebody opens its other end.
     flags |= getattr(os, "O_NONBLOCK", 0) | (0 if follow_links else getattr(os, "O_NOFOLLOW", 0))
@@ -139,12 +134,7 @@ def reject_foreign_entries(root: Path, *, but: frozenset[str] = frozenset()) -> 
     """Raise if a folder holds, at any depth, anything but regular files and folders.
 
     The folder itself may be reached through links. What disappears meanwhile is no error: a job
-    may be running.
-
-    Parameters
-    ----------
-    but : frozenset of str
-        Names of folders that are not looked into.
+    may be running. Folders named in ``but`` are not looked into.
 
     Raises
     ------
@@ -166,9 +156,7 @@ def reject_foreign_entries(root: Path, *, but: frozenset[str] = frozenset()) -> 
             ) from None
 
 
-def _check_entry(
-    entry: os.DirEntry[str], folders: list[Path], but: frozenset[str] = frozenset()
-) -> None:
+def _check_entry(entry: os.DirEntry[str], folders: list[Path], but: frozenset[str]) -> None:
     try:
         found = entry.stat(follow_symlinks=False)
     except FileNotFoundError:
@@ -184,11 +172,6 @@ def _check_entry(
             "else could lead out of them.",
             "Remove it, or put what it stands for in its place.",
         )
-
-
-def _refuse_link(path: Path) -> None:
-    if is_link(path):
-        raise _not_regular(path, "a link")
 
 
 def _is_link(found: os.stat_result) -> bool:
@@ -306,12 +289,8 @@ def finite_json(values: Any) -> Any:
 def read_json(path: Path, *, most_bytes: int | None = None, follow_links: bool = False) -> Any:
     """Read JSON with limits on size and depth; NaN and infinities are rejected.
 
-    Parameters
-    ----------
-    most_bytes : int, optional
-        Default: ``limits.MAX_JSON_BYTES``.
-    follow_links : bool
-        Whether the path may be a link, as for files that the user has named.
+    By default it may have ``limits.MAX_JSON_BYTES``; the path may be a link if ``follow_links``, as
+    for files that the user has named.
 
     Raises
     ------
@@ -352,9 +331,8 @@ def read_json(path: Path, *, most_bytes: int | None = None, follow_links: bool =
 def _check_depth(path: Path, values: Any, depth: int) -> None:
     if depth > limits.MAX_JSON_DEPTH:
         raise _too_deep(path)
-    children = values.values() if isinstance(values, dict) else values
     if isinstance(values, (dict, list)):
-        for child in children:
+        for child in values.values() if isinstance(values, dict) else values:
             _check_depth(path, child, depth + 1)
 
 
@@ -385,6 +363,4 @@ def resolve_inside(root: Path, name: str) -> Path | None:
     if any(is_reserved_name(part) for part in parts):
         return None
     path = root.joinpath(*parts)
-    if not real_path(path).is_relative_to(real_path(root)):
-        return None
-    return path
+    return path if real_path(path).is_relative_to(real_path(root)) else None

@@ -24,20 +24,15 @@ MAX_LEVELS = 8
 class Pyramid:
     """Image levels in one flat array, each half the size of the previous one."""
 
-    pixels: np.ndarray
-    """(n, 3) uint8 pixels of all levels, row by row."""
-    levels: np.ndarray
-    """(levels, 3) int64: first pixel, width, height."""
+    pixels: np.ndarray  # (n, 3) uint8 pixels of all levels, row by row
+    levels: np.ndarray  # (levels, 3) int64: first pixel, width, height
 
 
-def pyramid(image: np.ndarray, max_levels: int = MAX_LEVELS) -> Pyramid:
-    """Build a pyramid by averaging 2 x 2 pixels; odd borders are repeated, so scales are exact.
+def pyramid(image: np.ndarray) -> Pyramid:
+    """Build a pyramid of an image (h, w, 3) uint8 by averaging 2 x 2 pixels.
 
-    Parameters
-    ----------
-    image : (h, w, 3) uint8
-    max_levels : int
-        Upper bound; the pyramid also ends at one pixel.
+    It ends at one pixel, or after :data:`MAX_LEVELS`. Odd borders are repeated, so scales are
+    exact.
     """
     parts, levels, begin = [], [], 0
     current = image
@@ -46,7 +41,7 @@ def pyramid(image: np.ndarray, max_levels: int = MAX_LEVELS) -> Pyramid:
         parts.append(current.reshape(-1, 3))
         levels.append((begin, width, height))
         begin += width * height
-        if len(levels) >= max_levels or max(width, height) == 1:
+        if len(levels) >= MAX_LEVELS or max(width, height) == 1:
             break
         even = np.pad(current, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         total = even[0::2, 0::2].astype(np.uint16) + even[1::2, 0::2]
@@ -107,9 +102,7 @@ def trilinear(
 # each run, as LLVM cannot prove that the target is another array.
 
 
-LANES = 16
-"""Values per run. LLVM splits a run into as many registers as needed."""
-
+LANES = 16  # Values per run. LLVM splits a run into as many registers as needed.
 TAPS = 11
 HALF = TAPS // 2 + 1
 RING = TAPS + 1

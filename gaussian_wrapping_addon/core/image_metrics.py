@@ -9,7 +9,6 @@ import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,15 +17,10 @@ from .filters import LANES, RING, TAPS, filter_run, filter_two_runs
 from .parallel import even_bounds, run_chunks
 from .resampling import as_unit_floats, check_sizes
 
-if TYPE_CHECKING:
-    pass
-
-
 # -- Compiled comparison of two images: errors, structural similarity (SSIM), and the gradient ----
 
 
-WINDOW = TAPS
-"""Side of the Gaussian window, pixels; sigma is 1.5 (docs/method.md, section 3.1)."""
+WINDOW = TAPS  # Side of the Gaussian window, pixels; sigma is 1.5 (docs/method.md, section 3.1).
 RADIUS = WINDOW // 2
 SIGMA_PX = 1.5
 REACH = WINDOW - 1
@@ -38,9 +32,7 @@ WEIGHTS = tuple(float(tap / sum(_taps)) for tap in _taps)
 C1 = 0.01**2
 C2 = 0.03**2
 
-BLOCK_PX = 512
-"""Width of a column block: the buffered last rows of one fit a cache of 1 MB."""
-
+BLOCK_PX = 512  # width of a column block: the buffered last rows of one fit a cache of 1 MB
 _AVERAGED = 4  # x, y, x^2 + y^2, x y: SSIM only needs the sum of the two variances
 _MAPS = 3  # derivatives of SSIM with respect to E[x], E[x^2] and E[x y] of its window
 _MARGIN = 3 * REACH
@@ -275,9 +267,7 @@ def compare_rows(  # type: ignore[no-untyped-def]
 # -- PSNR, SSIM and LPIPS between a rendered view and its photo, over the pixels of a mask --------
 
 
-PSNR_CAP_DB = 100.0
-"""Replaces the infinite PSNR of equal images in averages and reports."""
-
+PSNR_CAP_DB = 100.0  # replaces the infinite PSNR of equal images in averages and reports
 _NO_MASK = np.zeros((0, 0), np.bool_)
 
 
@@ -285,11 +275,9 @@ _NO_MASK = np.zeros((0, 0), np.bool_)
 class ViewScores:
     """Metrics between an image and its photo."""
 
-    psnr: float
-    """dB, at most :data:`PSNR_CAP_DB`."""
+    psnr: float  # dB, at most :data:`PSNR_CAP_DB`
     ssim: float
-    lpips: float | None = None
-    """``None`` where it was not measured."""
+    lpips: float | None = None  # ``None`` where it was not measured
 
     def to_json(self) -> dict[str, float]:
         """Return plain JSON values; ``lpips`` only where it was measured."""
@@ -301,12 +289,9 @@ class ViewScores:
 class Comparison:
     """Errors and SSIM of an image over the pixels of a mask, and their gradient."""
 
-    absolute: float
-    """Mean absolute error over pixels and colours; 0 if there are none."""
-    squared: float
-    """Mean squared error."""
-    similarity: float
-    """Mean SSIM over windows and colours; 1 if there are none."""
+    absolute: float  # Mean absolute error over pixels and colours; 0 if there are none.
+    squared: float  # mean squared error
+    similarity: float  # Mean SSIM over windows and colours; 1 if there are none.
     windows: int
     gradient: np.ndarray | None
     """(h, w, 3), of the image's type: derivative of ``weights[0] absolute + weights[1] similarity``
@@ -316,12 +301,8 @@ class Comparison:
 def psnr(image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the peak signal-to-noise ratio in dB; infinite for equal images.
 
-    Parameters
-    ----------
-    image, photo : (h, w, 3)
-        uint8, or floats whose white is 1. The image is clamped to [0, 1] as a display would.
-    mask : (h, w) bool, optional
-        Pixels to measure.
+    Both are (h, w, 3) uint8, or floats whose white is 1, and measured at the pixels of the mask
+    (h, w) bool. The image is clamped to [0, 1] as a display would.
 
     Raises
     ------
@@ -348,25 +329,15 @@ def ssim(
 
 
 def score_images(
-    image: np.ndarray,
-    photo: np.ndarray,
-    mask: np.ndarray | None = None,
-    *,
-    lpips: Lpips | None = None,
-    threads: int = 1,
-) -> ViewScores:
-    """Return all metrics of an image and its photo.
+    image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None, *,
+    lpips: Lpips | None = None, threads: int = 1,
+) -> ViewScores:  # fmt: skip
+    """Return all metrics of an image and its photo, as for :func:`psnr`.
 
-    Parameters
-    ----------
-    image, photo : (h, w, 3)
-        uint8, or floats whose white is 1. The image is clamped to [0, 1] as a display would.
-    mask : (h, w) bool, optional
-        Pixels to compare. PSNR is over these; SSIM over the windows centred on them, both images
-        black elsewhere (1 if there are none: see :func:`has_windows`); LPIPS is of the whole image,
-        with the photo's pixels in both elsewhere.
-    lpips : Lpips, optional
-        Without it, or if the image is too small for it, LPIPS is not measured.
+    PSNR is over the pixels of the mask; SSIM over the windows centred on them, both images black
+    elsewhere (1 if there are none: see :func:`has_windows`); LPIPS is of the whole image, with the
+    photo's pixels in both elsewhere. Without ``lpips``, or if the image is too small for it, it is
+    not measured.
 
     Raises
     ------
@@ -391,18 +362,15 @@ def has_windows(shape: tuple[int, ...], mask: np.ndarray | None = None) -> bool:
 
 
 def compare(
-    image: np.ndarray,
-    photo: np.ndarray,
-    mask: np.ndarray | None = None,
-    *,
-    weights: tuple[float, float] | None = None,
-    threads: int = 1,
-    out: np.ndarray | None = None,
-) -> Comparison:
+    image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None, *,
+    weights: tuple[float, float] | None = None, threads: int = 1, out: np.ndarray | None = None,
+) -> Comparison:  # fmt: skip
     """Return the mean errors and the mean SSIM, with their gradient if weights are given.
 
     The window of SSIM is 11 x 11, Gaussian with sigma 1.5, "valid" padding. With a mask, both
     images are black outside it, and only windows centred inside it are counted.
+
+    The result is bitwise the same for any number of threads.
 
     Parameters
     ----------
@@ -416,11 +384,6 @@ def compare(
     out : (h, w, 3), C-contiguous, of the image's type, optional
         Receives the gradient; by default a new array.
 
-    Returns
-    -------
-    Comparison
-        Bitwise the same for any number of threads.
-
     Raises
     ------
     UsageError
@@ -433,14 +396,12 @@ def compare(
     height, width = image.shape[:2]
     inside = (slice(RADIUS, height - RADIUS), slice(RADIUS, width - RADIUS))
     if mask is None:
-        mask = _NO_MASK
-        pixels = height * width
+        mask, pixels = _NO_MASK, height * width
         windows = max(0, height - 2 * RADIUS) * max(0, width - 2 * RADIUS)
     else:
         mask = np.ascontiguousarray(mask, np.bool_)
         pixels = int(np.count_nonzero(mask))
-        fits = min(height, width) >= WINDOW
-        windows = int(np.count_nonzero(mask[inside])) if fits else 0
+        windows = int(np.count_nonzero(mask[inside])) if min(height, width) >= WINDOW else 0
     values, windows = 3 * pixels, 3 * windows
     flat_image, flat_photo = image.reshape(height, -1), photo.reshape(height, -1)  # (h, 3 w)
     sums = np.zeros((-(-width // BLOCK_PX), height, 3))
@@ -476,11 +437,8 @@ def compare(
 
 _logger = logging.getLogger(__name__)
 
-BACKBONE_PATTERN = "alexnet-owt-*.pth"
-"""Name of torchvision's AlexNet weights in torch's hub cache."""
-
-MIN_SIDE_PX = 31
-"""For smaller images, the last layers of AlexNet have no pixel."""
+BACKBONE_PATTERN = "alexnet-owt-*.pth"  # name of torchvision's AlexNet weights in torch's hub cache
+MIN_SIDE_PX = 31  # for smaller images, the last layers of AlexNet have no pixel
 
 
 def lpips_ready() -> tuple[bool, str]:
@@ -529,10 +487,7 @@ class Lpips:
     def distance(self, image: np.ndarray, photo: np.ndarray) -> float:
         """Return the distance: 0 for equal images, about 0.7 for unrelated ones.
 
-        Parameters
-        ----------
-        image, photo : (h, w, 3)
-            sRGB, uint8 or floats with white = 1; clamped to [0, 1] as by a display.
+        Both are (h, w, 3) sRGB, uint8 or floats with white = 1, clamped to [0, 1] as by a display.
         """
         import torch
 

@@ -15,8 +15,7 @@ MAX_IMAGE_PIXELS = 100_000_000
 MAX_IMAGE_SIDE_PX = 50_000
 MAX_VIDEO_S = 3600.0
 """Longest video: an hour; reading it takes about as long."""
-MAX_VIDEO_FRAMES = 250_000
-"""More than an hour at 60 frames a second."""
+MAX_VIDEO_FRAMES = 250_000  # more than an hour at 60 frames a second
 MAX_CHOSEN_FRAMES = 2000
 MAX_JSON_BYTES = 64 * 1024 * 1024
 MAX_STATUS_BYTES = 1024 * 1024
@@ -32,8 +31,7 @@ MAX_MESH_POINTS = 5_000_000
 MAX_TILES = 4096
 MAX_BLOCKS = 1024
 """Of a training: a plan keeps a flag for each Gaussian and block."""
-MAX_PARTS = 50_000
-"""Of a job: those of a few regions of the most tiles."""
+MAX_PARTS = 50_000  # of a job: those of a few regions of the most tiles
 MAX_PARTS_BYTES = 32 * 1024 * 1024
 MAX_TEXTURE_SIDE_PX = 8192
 MAX_ATLASES = 16
@@ -77,9 +75,7 @@ CANCEL_GRACE_S = 9.0
 SCENE_RADIUS = 5.0
 """Scenes are scaled so that 1.1 x the largest distance of a camera from their mean equals this."""
 
-FAR_RADIUS = 10.0 * SCENE_RADIUS
-"""From here on a Gaussian may stand for the sky."""
-
+FAR_RADIUS = 10.0 * SCENE_RADIUS  # from here on a Gaussian may stand for the sky
 POINT_REACH = 1e4 * SCENE_RADIUS
 """Sparse points farther than this from the centre of the cameras are not used.
 
@@ -133,27 +129,19 @@ FINITE_PULL = 1e18
 FINITE_Z_MIN, FINITE_Z_MAX = 1e-9, 1e12
 """Range of z-depths. The larger, over the smallest ``den`` and times the largest ``1 + p.d``
 (1e8, the root of the largest ``den``), is 1e36; gradients contain 1 / z."""
-FINITE_SIGMA_Z = 1e15
-"""Largest sigma_z: its inverse square, the smallest a0, is a normal float32."""
-FINITE_COLOR = 2.0**24
-"""Beyond, a float32 sum no longer resolves white added to it."""
+FINITE_SIGMA_Z = 1e15  # largest sigma_z: its inverse square, the smallest a0, is a normal float32
+FINITE_COLOR = 2.0**24  # beyond, a float32 sum no longer resolves white added to it
 
 # Multi-view terms (docs/method.md, section 3.4).
-HALF_PATCH = 3
-"""A patch has ``2 * 3 + 1`` samples per side ..."""
-PATCH_STEP_PX = 0.5
-"""... half a pixel of the reference apart, where that is not flat."""
-MAX_NOISE_PX = 1.0
-"""Points with a larger reprojection error are occluded or wrong in one view."""
-MIN_NOISE_PX = 1e-9
-"""Below this, the direction of the reprojection error is rounding: no gradient."""
+HALF_PATCH = 3  # a patch has ``2 * 3 + 1`` samples per side ...
+PATCH_STEP_PX = 0.5  # ... half a pixel of the reference apart, where that is not flat.
+MAX_NOISE_PX = 1.0  # points with a larger reprojection error are occluded or wrong in one view
+MIN_NOISE_PX = 1e-9  # below this, the direction of the reprojection error is rounding: no gradient
 SPREAD_PRODUCT = 1e-8
 """Added to the product of the sums of squared deviations of two patches: patches of weak contrast
 correlate less."""
-MAX_PATCH_ERROR = 0.9
-"""Patches with a larger error show different things."""
-MIN_PLANE_NORMAL = 0.3
-"""Shortest blended normal that defines a plane."""
+MAX_PATCH_ERROR = 0.9  # patches with a larger error show different things
+MIN_PLANE_NORMAL = 0.3  # shortest blended normal that defines a plane
 MIN_PLANE_FACING = 0.1
 """Smallest cosine between normal and ray (84 degrees): more grazing planes have no patch."""
 PATCH_SKIPPED, PATCH_KEPT, PATCH_BROKEN = 0, 1, 2

@@ -154,18 +154,17 @@ def _reclaimable(folder: Path, key: str) -> int:
 
 def describe_machine(threads: int) -> dict[str, Any]:
     """Return processor, cores, memory, Python and package versions as plain JSON values."""
-    versions = {}
-    for name in PACKAGES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "missing"
     return {
-        "processor": processor_name(),
-        "cores": os.cpu_count(),
-        "threads": threads,
+        "processor": processor_name(), "cores": os.cpu_count(), "threads": threads,
         "memory_bytes": total_memory_bytes(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "packages": versions,
-    }
+        "packages": {name: _version(name) for name in PACKAGES},
+    }  # fmt: skip
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "missing"

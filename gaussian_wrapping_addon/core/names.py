@@ -22,19 +22,16 @@ from .errors import UsageError
 # made from the name of the folder or object (:func:`file_stem`).
 
 
-AUTOMATIC_REGIONS = ("auto", "all")
-"""Values that a job accepts instead of a region file."""
+AUTOMATIC_REGIONS = ("auto", "all")  # values that a job accepts instead of a region file
 REPORT_FOLDER = "report"
 """Folder of the report's pictures in a result; reserved, no region may use it."""
-JOB_MARKER = ".gaussian-wrapping-job"
-"""Empty file that makes a folder one of a job."""
+JOB_MARKER = ".gaussian-wrapping-job"  # empty file that makes a folder one of a job
 SHARED_VARIABLE = "GW_SHARED"
 """Environment variable that names the folder that several computers share, as each sees it."""
 MAX_REGION_CHARACTERS = 40
 MAX_STEM_BYTES = 120
 """With suffixes, and those of atomic writing, names stay below the 255 bytes of file systems."""
-SPLAT_STEM = "gaussians.splat"
-"""Stem of the splat file beside the meshes."""
+SPLAT_STEM = "gaussians.splat"  # stem of the splat file beside the meshes
 _DIGITS = 8
 
 _RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{d}{i}" for d in ("COM", "LPT") for i in range(1, 10))}
@@ -61,12 +58,7 @@ def printable_name(name: Any) -> str:
 def region_name(request: str, body: Any) -> str:
     """Return the folder name of a requested region: ASCII, short, never empty.
 
-    Parameters
-    ----------
-    request : str
-        One of :data:`AUTOMATIC_REGIONS`, or the path of a region file.
-    body : object
-        Content of that file.
+    The request is one of :data:`AUTOMATIC_REGIONS`, or the path of a region file with this body.
     """
     if request in AUTOMATIC_REGIONS:
         return request
@@ -85,12 +77,7 @@ def _requested_name(request: str, body: Any) -> str:
 
 
 def region_names(requests: Sequence[str], bodies: Mapping[str, Any]) -> list[str]:
-    """Return the folder names of all requested regions.
-
-    Parameters
-    ----------
-    bodies : mapping
-        Content of the region files, by request.
+    """Return the folder names of all requested regions, by the contents of the region files.
 
     Raises
     ------
@@ -130,12 +117,8 @@ def file_stems(meshes: Iterable[tuple[str, int]]) -> dict[tuple[str, int], str]:
     """Return the stems of all meshes of a result, unique even if case is ignored.
 
     Colliding stems all end with a hash of their own name, which does not depend on which of them
-    are written, so that a later export overwrites none of the others.
-
-    Parameters
-    ----------
-    meshes : iterable of (region, level)
-        All meshes of the result, not only those to be written.
+    are written, so that a later export overwrites none of the others. Meshes are all (region,
+    level) of the result, not only those to be written.
     """
     stems = {mesh: file_stem(*mesh) for mesh in meshes}
     count = Counter([SPLAT_STEM, *(stem.casefold() for stem in stems.values())])
@@ -166,27 +149,19 @@ SHADINGS = ("auto", "lit", "unlit")
 class ExportFormat:
     """Names, writer and capabilities of an export format."""
 
-    name: str
-    """Identifier in options and job files."""
-    label: str
-    """Label in Blender's panel."""
-    help: str
-    """Content, for the panel's tooltip."""
+    name: str  # identifier in options and job files
+    label: str  # label in Blender's panel
+    help: str  # content, for the panel's tooltip
     suffix: str
     needs_blender: bool = False
     """Whether only Blender's exporter writes it; the worker writes the others."""
-    in_jobs: bool = True
-    """Whether a job can write it with its result (``--export``)."""
-    of_mesh: bool = True
-    """Whether it contains a mesh; otherwise the Gaussians."""
+    in_jobs: bool = True  # whether a job can write it with its result (``--export``)
+    of_mesh: bool = True  # Whether it contains a mesh; otherwise the Gaussians.
     textures: str = "beside"
     """``"inside"`` the file, ``"beside"`` it, ``"either"`` (an option), or ``"none"``."""
-    packed_suffix: str = ""
-    """Suffix of a file with packed textures, if it differs from ``suffix``."""
-    y_up: bool = False
-    """Whether its up axis is Y; otherwise Z."""
-    doubles: bool = False
-    """Whether coordinates are double precision and need no offset."""
+    packed_suffix: str = ""  # suffix of a file with packed textures, if it differs from ``suffix``
+    y_up: bool = False  # Whether its up axis is Y; otherwise Z.
+    doubles: bool = False  # whether coordinates are double precision and need no offset
     unlit: str = "lit"
     """Export of an unlit material in Blender: ``"keep"``, ``"emission"`` or ``"lit"``."""
 
@@ -241,5 +216,4 @@ POINTS, GATHER, FACES = "points", "gather", "faces"
 TILE_KINDS = (POINTS, GATHER, FACES)
 """In the order in which they are made."""
 
-CPU = "cpu"
-"""The processor, as the name of a device."""
+CPU = "cpu"  # the processor, as the name of a device

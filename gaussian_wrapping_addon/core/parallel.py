@@ -34,19 +34,9 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def balanced_bounds(costs: np.ndarray, chunks: int) -> np.ndarray:
-    """Split items into runs of about equal cost.
+    """Split items of costs (n,) >= 0 into about so many runs of about equal cost.
 
-    Parameters
-    ----------
-    costs : (n,) array
-        Cost of each item, >= 0.
-    chunks : int
-        Desired number of runs.
-
-    Returns
-    -------
-    (m,) int64
-        Increasing bounds from 0 to n; run i is ``[bounds[i], bounds[i + 1])``.
+    Returns increasing bounds (m,) int64 from 0 to n; run i is ``[bounds[i], bounds[i + 1])``.
     """
     total = np.concatenate([[0.0], np.cumsum(np.asarray(costs, dtype=np.float64))])
     cuts = np.searchsorted(total, np.linspace(0.0, total[-1], chunks + 1))
@@ -113,12 +103,10 @@ def run_rows(
 # -- Memory for large arrays, aligned so that the system can use huge pages -----------------------
 
 
-_PAGE_BYTES = 1 << 21
-"""A huge page of x86, and of ARM with 4 kB pages."""
+_PAGE_BYTES = 1 << 21  # a huge page of x86, and of ARM with 4 kB pages
 _LARGE_BYTES = 1 << 19
 """Smallest array to align; for smaller ones a huge page would be mostly empty."""
-_ADVISED_BYTES = 1 << 22
-"""Allocation size from which numpy requests huge pages from Linux."""
+_ADVISED_BYTES = 1 << 22  # allocation size from which numpy requests huge pages from Linux
 
 
 def empty_array(count: int, dtype: DTypeLike) -> np.ndarray:
@@ -159,16 +147,10 @@ class ArrayStore:
     def take(
         self, name: str, shape: tuple[int, ...] | int, dtype: DTypeLike, limit: int | None = None
     ) -> np.ndarray:
-        """Return an uninitialised C-contiguous array.
+        """Return an uninitialised C-contiguous array, as :func:`numpy.empty` does.
 
-        Parameters
-        ----------
-        name : str
-            A name has one dtype and one shape after the first axis.
-        shape, dtype
-            As for :func:`numpy.empty`.
-        limit : int, optional
-            Largest number of rows to reserve ahead of need.
+        A name has one dtype and one shape after the first axis. At most ``limit`` rows are reserved
+        ahead of need.
         """
         shape = (shape,) if isinstance(shape, int) else shape
         kept = self._kept.get(name)
@@ -177,12 +159,10 @@ class ArrayStore:
             # Free the old memory before allocating the new.
             self._kept.pop(name, None)
             kept = None
-            rows, row_size = shape[0], math.prod(shape[1:])
-            reserved = rows + int(_GROWTH * rows)
+            reserved = shape[0] + int(_GROWTH * shape[0])
             if limit is not None:
-                reserved = max(rows, min(reserved, limit))
-            kept = empty_array(reserved * row_size, dtype)
-            self._kept[name] = kept
+                reserved = max(shape[0], min(reserved, limit))
+            kept = self._kept[name] = empty_array(reserved * math.prod(shape[1:]), dtype)
         return kept[:size].reshape(shape)
 
     def zeros(self, name: str, shape: tuple[int, ...] | int, dtype: DTypeLike) -> np.ndarray:

@@ -27,8 +27,7 @@ _TYPES = {
 
 _ENCODINGS = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}
 
-LIST = "list"
-"""Type of a list property; only elements after the vertices may have one."""
+LIST = "list"  # Type of a list property; only elements after the vertices may have one.
 
 
 @dataclass(frozen=True)
@@ -50,12 +49,10 @@ class PlyElement:
 class PlyHeader:
     """A parsed header."""
 
-    encoding: str
-    """``"ascii"``, or the byte order ``"<"`` or ``">"``."""
+    encoding: str  # ``"ascii"``, or the byte order ``"<"`` or ``">"``
     elements: tuple[PlyElement, ...]
     comments: tuple[str, ...]
-    begin: int
-    """Offset of the body in bytes."""
+    begin: int  # offset of the body in bytes
 
     def count(self, element: str) -> int:
         """Return the declared count of an element, 0 if it is not declared."""
@@ -63,13 +60,7 @@ class PlyHeader:
 
 
 def read_ply_header(path: Path, hint: str) -> PlyHeader:
-    """Read a header of at most :data:`MAX_HEADER_BYTES`.
-
-    Parameters
-    ----------
-    path : Path
-    hint : str
-        Hint of every error.
+    """Read a header of at most :data:`MAX_HEADER_BYTES`; every error has the hint.
 
     Raises
     ------
@@ -143,10 +134,8 @@ def vertex_layout(
         raise ParseError(path, "header", "the first element is not named vertex.", hint)
     vertex = header.elements[0]
     if vertex.count > most:
-        raise ParseError(
-            path, "header", f"{vertex.count} vertices; at most {most} are read.",
-            hint,
-        )  # fmt: skip
+        problem = f"{vertex.count} vertices; at most {most} are read."
+        raise ParseError(path, "header", problem, hint)
     if not vertex.properties:
         raise ParseError(path, "header", "vertices without properties.", hint)
     if any(kind == LIST for _, kind in vertex.properties):
@@ -170,22 +159,9 @@ def read_vertices(
 ) -> np.ndarray:
     """Read the vertices, the first element of a file.
 
-    Nothing is allocated before the file is known to be as long as its header declares.
-
-    Parameters
-    ----------
-    path : Path
-    header : PlyHeader
-        Header of the file.
-    hint : str
-        Hint of every error.
-    most : int
-        Greatest number of vertices that is accepted.
-
-    Returns
-    -------
-    (n,) structured array
-        One field per property; for ASCII files all are float64.
+    Nothing is allocated before the file is known to be as long as its header declares. Up to
+    ``most`` vertices are accepted; every error has the hint. Returns an (n,) structured array with
+    one field per property; for ASCII files all are float64.
 
     Raises
     ------

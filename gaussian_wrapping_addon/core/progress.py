@@ -33,51 +33,32 @@ class ProgressEvent:
     message: str
     figures: dict[str, float] = field(default_factory=dict)
     seconds_left: float | None = None
-    phase: str = ""
-    """Phase for programs, such as :data:`COMPILING`."""
+    phase: str = ""  # phase for programs, such as :data:`COMPILING`
 
 
 class Progress:
     """Progress of a span of one stage; :meth:`span` returns a sub-span for a callee.
 
-    Parameters
-    ----------
-    stage : str
-        Name of the stage, such as ``"train"``.
-    sink : callable or None
-        Receives a :class:`ProgressEvent`; ``None`` drops them.
-    is_cancelled : callable or None
-        Polled by :meth:`check`, which raises :class:`Cancelled` if it returns true.
+    The ``sink`` receives each :class:`ProgressEvent`; ``is_cancelled`` is polled by :meth:`check`,
+    which raises :class:`Cancelled` if it returns true.
     """
 
     def __init__(
-        self,
-        stage: str = "",
-        sink: Callable[[ProgressEvent], None] | None = None,
-        is_cancelled: Callable[[], bool] | None = None,
-        *,
-        start: float = 0.0,
-        end: float = 1.0,
+        self, stage: str = "", sink: Callable[[ProgressEvent], None] | None = None,
+        is_cancelled: Callable[[], bool] | None = None, *, start: float = 0.0, end: float = 1.0,
         begun_s: float | None = None,
-    ) -> None:
-        self.stage = stage
-        self._sink = sink
-        self._is_cancelled = is_cancelled
-        self._start = start
-        self._end = end
+    ) -> None:  # fmt: skip
+        self.stage, self._sink, self._is_cancelled = stage, sink, is_cancelled
+        self._start, self._end = start, end
         self._begun_s = time.monotonic() if begun_s is None else begun_s
 
     def span(self, start: float, end: float) -> Progress:
         """Return the part [start, end] of this span, for a callee."""
         width = self._end - self._start
         return Progress(
-            self.stage,
-            self._sink,
-            self._is_cancelled,
-            start=self._start + width * start,
-            end=self._start + width * end,
-            begun_s=self._begun_s,
-        )
+            self.stage, self._sink, self._is_cancelled, start=self._start + width * start,
+            end=self._start + width * end, begun_s=self._begun_s,
+        )  # fmt: skip
 
     def cancelled(self) -> bool:
         """Return whether the user cancelled, without raising."""
@@ -170,10 +151,7 @@ def write_text(stream: IO[str], text: str) -> None:
 class TerminalHandler(logging.Handler):
     """Write records to a terminal, a pipe or a file; after a failure, which is kept, no more.
 
-    Parameters
-    ----------
-    stream : file of text or None
-        ``None`` where a program has none (a window without a console): nothing is written.
+    Without a stream, as in a program with a window but no console, nothing is written.
     """
 
     def __init__(self, stream: IO[str] | None) -> None:
@@ -235,10 +213,8 @@ class ReportWarning:
     code: str
     """Stable identifier for programs, such as ``"photos-not-placed"``; empty for texts read from
     version 0.1.0."""
-    text: str
-    """One or more sentences for the user."""
-    hint: str = ""
-    """What the user can do; empty if nothing is known to help."""
+    text: str  # one or more sentences for the user
+    hint: str = ""  # What the user can do; empty if nothing is known to help.
 
     def to_json(self) -> dict[str, str]:
         """Return plain JSON values."""
@@ -257,37 +233,22 @@ _HINTS_0_1_0 = (
     ("stand on one line", "Take photos from other heights and directions too."),
     ("models:", "Take photos that connect the parts, so that one model holds them all."),
     ("left out", "Check whether these are needed; if so, export the input again."),
-    (
-        "levels of detail were made",
-        "Ask for fewer (--set lods=N), or for a mesh of more faces.",
-    ),
+    ("levels of detail were made", "Ask for fewer (--set lods=N), or for a mesh of more faces."),
     ("ply_file_path", "Put the file where transforms.json says it is."),
 )
-
-
-def _hint_of_0_1_0(text: str) -> str:
-    return next((hint for mark, hint in _HINTS_0_1_0 if mark in text), "")
 
 
 def read_warnings(values: Any) -> tuple[ReportWarning, ...]:
     """Return the warnings of a JSON list; invalid entries are skipped.
 
-    Parameters
-    ----------
-    values : any
-        List of :meth:`ReportWarning.to_json` values, or of strings as written by version 0.1.0.
+    Entries are :meth:`ReportWarning.to_json` values, or strings as written by version 0.1.0.
     """
     found = []
     for value in values if isinstance(values, list) else []:
         if isinstance(value, str):
-            found.append(ReportWarning("", value, _hint_of_0_1_0(value)))
+            hint = next((hint for mark, hint in _HINTS_0_1_0 if mark in value), "")
+            found.append(ReportWarning("", value, hint))
         elif isinstance(value, dict) and isinstance(value.get("text"), str):
-            code, hint = (value.get(key) for key in ("code", "hint"))
-            found.append(
-                ReportWarning(
-                    code if isinstance(code, str) else "",
-                    value["text"],
-                    hint if isinstance(hint, str) else "",
-                )
-            )
+            code, hint = (v if isinstance(v := value.get(k), str) else "" for k in ("code", "hint"))
+            found.append(ReportWarning(code, value["text"], hint))
     return tuple(found)

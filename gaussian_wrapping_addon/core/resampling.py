@@ -16,18 +16,10 @@ from .parallel import even_bounds, run_chunks
 
 
 def sample_bicubic(photo: np.ndarray, where: np.ndarray, threads: int = 1) -> np.ndarray:
-    """Sample a photo with Catmull-Rom weights; coordinates are clamped at the border.
+    """Sample a photo (h, w, c) uint8 with Catmull-Rom weights, into (rows, columns, c) uint8.
 
-    Parameters
-    ----------
-    photo : (h, w, c) uint8
-    where : (rows, columns, 2) float32
-        Pixel coordinates x, y in ``photo``; the first pixel's centre is (0.5, 0.5).
-    threads : int
-
-    Returns
-    -------
-    (rows, columns, c) uint8
+    ``where`` (rows, columns, 2) float32 holds pixel coordinates x, y in the photo, clamped at its
+    border; the first pixel's centre is (0.5, 0.5).
     """
     photo = np.ascontiguousarray(photo)
     where = np.ascontiguousarray(where, np.float32)
@@ -112,8 +104,7 @@ def check_sizes(
 # -- Grey levels of colours -----------------------------------------------------------------------
 
 
-LUMA = (0.299, 0.587, 0.114)
-"""Shares of red, green and blue in a grey level (ITU-R BT.601)."""
+LUMA = (0.299, 0.587, 0.114)  # shares of red, green and blue in a grey level (ITU-R BT.601)
 
 
 def grey_of(colors: np.ndarray) -> np.ndarray:

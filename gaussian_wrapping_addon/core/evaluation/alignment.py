@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import DatasetError
 from ..scene.camera import Camera, Similarity
 from ..scene.placement import fit_similarity, require_plane, umeyama
-from .surface_scores import voxel_downsample_points
+from .surface_scores import voxel_downsample
 
 # -- Errors of solved camera poses after a similarity alignment of the camera centres -------------
 
@@ -25,16 +25,11 @@ class PoseErrors:
     center_shares: np.ndarray
     """(n,) distance of the aligned centre from the true one, over the true cameras' spread: the
     root mean square distance of their centres from their mean."""
-    given_shares: np.ndarray
-    """(n,) the same distance before any alignment."""
-    rotation_degrees: np.ndarray
-    """(n,) angle between the aligned and the true orientation."""
-    spread: float
-    """The spread, units of the true frame."""
-    transform: Similarity
-    """``true_from_solved``."""
-    missing: tuple[str, ...]
-    """True cameras missing in the solved set."""
+    given_shares: np.ndarray  # (n,) the same distance before any alignment
+    rotation_degrees: np.ndarray  # (n,) angle between the aligned and the true orientation
+    spread: float  # the spread, units of the true frame
+    transform: Similarity  # ``true_from_solved``
+    missing: tuple[str, ...]  # true cameras missing in the solved set
 
     def to_json(self) -> dict[str, Any]:
         """Return counts, medians and maxima as plain JSON values."""
@@ -54,12 +49,7 @@ class PoseErrors:
 def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> PoseErrors:
     """Align cameras of equal names by their centres (with scale) and return the residual errors.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Solved cameras, in any frame.
-    true_cameras : sequence of Camera
-        Their true poses. Cameras are matched by ``name``.
+    The solved cameras may be in any frame.
 
     Raises
     ------
@@ -117,20 +107,16 @@ thresholds an iteration, which no share within the threshold shows."""
 TANKS_STAGES = ((1.0, 80.0), (0.5, 20.0), (0.0, 2.0))
 """Voxel and largest distance of each refinement stage in thresholds (docs/method.md, section 9.1);
 voxel 0 takes every k-th point instead."""
-TANKS_MAX_POINTS = 4_000_000
-"""Maximum number of points in the last stage, after taking every k-th."""
+TANKS_MAX_POINTS = 4_000_000  # maximum number of points in the last stage, after taking every k-th
 
 
 @dataclass(frozen=True)
 class IcpResult:
     """Result of :func:`icp`."""
 
-    transform: Similarity
-    """``target_from_source``."""
-    fitness: float
-    """Share of the source points with a correspondence within ``max_distance``."""
-    rmse: float
-    """Root mean square distance of the correspondences, units of the target."""
+    transform: Similarity  # ``target_from_source``
+    fitness: float  # share of the source points with a correspondence within ``max_distance``
+    rmse: float  # root mean square distance of the correspondences, units of the target
     iterations: int = 0
     converged: bool = False
 
@@ -139,34 +125,20 @@ class IcpResult:
 class TanksRefinement:
     """The three stages of the refinement, in order."""
 
-    transform: Similarity
-    """``target_from_source`` after the last stage."""
+    transform: Similarity  # ``target_from_source`` after the last stage
     stages: tuple[IcpResult, ...]
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return fitness, rmse and iterations of every stage as plain JSON values."""
-        return [
-            {
-                "fitness": s.fitness,
-                "rmse": s.rmse,
-                "iterations": s.iterations,
-                "converged": s.converged,
-            }
-            for s in self.stages
-        ]
+        names = ("fitness", "rmse", "iterations", "converged")
+        return [{name: getattr(stage, name) for name in names} for stage in self.stages]
 
 
 def icp(
-    source: np.ndarray,
-    target: np.ndarray,
-    start: Similarity,
-    *,
-    max_distance: float,
-    iterations: int = ICP_ITERATIONS,
-    with_scale: bool,
-    tolerance: float = ICP_TOLERANCE,
+    source: np.ndarray, target: np.ndarray, start: Similarity, *, max_distance: float,
+    iterations: int = ICP_ITERATIONS, with_scale: bool, tolerance: float = ICP_TOLERANCE,
     threads: int = 1,
-) -> IcpResult:
+) -> IcpResult:  # fmt: skip
     """Refine an alignment by the iterative closest point algorithm.
 
     Point to point (Besl and McKay 1992). It ends when no correspondence changes, when fitness and
@@ -174,8 +146,7 @@ def icp(
 
     Parameters
     ----------
-    source : (n, 3) float64
-    target : (m, 3) float64
+    source, target : (n, 3), (m, 3) float64
     start : Similarity
         Initial ``target_from_source``.
     max_distance : float
@@ -183,7 +154,7 @@ def icp(
     with_scale : bool
         Whether the scale is optimised; otherwise that of ``start`` is kept.
     threads : int
-        Threads of the search; the result does not depend on it.
+        Of the search; the result does not depend on it.
 
     Raises
     ------
@@ -207,7 +178,7 @@ def icp(
     # "placed" are the source points under ``start``; only the increment is iterated.
     placed = start.points(source) - center
     added = Similarity()
-    partners, fitness, rmse, round_, converged = np.zeros(0, np.int64), 0.0, 0.0, 0, False
+    partners, fitness, rmse, round_ = np.zeros(0, np.int64), 0.0, 0.0, 0
     while True:
         distances, nearest = tree.query(
             added.points(placed), distance_upper_bound=max_distance, workers=max(threads, 1)
@@ -222,16 +193,12 @@ def icp(
         before = (fitness, rmse)
         fitness = float(near.mean())
         rmse = float(np.sqrt((distances[near] ** 2).mean()))
-        if round_ and (
-            np.array_equal(nearest, partners)
-            or (
-                abs(fitness - before[0]) <= tolerance * fitness
-                and abs(rmse - before[1]) <= tolerance * rmse
-            )
-        ):
-            converged = True
-            break
-        if round_ == iterations:
+        steady = (
+            abs(fitness - before[0]) <= tolerance * fitness
+            and abs(rmse - before[1]) <= tolerance * rmse
+        )
+        converged = round_ > 0 and (steady or np.array_equal(nearest, partners))
+        if converged or round_ == iterations:
             break
         partners = nearest
         pairs = placed[near], aim[nearest[near]]
@@ -247,15 +214,9 @@ def icp(
 
 
 def refine_as_tanks(
-    source: np.ndarray,
-    target: np.ndarray,
-    start: Similarity,
-    threshold: float,
-    *,
-    inside: Callable[[np.ndarray], np.ndarray] | None = None,
-    iterations: int = ICP_ITERATIONS,
-    threads: int = 1,
-) -> TanksRefinement:
+    source: np.ndarray, target: np.ndarray, start: Similarity, threshold: float, *,
+    inside: Callable[[np.ndarray], np.ndarray], threads: int = 1,
+) -> TanksRefinement:  # fmt: skip
     """Refine an alignment as Tanks and Temples does: ICP with scale in three stages.
 
     See docs/method.md, section 9.1.
@@ -269,7 +230,7 @@ def refine_as_tanks(
     source, target : (n, 3), (m, 3) float64
     threshold : float
         The scene's tau, units of the target.
-    inside : callable or None
+    inside : callable
         The crop: maps (n, 3) points in the target's frame to (n,) bool.
 
     Raises
@@ -278,38 +239,28 @@ def refine_as_tanks(
         See :func:`icp`; also if the crop is empty.
     """
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
-    if inside is not None:
-        target = target[inside(target)]
+    target = target[inside(target)]
     transform, stages = start, []
     for voxels, reach in TANKS_STAGES:
-        moving = source if inside is None else source[inside(transform.points(source))]
+        moving = source[inside(transform.points(source))]
         if min(len(moving), len(target)) < 3:
             raise DatasetError(
                 f"The crop leaves {len(moving)} points of the mesh and {len(target)} of the truth.",
                 "The initial alignment is wrong, or the crop belongs to another scene.",
             )
-        aim = target
         if voxels:
             # Voxels are in the target's frame, so that both sets are equally dense.
-            moving = transform.inverse().points(
-                voxel_downsample_points(transform.points(moving), voxels * threshold)
-            )
-            aim = voxel_downsample_points(aim, voxels * threshold)
+            moved = voxel_downsample(transform.points(moving), voxels * threshold)
+            moving = transform.inverse().points(moved)
+            aim = voxel_downsample(target, voxels * threshold)
         else:
-            moving, aim = _every_kth(moving), _every_kth(aim)
-        stages.append(
-            icp(
-                moving,
-                aim,
-                transform,
-                max_distance=reach * threshold,
-                iterations=iterations,
-                with_scale=True,
-                tolerance=TANKS_TOLERANCE,
-                threads=threads,
-            )
-        )
-        transform = stages[-1].transform
+            moving, aim = _every_kth(moving), _every_kth(target)
+        found = icp(
+            moving, aim, transform, max_distance=reach * threshold, with_scale=True,
+            tolerance=TANKS_TOLERANCE, threads=threads,
+        )  # fmt: skip
+        stages.append(found)
+        transform = found.transform
     return TanksRefinement(transform, tuple(stages))
 
 

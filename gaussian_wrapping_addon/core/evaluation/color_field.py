@@ -29,19 +29,14 @@ class Contraction:
     The map of Mip-NeRF 360 (docs/method.md, section 9.3), which the published colour field uses.
     """
 
-    center: np.ndarray
-    """(3,) float64, world frame."""
-    radius: float
-    """World units."""
+    center: np.ndarray  # (3,) float64, world frame
+    radius: float  # world units
 
     @classmethod
     def of_cameras(cls, cameras: Sequence[Camera], distance: float) -> Contraction:
         """Return the contraction around the mean camera centre, out to the farthest one.
 
-        Parameters
-        ----------
-        distance : float
-            Typical distance of the surface from the cameras, world units, > 0.
+        ``distance`` is a typical one of the surface from the cameras, world units, > 0.
         """
         centers = np.array([camera.center for camera in cameras])
         center = centers.mean(axis=0)
@@ -64,8 +59,7 @@ class Contraction:
 # -- Sparse cubic lattice: only the cells that hold a sample exist, in two nested sizes -----------
 
 
-RATIO = 4
-"""Coarse cells are this many fine cells wide."""
+RATIO = 4  # coarse cells are this many fine cells wide
 _AXIS_BITS = 19
 """Bits of a coarse cell's index along an axis: three of them and a fine cell's number within the
 coarse one (6 bits) fill 63 bits."""
@@ -79,26 +73,15 @@ CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], 
 class Level:
     """Cells of one size and their corners."""
 
-    cells: np.ndarray
-    """(c,) int64 keys, increasing."""
-    corners: np.ndarray
-    """(c, 8) int32: vertices of each cell."""
-    vertices: np.ndarray
-    """(v,) int64 keys, increasing."""
+    cells: np.ndarray  # (c,) int64 keys, increasing
+    corners: np.ndarray  # (c, 8) int32: vertices of each cell
+    vertices: np.ndarray  # (v,) int64 keys, increasing
     incident: np.ndarray
     """(v, 8) int32: ``8 cell + corner`` of the cells around a vertex, -1 where there is none."""
 
     @classmethod
     def of_cells(cls, keys: np.ndarray, indices: np.ndarray) -> Level:
-        """Return the level of the given cells.
-
-        Parameters
-        ----------
-        keys : (c,) int64
-            Increasing.
-        indices : (c, 3) int64
-            Of the cells along each axis.
-        """
+        """Return the level of cells of increasing keys (c,), from their indices (c, 3) int64."""
         corner_keys = pack(indices[:, None, :] + CORNERS)  # (c, 8)
         vertices, inverse = np.unique(corner_keys, return_inverse=True)
         corners = inverse.reshape(corner_keys.shape).astype(np.int32)
@@ -125,12 +108,8 @@ def pack(indices: np.ndarray) -> np.ndarray:
 def locate(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the fine cells of contracted points and the positions in them.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        In [-2, 2].
-    cell : float
-        Side of a fine cell, at least :data:`MIN_CELL`.
+    Points are (n, 3) float64 in [-2, 2]; ``cell`` is the side of a fine cell, at least
+    :data:`MIN_CELL`.
 
     Returns
     -------
@@ -163,8 +142,7 @@ def _search(sorted_keys: np.ndarray, keys: np.ndarray) -> np.ndarray:
 # of degree 0 to 2 (9 x 3 values) at each coarse vertex, both interpolated trilinearly.
 
 
-HARMONICS = 9
-"""Real spherical harmonics of degree 0 to 2."""
+HARMONICS = 9  # real spherical harmonics of degree 0 to 2
 COARSE_VALUES = 3 * HARMONICS
 
 
@@ -198,22 +176,10 @@ def _harmonics(x: Any, y: Any, z: Any, basis: Any) -> None:
 
 @kernel(fast=True)
 def normal_product(
-    begin: int,
-    end: int,
-    coarse_starts: Any,
-    fine_starts: Any,
-    fine_corners: Any,
-    coarse_corners: Any,
-    places: Any,
-    sub_places: Any,
-    directions: Any,
-    colors: Any,
-    share: Any,
-    fine: Any,
-    coarse: Any,
-    fine_sums: Any,
-    coarse_sums: Any,
-) -> None:
+    begin: int, end: int, coarse_starts: Any, fine_starts: Any, fine_corners: Any,
+    coarse_corners: Any, places: Any, sub_places: Any, directions: Any, colors: Any, share: Any,
+    fine: Any, coarse: Any, fine_sums: Any, coarse_sums: Any,
+) -> None:  # fmt: skip
     """Write ``A^T (A p - share y)`` of the coarse cells from begin to end, by cell and corner.
 
     ``coarse_starts`` (c + 1,) numbers the fine cells of each coarse cell, ``fine_starts`` (f + 1,)
@@ -286,16 +252,9 @@ def normal_product(
 
 @kernel(fast=True)
 def diagonal(
-    begin: int,
-    end: int,
-    coarse_starts: Any,
-    fine_starts: Any,
-    places: Any,
-    sub_places: Any,
-    directions: Any,
-    fine_sums: Any,
-    coarse_sums: Any,
-) -> None:
+    begin: int, end: int, coarse_starts: Any, fine_starts: Any, places: Any, sub_places: Any,
+    directions: Any, fine_sums: Any, coarse_sums: Any,
+) -> None:  # fmt: skip
     """Write the diagonal of ``A^T A`` by cell and corner: (f, 8, 1) and (c, 8, 9)."""
     weights = np.empty(8, np.float32)
     basis = np.empty(9, np.float32)
@@ -339,17 +298,9 @@ def gather(begin: int, end: int, incident: Any, sums: Any, out: Any) -> None:
 
 @kernel(fast=True)
 def field_colors(
-    begin: int,
-    end: int,
-    fine_vertices: Any,
-    coarse_vertices: Any,
-    places: Any,
-    coarse_places: Any,
-    directions: Any,
-    fine: Any,
-    coarse: Any,
-    out: Any,
-) -> None:
+    begin: int, end: int, fine_vertices: Any, coarse_vertices: Any, places: Any,
+    coarse_places: Any, directions: Any, fine: Any, coarse: Any, out: Any,
+) -> None:  # fmt: skip
     """Write the colours (n, 3) at points whose corners are given, -1 where there is no vertex.
 
     A missing fine vertex has the value 0; missing coarse ones leave their weight to the others.
@@ -389,31 +340,23 @@ def field_colors(
 class ColorFieldSettings:
     """How fine the field is and how it is solved."""
 
-    cell_px: float = 1.0
-    """Side of a fine cell in median footprints of a pixel."""
-    iterations: int = 20
-    """Steps of conjugate gradients."""
+    cell_px: float = 1.0  # side of a fine cell in median footprints of a pixel
+    iterations: int = 20  # steps of conjugate gradients
     fine_ridge: float = 0.5
     """Pull of each fine value towards 0, in samples: a vertex with fewer samples than this takes
     its colour from the coarse lattice."""
-    mean_ridge: float = 0.02
-    """Pull of the coarse colours towards the mean colour, in samples."""
-    view_ridge: float = 2.0
-    """Pull of the harmonics of degree 1 and 2 towards 0, in samples."""
+    mean_ridge: float = 0.02  # pull of the coarse colours towards the mean colour, in samples
+    view_ridge: float = 2.0  # pull of the harmonics of degree 1 and 2 towards 0, in samples
 
 
 @dataclass(frozen=True)
 class Samples:
     """Coloured points of a surface."""
 
-    points: np.ndarray
-    """(n, 3) float64, world frame."""
-    directions: np.ndarray
-    """(n, 3) float32, unit, from the camera to the point."""
-    footprints: np.ndarray
-    """(n,) float32: side of a pixel at the point, world units."""
-    colors: np.ndarray
-    """(n, 3) float32, white is 1."""
+    points: np.ndarray  # (n, 3) float64, world frame
+    directions: np.ndarray  # (n, 3) float32, unit, from the camera to the point
+    footprints: np.ndarray  # (n,) float32: side of a pixel at the point, world units
+    colors: np.ndarray  # (n, 3) float32, white is 1
 
 
 @dataclass(frozen=True)
@@ -421,16 +364,11 @@ class ColorField:
     """A fitted field."""
 
     contraction: Contraction
-    cell: float
-    """Side of a fine cell, contracted units."""
-    mean: np.ndarray
-    """(3,) float32: colour far from every sample."""
-    levels: tuple[Level, Level]
-    """Fine and coarse."""
-    fine: np.ndarray
-    """(v, 3) float32."""
-    coarse: np.ndarray
-    """(w, 27) float32: harmonic by harmonic, red, green, blue."""
+    cell: float  # side of a fine cell, contracted units
+    mean: np.ndarray  # (3,) float32: colour far from every sample
+    levels: tuple[Level, Level]  # fine and coarse
+    fine: np.ndarray  # (v, 3) float32
+    coarse: np.ndarray  # (w, 27) float32: harmonic by harmonic, red, green, blue
 
     def colors(self, points: np.ndarray, directions: np.ndarray, *, threads: int = 1) -> np.ndarray:
         """Return (n, 3) float32 colours in [0, 1] of (n, 3) world points seen along directions."""
@@ -453,21 +391,12 @@ class ColorField:
 
 
 def fit_color_field(
-    samples: Samples,
-    contraction: Contraction,
-    settings: ColorFieldSettings,
-    progress: Progress,
-    *,
-    threads: int = 1,
-) -> ColorField:
+    samples: Samples, contraction: Contraction, settings: ColorFieldSettings, progress: Progress,
+    *, threads: int = 1,
+) -> ColorField:  # fmt: skip
     """Return the field of least squared error at the samples, by conjugate gradients.
 
-    Parameters
-    ----------
-    samples : Samples
-        At least one.
-    threads : int
-        The result does not depend on it.
+    There must be a sample; the result does not depend on ``threads``.
     """
     scales = contraction.scales(samples.points)
     cell = settings.cell_px * float(np.median(samples.footprints * scales))
@@ -494,13 +423,9 @@ class _System:
 
     @classmethod
     def of(
-        cls,
-        samples: Samples,
-        contraction: Contraction,
-        cell: float,
-        settings: ColorFieldSettings,
+        cls, samples: Samples, contraction: Contraction, cell: float, settings: ColorFieldSettings,
         threads: int,
-    ) -> _System:
+    ) -> _System:  # fmt: skip
         keys, indices, places = locate(contraction.points(samples.points), cell)
         order = np.argsort(keys, kind="stable")
         keys = keys[order]
@@ -514,18 +439,13 @@ class _System:
         view = np.full(COARSE_VALUES, settings.view_ridge, np.float32)
         view[:3] = settings.mean_ridge
         return cls(
-            cell,
-            mean,
-            (fine, coarse),
-            np.append(coarse_first, len(fine_keys)),
-            np.append(first, len(keys)),
-            np.ascontiguousarray(places[order]),
+            cell, mean, (fine, coarse), np.append(coarse_first, len(fine_keys)),
+            np.append(first, len(keys)), np.ascontiguousarray(places[order]),
             ((fine_indices % RATIO) / RATIO).astype(np.float32),
             np.ascontiguousarray(samples.directions[order], np.float32),
             np.ascontiguousarray(samples.colors[order] - mean, np.float32),
-            (np.full(3, settings.fine_ridge, np.float32), view),
-            threads,
-        )
+            (np.full(3, settings.fine_ridge, np.float32), view), threads,
+        )  # fmt: skip
 
     def solve(self, iterations: int, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
         """Run conjugate gradients from 0 with the diagonal as preconditioner."""

@@ -50,6 +50,8 @@ alignment brings them nearer; equal to the largest of :data:`SHARES`."""
 ICP_REACH = (0.05, 0.01)
 """Maximum distance of pairs in the two stages of ``--align icp``, shares of the diagonal."""
 
+_Mesh = tuple[np.ndarray, np.ndarray]
+
 
 @dataclass(frozen=True)
 class EvaluationRequest:
@@ -82,14 +84,10 @@ class EvaluationRequest:
                 raise UsageError(f"{name} {value} is unknown.", f"Use {', '.join(known)}.")
         if self.protocols is not None and not self.protocols:
             raise UsageError("--protocols is empty.", f"Use {', '.join(PROTOCOLS)}.")
-        for protocol in self.protocols or ():
-            if protocol not in PROTOCOLS:
-                raise UsageError(
-                    f"Protocol {protocol!r} is unknown.", f"Use {', '.join(PROTOCOLS)}."
-                )
+        if unknown := [p for p in self.protocols or () if p not in PROTOCOLS]:
+            raise UsageError(f"Protocol {unknown[0]!r} is unknown.", f"Use {', '.join(PROTOCOLS)}.")
         for name, values in (("--thresholds", self.shares), ("--distances", self.distances)):
-            good = values is None or (values and all(0 < v < float("inf") for v in values))
-            if not good:
+            if values is not None and not (values and all(0 < v < float("inf") for v in values)):
                 raise UsageError(f"{name} needs positive numbers.", "Separate them by commas.")
         if self.shares is not None and self.distances is not None:
             raise UsageError(
@@ -152,24 +150,13 @@ def read_cameras(path: Path) -> list[Camera]:
 
 
 def evaluate_mesh(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    cameras: Sequence[Camera],
-    request: EvaluationRequest,
+    vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera], request: EvaluationRequest,
     progress: Progress,
-) -> dict[str, Any]:
-    """Align and score a mesh.
+) -> dict[str, Any]:  # fmt: skip
+    """Align and score a mesh of vertices (v, 3) and faces (f, 3).
 
-    Parameters
-    ----------
-    vertices, faces : (v, 3), (f, 3)
-    cameras : sequence of Camera
-        Cameras of the reconstruction, in the mesh's frame; empty if unknown.
-
-    Returns
-    -------
-    dict
-        Plain JSON values: layout, truth, thresholds, alignment, and the scores.
+    The cameras are those of the reconstruction, in the mesh's frame, or none if unknown. Returns
+    plain JSON values: layout, truth, thresholds, alignment, and the scores.
 
     Raises
     ------
@@ -177,19 +164,20 @@ def evaluate_mesh(
     """
     request = request.checked()
     layout = find_layout(request)
+    mesh = vertices, faces
     if layout == "tanks":
-        result = _tanks(vertices, faces, cameras, request, progress)
+        result = _tanks(mesh, cameras, request, progress)
     elif layout == "dtu":
-        result = _dtu(vertices, faces, cameras, request, progress)
+        result = _dtu(mesh, cameras, request, progress)
     else:
-        result = _surface(vertices, faces, cameras, request, layout, progress)
+        result = _surface(mesh, cameras, request, layout, progress)
     return {"layout": layout, "seed": request.seed, **result}
 
 
-def _require_cameras(cameras: Sequence[Camera], what: str) -> None:
+def _require_cameras(cameras: Sequence[Camera]) -> None:
     if not cameras:
         raise UsageError(
-            f"{what} by cameras needs the cameras of the reconstruction.",
+            "Alignment by cameras needs the cameras of the reconstruction.",
             "Evaluate the job folder instead of its mesh, give --cameras, or place the mesh "
             "yourself and use --align none.",
         )
@@ -203,13 +191,9 @@ def _protocols(request: EvaluationRequest, cameras: Sequence[Camera]) -> tuple[s
 
 
 def _surface(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    cameras: Sequence[Camera],
-    request: EvaluationRequest,
-    layout: str,
+    mesh: _Mesh, cameras: Sequence[Camera], request: EvaluationRequest, layout: str,
     progress: Progress,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     progress.update(0.0, "reading the truth")
     true_cameras: list[Camera] = []
     if layout == "scene":
@@ -226,12 +210,12 @@ def _surface(
             raise UsageError(
                 "A mesh or cloud as truth has no cameras to align by.", "Use --align icp or none."
             )
-        _require_cameras(cameras, "Alignment")
+        _require_cameras(cameras)
         poses = pose_errors(cameras, true_cameras)
         transform = poses.transform
     if align == "icp":
         progress.update(0.1, "aligning by nearest points")
-        transform, stages = _icp(vertices, faces, truth, transform, diagonal, request)
+        transform, stages = _icp(mesh, truth, transform, diagonal, request)
         alignment["stages"] = [
             {"fitness": s.fitness, "rmse": s.rmse, "iterations": s.iterations} for s in stages
         ]
@@ -247,22 +231,19 @@ def _surface(
     distances = request.distances or tuple(s * diagonal for s in shares or ())
     progress.update(0.3, "measuring distances")
     scores = score_protocols(
-        transform.points(vertices), faces, truth, viewers, distances,
+        transform.points(mesh[0]), mesh[1], truth, viewers, distances,
         count=request.samples or SAMPLES, seed=request.seed, threads=request.threads,
         protocols=protocols,
     )  # fmt: skip
     return {
-        "diagonal": diagonal,
-        "distances": list(distances),
+        "diagonal": diagonal, "distances": list(distances),
         "shares_of_diagonal": None if shares is None else list(shares),
-        "samples": request.samples or SAMPLES,
-        "truth_samples": len(truth.samples),
+        "samples": request.samples or SAMPLES, "truth_samples": len(truth.samples),
         "alignment": {**alignment, "transform": transform.to_json()},
-        "pose_errors": None if poses is None else poses.to_json(),
-        "pose_note": pose_note,
+        "pose_errors": None if poses is None else poses.to_json(), "pose_note": pose_note,
         "scan_cameras": len(viewers) if "scan" in protocols else 0,
         "scores": {name: score.to_json() for name, score in scores.items()},
-    }
+    }  # fmt: skip
 
 
 def _scene_diagonal(path: Path) -> float:
@@ -298,42 +279,27 @@ def _mesh_truth(request: EvaluationRequest) -> tuple[Truth, float]:
 
 
 def _icp(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    truth: Truth,
-    start: Similarity,
-    diagonal: float,
-    request: EvaluationRequest,
+    mesh: _Mesh, truth: Truth, start: Similarity, diagonal: float, request: EvaluationRequest
 ) -> tuple[Similarity, list[IcpResult]]:
     """Run two stages of ICP with scale on uniform samples, from distant pairs to near ones."""
-    points = sample_uniformly(
-        vertices, faces, min(request.samples or SAMPLES, SAMPLES), seed=request.seed
-    ).points
+    count = min(request.samples or SAMPLES, SAMPLES)
+    points = sample_uniformly(*mesh, count, seed=request.seed).points
     stages: list[IcpResult] = []
     for reach in ICP_REACH:
         moving = points
         if truth.crop is not None:
-            moving = points[truth.crop.inside(start.points(points))]
-        stages.append(
-            icp(
-                moving,
-                truth.samples.points,
-                start,
-                max_distance=reach * diagonal,
-                with_scale=True,
-                threads=request.threads,
-            )
-        )
-        start = stages[-1].transform
+            moving = points[truth.crop.contains(start.points(points))]
+        found = icp(
+            moving, truth.samples.points, start, max_distance=reach * diagonal, with_scale=True,
+            threads=request.threads,
+        )  # fmt: skip
+        stages.append(found)
+        start = found.transform
     return start, stages
 
 
 def _tanks(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    cameras: Sequence[Camera],
-    request: EvaluationRequest,
-    progress: Progress,
+    mesh: _Mesh, cameras: Sequence[Camera], request: EvaluationRequest, progress: Progress
 ) -> dict[str, Any]:
     if request.shares is not None or len(request.distances or (0.0,)) > 1:
         raise UsageError(
@@ -345,7 +311,7 @@ def _tanks(
     start = Similarity()
     alignment: dict[str, Any] = {"method": align}
     if align == "cameras" or (align == "icp" and (cameras or request.align is None)):
-        _require_cameras(cameras, "Alignment")
+        _require_cameras(cameras)
         found = align_to_log(cameras, scene, seed=request.seed)
         start = found.transform
         alignment["cameras"] = {
@@ -357,28 +323,19 @@ def _tanks(
     samples = request.samples or TANKS_SAMPLES
     protocols = _protocols(request, cameras)
     scores = score_tanks(
-        vertices, faces, cameras, scene, start,
+        *mesh, cameras, scene, start,
         refine=align == "icp", protocols=protocols, samples=samples,
         seed=request.seed, threads=request.threads, progress=progress.span(0.1, 1.0),
     )  # fmt: skip
     return {
-        "scene": scene.name,
-        "distances": [scene.threshold],
-        "voxel": scene.threshold / 2,
-        "samples": samples,
-        "truth_samples": len(scene.cloud),
-        "alignment": alignment,
-        "scan_cameras": len(cameras) if "scan" in protocols else 0,
-        "scores": scores,
-    }
+        "scene": scene.name, "distances": [scene.threshold], "voxel": scene.threshold / 2,
+        "samples": samples, "truth_samples": len(scene.cloud), "alignment": alignment,
+        "scan_cameras": len(cameras) if "scan" in protocols else 0, "scores": scores,
+    }  # fmt: skip
 
 
 def _dtu(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    cameras: Sequence[Camera],
-    request: EvaluationRequest,
-    progress: Progress,
+    mesh: _Mesh, cameras: Sequence[Camera], request: EvaluationRequest, progress: Progress
 ) -> dict[str, Any]:
     if request.scan is None:
         raise UsageError("A DTU folder holds many scans.", "Choose one: --scan 24.")
@@ -394,21 +351,18 @@ def _dtu(
     transform = Similarity()
     alignment: dict[str, Any] = {"method": align}
     if align == "cameras":
-        _require_cameras(cameras, "Alignment")
+        _require_cameras(cameras)
         found = align_to_scan(cameras, truth)
         transform = found.transform
         alignment |= {"source": truth.camera_source, **found.to_json()}
     progress.update(0.2, "measuring distances")
-    score = score_dtu(vertices, faces, truth, transform, seed=request.seed, threads=request.threads)
+    score = score_dtu(*mesh, truth, transform, seed=request.seed, threads=request.threads)
     return {
-        "scan": truth.scan,
-        "density_mm": DENSITY_MM,
-        "patch_mm": PATCH_MM,
-        "max_distance_mm": MAX_DISTANCE_MM,
-        "truth_samples": len(truth.cloud),
+        "scan": truth.scan, "density_mm": DENSITY_MM, "patch_mm": PATCH_MM,
+        "max_distance_mm": MAX_DISTANCE_MM, "truth_samples": len(truth.cloud),
         "alignment": {"transform": transform.to_json(), **alignment},
         "scores": {"dtu": score.to_json()},
-    }
+    }  # fmt: skip
 
 
 def table(result: dict[str, Any]) -> list[str]:
@@ -452,12 +406,13 @@ def _pose_lines(result: dict[str, Any], align: str) -> list[str]:
         note = result.get("pose_note")
         return [f"poses     not compared: {note}"] if note else []
     given, aligned = poses["given_share_median"], poses["center_share_median"]
-    text = (
-        f"poses     centres {100 * aligned:.3g} % of the spread, "
-        f"rotations {poses['rotation_degrees_median']:.3g} degrees (medians of "
-        f"{poses['cameras']}, after their own best alignment)"
-    )
-    lines = [text]
+    lines = [
+        (
+            f"poses     centres {100 * aligned:.3g} % of the spread, "
+            f"rotations {poses['rotation_degrees_median']:.3g} degrees (medians of "
+            f"{poses['cameras']}, after their own best alignment)"
+        )
+    ]
     if align == "none" and given > max(FRAME_MISMATCH_SHARE, 2.0 * aligned):
         lines.append(
             f"poses     the cameras are in another frame (scale "

@@ -24,7 +24,6 @@ cameras' spread; wrongly paired cameras have about the full spread."""
 NUMBER_OFFSETS = (0, 1, -1)
 """Photo names and camera files count from 0 or from 1: the offset that fits best is used."""
 
-_DTU_AGAIN = "Use the file that belongs to the data set."
 _CAMERA_FOLDERS = ("", "scan{scan}", "dtu_scan{scan}")
 _ARCHIVES = ("cameras.npz", "cameras_sphere.npz")
 
@@ -34,25 +33,19 @@ class DtuScan:
     """Ground truth of one scan, millimetres."""
 
     scan: int
-    cloud: np.ndarray
-    """(n, 3) float64."""
+    cloud: np.ndarray  # (n, 3) float64
     mask: ObservationMask
-    plane: np.ndarray
-    """(4,) ground plane; true points with ``plane . [x, 1] > 0`` are evaluated."""
-    camera_numbers: np.ndarray
-    """(m,) int64; empty if no camera files were found."""
-    camera_centers: np.ndarray
-    """(m, 3) float64."""
-    camera_source: str
-    """Name of the file or folder of the cameras."""
+    plane: np.ndarray  # (4,) ground plane; true points with ``plane . [x, 1] > 0`` are evaluated.
+    camera_numbers: np.ndarray  # (m,) int64; empty if no camera files were found.
+    camera_centers: np.ndarray  # (m, 3) float64
+    camera_source: str  # name of the file or folder of the cameras
 
 
 @dataclass(frozen=True)
 class DtuAlignment:
     """Alignment of the job's cameras to the true ones."""
 
-    transform: Similarity
-    """``truth_from_job``."""
+    transform: Similarity  # ``truth_from_job``
     cameras: int
     number_offset: int
     """Number in the camera files minus the number in the photo's name."""
@@ -60,12 +53,11 @@ class DtuAlignment:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return {
-            "transform": self.transform.to_json(),
-            "cameras": self.cameras,
-            "number_offset": self.number_offset,
-            "rmse_mm": self.rmse_mm,
-        }
+        return {**vars(self), "transform": self.transform.to_json()}
+
+
+def _bad(path: Path, place: str, problem: str) -> ParseError:
+    return ParseError(path, place, problem, "Use the file that belongs to the data set.")
 
 
 def is_dtu_folder(folder: Path) -> bool:
@@ -117,15 +109,13 @@ def read_observation_mask(path: Path) -> ObservationMask:
     values = _read_mat(path, ("ObsMask", "BB", "Res"))
     volume = values["ObsMask"]
     if volume.ndim != 3 or volume.dtype.kind not in "bui" or volume.size == 0:
-        raise ParseError(
-            path, "ObsMask", f"{volume.dtype} {volume.shape} is not a volume.", _DTU_AGAIN
-        )
+        raise _bad(path, "ObsMask", f"{volume.dtype} {volume.shape} is not a volume.")
     box = _floats(path, "BB", values["BB"], (2, 3))
     resolution = float(_floats(path, "Res", values["Res"].reshape(-1), (1,))[0])
     if not (box[1] > box[0]).all():
-        raise ParseError(path, "BB", "the box is empty.", _DTU_AGAIN)
+        raise _bad(path, "BB", "the box is empty.")
     if not resolution > 0:
-        raise ParseError(path, "Res", f"{resolution:g} is not positive.", _DTU_AGAIN)
+        raise _bad(path, "Res", f"{resolution:g} is not positive.")
     return ObservationMask(volume != 0, box[0], box[1], resolution)
 
 
@@ -138,7 +128,7 @@ def read_plane(path: Path) -> np.ndarray:
     """
     plane = _floats(path, "P", _read_mat(path, ("P",))["P"].reshape(-1), (4,))
     if not plane[:3].any():
-        raise ParseError(path, "P", "the plane has no direction.", _DTU_AGAIN)
+        raise _bad(path, "P", "the plane has no direction.")
     return plane
 
 
@@ -148,22 +138,20 @@ def _read_mat(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
     try:
         values = loadmat(path, variable_names=keys)
     except Exception as error:  # a broken file can make the reader raise anything
-        raise ParseError(
-            path, "whole file", f"cannot be read as a MATLAB file up to version 7.2 ({error}).",
-            _DTU_AGAIN,
-        ) from None  # fmt: skip
+        text = f"cannot be read as a MATLAB file up to version 7.2 ({error})."
+        raise _bad(path, "whole file", text) from None
     for key in keys:
         if not isinstance(values.get(key), np.ndarray):
-            raise ParseError(path, key, "there is no such entry.", _DTU_AGAIN)
+            raise _bad(path, key, "there is no such entry.")
     return {key: values[key] for key in keys}
 
 
 def _floats(path: Path, place: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if value.shape != shape or value.dtype.kind not in "fiub":
-        raise ParseError(path, place, f"{value.shape} is not {shape} numbers.", _DTU_AGAIN)
+        raise _bad(path, place, f"{value.shape} is not {shape} numbers.")
     values = value.astype(np.float64)
     if not np.isfinite(values).all():
-        raise ParseError(path, place, "a number is not finite.", _DTU_AGAIN)
+        raise _bad(path, place, "a number is not finite.")
     return values
 
 
@@ -191,9 +179,9 @@ def _archive_centers(path: Path) -> tuple[np.ndarray, np.ndarray]:
                     numbers.append(int(found.group(1)))
                     centers.append(_center(path, key, matrix[:3]))
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ParseError(path, "whole file", f"cannot be read ({error}).", _DTU_AGAIN) from None
+        raise _bad(path, "whole file", f"cannot be read ({error}).") from None
     if not numbers:
-        raise ParseError(path, "world_mat_0", "there is no such entry.", _DTU_AGAIN)
+        raise _bad(path, "world_mat_0", "there is no such entry.")
     return np.array(numbers, np.int64), np.array(centers)
 
 
@@ -207,12 +195,10 @@ def _text_centers(paths: list[Path]) -> tuple[np.ndarray, np.ndarray]:
             words = path.read_bytes().decode(errors="replace").split()
             values = np.array([float(word) for word in words])
         except (OSError, ValueError) as error:
-            raise ParseError(path, "whole file", f"{error}.", _DTU_AGAIN) from None
+            raise _bad(path, "whole file", f"{error}.") from None
         if len(values) != 12 or not np.isfinite(values).all():
-            raise ParseError(
-                path, "whole file", f"12 finite numbers (3x4) were expected, not {len(values)}.",
-                _DTU_AGAIN,
-            )  # fmt: skip
+            text = f"12 finite numbers (3x4) were expected, not {len(values)}."
+            raise _bad(path, "whole file", text)
         numbers.append(int(digits.group(1)))
         centers.append(_center(path, "whole file", values.reshape(3, 4)))
     return np.array(numbers, np.int64), np.array(centers).reshape(-1, 3)
@@ -222,7 +208,7 @@ def _center(path: Path, place: str, projection: np.ndarray) -> np.ndarray:
     """Return the centre of a (3, 4) projection, its null space."""
     linear = projection[:, :3]
     if not np.linalg.cond(linear) < 1e12:
-        raise ParseError(path, place, "the projection has no centre.", _DTU_AGAIN)
+        raise _bad(path, place, "the projection has no centre.")
     return -np.linalg.solve(linear, projection[:, 3])
 
 
@@ -283,14 +269,9 @@ def align_to_scan(cameras: Sequence[Camera], truth: DtuScan) -> DtuAlignment:
 
 
 def score_dtu(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    truth: DtuScan,
-    truth_from_job: Similarity,
-    *,
-    seed: int = 0,
-    threads: int = 1,
-) -> DtuScore:
+    vertices: np.ndarray, faces: np.ndarray, truth: DtuScan, truth_from_job: Similarity, *,
+    seed: int = 0, threads: int = 1,
+) -> DtuScore:  # fmt: skip
     """Align a mesh, resample it as points, and compare (see :func:`~.dtu_chamfer.dtu_chamfer`).
 
     Faces farther than the patch from the observed box are left out, as they would not count.

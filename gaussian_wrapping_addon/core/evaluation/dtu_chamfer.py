@@ -18,13 +18,9 @@ from ..files import finite_json
 from ..limits import MAX_POINTS
 from ..mesh.sampling import distances_to_cloud, thin
 
-DENSITY_MM = 0.2
-"""Minimum distance of predicted points, and maximum gap of a resampled mesh."""
-PATCH_MM = 60.0
-"""Predicted points farther than this outside the observed box are ignored."""
-MAX_DISTANCE_MM = 20.0
-"""Distances of this or more are dropped from the means."""
-
+DENSITY_MM = 0.2  # minimum distance of predicted points, and maximum gap of a resampled mesh
+PATCH_MM = 60.0  # predicted points farther than this outside the observed box are ignored
+MAX_DISTANCE_MM = 20.0  # distances of this or more are dropped from the means
 MAX_CELLS = 2e6
 """Maximum extent in densities: indices of cells over three such axes fit into 64 bits."""
 ROW_SHARE = math.sqrt(0.75)
@@ -43,8 +39,7 @@ class ObservationMask:
     low: np.ndarray
     high: np.ndarray
     """(3,) float64, corners of the box, rows of ``BB``."""
-    resolution: float
-    """Distance between voxel centres."""
+    resolution: float  # distance between voxel centres
 
     def __post_init__(self) -> None:
         is_valid = (
@@ -70,10 +65,8 @@ class ObservationMask:
     def observed(self, points: np.ndarray) -> np.ndarray:
         """Return whether (n, 3) points lie in an observed voxel, (n,) bool."""
         # Clipped before the cast: far points would overflow an integer.
-        along_row = np.clip(
-            np.floor((points - self.low) / self.resolution + 0.5), -1.0, self.volume.shape
-        )
-        index = along_row.astype(np.int64)  # (n, 3)
+        place = np.floor((points - self.low) / self.resolution + 0.5)
+        index = np.clip(place, -1.0, self.volume.shape).astype(np.int64)  # (n, 3)
         inside = ((index >= 0) & (index < self.volume.shape)).all(1)
         result = np.zeros(len(points), np.bool_)
         i, j, k = index[inside].T
@@ -85,12 +78,9 @@ class ObservationMask:
 class DtuScore:
     """Mean distances in the truth's unit (mm); infinite if there is no distance to average."""
 
-    accuracy: float
-    """From predicted points in observed voxels to the truth."""
-    completeness: float
-    """From true points above the ground plane to the prediction."""
-    overall: float
-    """Mean of the two: the data set's Chamfer distance."""
+    accuracy: float  # from predicted points in observed voxels to the truth
+    completeness: float  # from true points above the ground plane to the prediction
+    overall: float  # mean of the two: the data set's Chamfer distance
     accuracy_count: int
     completeness_count: int
     """Number of distances averaged."""
@@ -104,17 +94,10 @@ class DtuScore:
 
 
 def dtu_chamfer(
-    points: np.ndarray,
-    truth_points: np.ndarray,
-    mask: ObservationMask,
-    plane: np.ndarray,
-    *,
-    density: float = DENSITY_MM,
-    patch: float = PATCH_MM,
-    max_distance: float = MAX_DISTANCE_MM,
-    seed: int = 0,
-    threads: int = 1,
-) -> DtuScore:
+    points: np.ndarray, truth_points: np.ndarray, mask: ObservationMask, plane: np.ndarray, *,
+    density: float = DENSITY_MM, patch: float = PATCH_MM, max_distance: float = MAX_DISTANCE_MM,
+    seed: int = 0, threads: int = 1,
+) -> DtuScore:  # fmt: skip
     """Compare points with a scan by the protocol of the data set (Jensen et al., CVPR 2014).
 
     1. Predicted points farther than ``patch`` outside the mask's box are removed.
@@ -128,18 +111,16 @@ def dtu_chamfer(
 
     Parameters
     ----------
-    points : (n, 3) float64
-        Predicted, in the truth's frame; for a mesh, see :func:`resample_mesh`. May be empty.
-    truth_points : (m, 3) float64
-    mask : ObservationMask
+    points, truth_points : (n, 3), (m, 3) float64
+        In the truth's frame; for a mesh, see :func:`resample_mesh`. The former may be empty.
     plane : (4,) float64
         A true point x is above the ground where ``plane . [x, 1] > 0``.
     density, patch, max_distance : float
         In the truth's unit (mm); ``density`` 0 keeps all points.
     seed : int
-        Seed of the order in step 2.
+        Of the order in step 2.
     threads : int
-        Threads of the search; the result does not depend on it.
+        Of the search; the result does not depend on it.
 
     Raises
     ------
@@ -173,10 +154,8 @@ def dtu_chamfer(
 def thin_by_distance(points: np.ndarray, density: float, *, seed: int) -> np.ndarray:
     """Keep points, in random order, that are at least ``density`` from all points kept before.
 
-    Returns
-    -------
-    (k, 3) float64
-        In the original order; every removed point is nearer than ``density`` to one of them.
+    Returns (k, 3) float64 points in the original order; every removed point is nearer than
+    ``density`` to one of them.
 
     Raises
     ------
@@ -203,17 +182,8 @@ def resample_mesh(vertices: np.ndarray, faces: np.ndarray, density: float) -> np
     row and :data:`ROW_SHARE` of it between rows. Edges are covered by both of their faces;
     :func:`dtu_chamfer` removes the duplicates.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int
-    density : float
-        > 0, in the mesh's unit.
-
-    Returns
-    -------
-    (n, 3) float64
-        Empty for a mesh without faces.
+    Of vertices (v, 3) float64 and faces (f, 3) int, with a density > 0 in the mesh's unit. Returns
+    (n, 3) float64 points, none for a mesh without faces.
 
     Raises
     ------

@@ -27,7 +27,7 @@ from .surface_scores import (
     sample_uniformly,
     scan_virtually,
     score_clouds,
-    voxel_downsample_points,
+    voxel_downsample,
 )
 
 # -- Read meshes and point clouds for evaluation from common file formats -------------------------
@@ -44,9 +44,9 @@ def is_cloud(path: Path) -> bool:
     ParseError
         The header of the PLY is invalid.
     """
-    return path.suffix.lower() == ".ply" and not read_ply_header(path, _MESH_INPUT_AGAIN).count(
-        "face"
-    )
+    if path.suffix.lower() != ".ply":
+        return False
+    return not read_ply_header(path, _MESH_INPUT_AGAIN).count("face")
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -74,12 +74,8 @@ def read_cloud(path: Path) -> np.ndarray:
     if announced == 0:
         raise ParseError(path, "header", "the cloud is empty.", _MESH_INPUT_AGAIN)
     if len(points) < announced:
-        raise ParseError(
-            path,
-            "vertices",
-            f"{announced - len(points)} of {announced} are not finite.",
-            _MESH_INPUT_AGAIN,
-        )
+        text = f"{announced - len(points)} of {announced} are not finite."
+        raise ParseError(path, "vertices", text, _MESH_INPUT_AGAIN)
     return points
 
 
@@ -88,7 +84,6 @@ def read_cloud(path: Path) -> np.ndarray:
 
 CLASS_NAME = "SelectionPolygonVolume"
 VERSION = 1
-_POLYGON_VOLUME_AGAIN = "Use the crop file that belongs to the data set."
 _PLANES = {"X": (1, 2, 0), "Y": (0, 2, 1), "Z": (0, 1, 2)}
 """For each axis: the two coordinates of the polygon's plane, then the axis itself."""
 
@@ -100,8 +95,7 @@ class PolygonVolume:
     polygon: np.ndarray
     """(k, 3) float64 corners in order, the last joined to the first; the coordinate along the axis
     is not used. The polygon may be concave; self-intersections follow the even-odd rule."""
-    orthogonal_axis: str
-    """``"X"``, ``"Y"`` or ``"Z"``."""
+    orthogonal_axis: str  # ``"X"``, ``"Y"`` or ``"Z"``
     axis_min: float
     axis_max: float
 
@@ -130,24 +124,10 @@ class PolygonVolume:
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower and upper corner, (3,) each, of the axis-aligned box around it."""
-        u, v, w = _PLANES[self.orthogonal_axis]
-        low, high = np.empty(3), np.empty(3)
-        for axis in (u, v):
-            low[axis], high[axis] = self.polygon[:, axis].min(), self.polygon[:, axis].max()
-        low[w], high[w] = self.axis_min, self.axis_max
+        low, high = self.polygon.min(0), self.polygon.max(0)
+        axis = _PLANES[self.orthogonal_axis][2]
+        low[axis], high[axis] = self.axis_min, self.axis_max
         return low, high
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the values of the file format."""
-        return {
-            "class_name": CLASS_NAME,
-            "version_major": VERSION,
-            "version_minor": 0,
-            "axis_max": self.axis_max,
-            "axis_min": self.axis_min,
-            "orthogonal_axis": self.orthogonal_axis,
-            "bounding_polygon": self.polygon.tolist(),
-        }
 
 
 def read_polygon_volume(path: Path) -> PolygonVolume:
@@ -158,49 +138,44 @@ def read_polygon_volume(path: Path) -> PolygonVolume:
     ParseError
         States the entry: missing, not finite, an unknown axis or version, too few corners.
     """
+
+    def bad(place: str, problem: str) -> ParseError:
+        return ParseError(path, place, problem, "Use the crop file that belongs to the data set.")
+
+    def number(place: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise bad(place, "a number was expected.")
+        if not math.isfinite(value):
+            raise bad(place, "the number is not finite.")
+        return float(value)
+
     try:
         values = read_json(path, follow_links=True)
     except OSError as error:
-        raise ParseError(
-            path, "whole file", f"cannot be read: {error.strerror}.", _POLYGON_VOLUME_AGAIN
-        ) from None
+        raise bad("whole file", f"cannot be read: {error.strerror}.") from None
     if not isinstance(values, dict):
-        raise ParseError(path, "top level", "an object was expected.", _POLYGON_VOLUME_AGAIN)
+        raise bad("top level", "an object was expected.")
     if values.get("class_name", CLASS_NAME) != CLASS_NAME:
-        raise ParseError(path, "class_name", f"is not {CLASS_NAME!r}.", _POLYGON_VOLUME_AGAIN)
+        raise bad("class_name", f"is not {CLASS_NAME!r}.")
     version = values.get("version_major", values.get("version", VERSION))
     if isinstance(version, bool) or version != VERSION:
-        raise ParseError(
-            path, "version_major", f"{str(version)[:20]} is not known.", _POLYGON_VOLUME_AGAIN
-        )
+        raise bad("version_major", f"{str(version)[:20]} is not known.")
     axis = values.get("orthogonal_axis")
     if not isinstance(axis, str) or axis.upper() not in _PLANES:
-        raise ParseError(path, "orthogonal_axis", "X, Y or Z was expected.", _POLYGON_VOLUME_AGAIN)
-    low, high = (_number(path, key, values.get(key)) for key in ("axis_min", "axis_max"))
+        raise bad("orthogonal_axis", "X, Y or Z was expected.")
+    low, high = (number(key, values.get(key)) for key in ("axis_min", "axis_max"))
     if not low < high:
-        raise ParseError(
-            path, "axis_min", f"{low:g} is not below axis_max {high:g}.", _POLYGON_VOLUME_AGAIN
-        )
+        raise bad("axis_min", f"{low:g} is not below axis_max {high:g}.")
     rows = values.get("bounding_polygon")
     if not isinstance(rows, list) or len(rows) < 3:
-        raise ParseError(
-            path, "bounding_polygon", "at least 3 corners were expected.", _POLYGON_VOLUME_AGAIN
-        )
+        raise bad("bounding_polygon", "at least 3 corners were expected.")
     corners = []
     for i, row in enumerate(rows):
         place = f"bounding_polygon[{i}]"
         if not isinstance(row, list) or len(row) != 3:
-            raise ParseError(path, place, "three numbers were expected.", _POLYGON_VOLUME_AGAIN)
-        corners.append([_number(path, place, value) for value in row])
+            raise bad(place, "three numbers were expected.")
+        corners.append([number(place, value) for value in row])
     return PolygonVolume(np.array(corners, np.float64), axis.upper(), low, high)
-
-
-def _number(path: Path, place: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ParseError(path, place, "a number was expected.", _POLYGON_VOLUME_AGAIN)
-    if not math.isfinite(value):
-        raise ParseError(path, place, "the number is not finite.", _POLYGON_VOLUME_AGAIN)
-    return float(value)
 
 
 # -- Read, align and score scenes of Tanks and Temples in their original layout -------------------
@@ -228,7 +203,6 @@ SCAN_KEPT_POINTS = 20_000_000
 
 _TRUTH_SUFFIX, _LOG_SUFFIX = "_trans.txt", "_COLMAP_SfM.log"
 _ROTATION_TOLERANCE = 1e-2
-_TANKS_AGAIN = "Use the file that belongs to the data set."
 
 
 @dataclass(frozen=True)
@@ -237,13 +211,15 @@ class TanksScene:
 
     name: str
     threshold: float
-    cloud: np.ndarray
-    """(n, 3) float64."""
+    cloud: np.ndarray  # (n, 3) float64
     crop: PolygonVolume
-    log_numbers: np.ndarray
-    """(m,) int64, photo number of each entry of the trajectory."""
+    log_numbers: np.ndarray  # (m,) int64, photo number of each entry of the trajectory
     log_centers: np.ndarray
     """(m, 3) camera centres of the trajectory, transformed by ``_trans.txt``."""
+
+
+def _bad(path: Path, place: str, problem: str) -> ParseError:
+    return ParseError(path, place, problem, "Use the file that belongs to the data set.")
 
 
 def is_tanks_folder(folder: Path) -> bool:
@@ -252,14 +228,9 @@ def is_tanks_folder(folder: Path) -> bool:
 
 
 def read_tanks(folder: Path, threshold: float | None = None) -> TanksScene:
-    """Read a scene.
+    """Read a scene; a folder with the files of several must have the name of the scene.
 
-    Parameters
-    ----------
-    folder : Path
-        Must have the name of the scene if it holds the files of several.
-    threshold : float or None
-        Replaces that of :data:`THRESHOLDS`.
+    ``threshold`` replaces that of :data:`THRESHOLDS`.
 
     Raises
     ------
@@ -296,13 +267,8 @@ def read_tanks(folder: Path, threshold: float | None = None) -> TanksScene:
 def _scene_name(folder: Path) -> str:
     if not folder.is_dir():
         raise DatasetError(f"{folder} is not a folder.", "Give the folder of one scene.")
-    names = sorted(
-        {
-            path.name.removesuffix(suffix)
-            for suffix in (_TRUTH_SUFFIX, _LOG_SUFFIX)
-            for path in folder.glob(f"*{suffix}")
-        }
-    )
+    suffixes = _TRUTH_SUFFIX, _LOG_SUFFIX
+    names = sorted({p.name.removesuffix(s) for s in suffixes for p in folder.glob(f"*{s}")})
     same = [name for name in names if name.lower() == folder.name.lower()]
     if len(names) == 1 or len(same) == 1:
         return (same or names)[0]
@@ -325,9 +291,7 @@ def read_matrix(path: Path) -> Similarity:
     rows = [line.split() for _, line in _lines(path) if line.strip()]
     if len(rows) != 4 or any(len(row) != 4 for row in rows):
         shape = f"{len(rows)} lines of {sorted({len(r) for r in rows})} numbers"
-        raise ParseError(
-            path, "whole file", f"a 4x4 matrix was expected, not {shape}.", _TANKS_AGAIN
-        )
+        raise _bad(path, "whole file", f"a 4x4 matrix was expected, not {shape}.")
     return _similarity(path, "whole file", _numbers(path, "whole file", rows))
 
 
@@ -347,26 +311,25 @@ def read_trajectory(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     lines = [(number, line.split()) for number, line in _lines(path) if line.strip()]
     if len(lines) < 15 or len(lines) % 5:
-        raise ParseError(
+        raise _bad(
             path, f"line {lines[-1][0] if lines else 1}",
             f"{len(lines)} lines are not at least 3 entries of 5; the file may be cut off.",
-            _TANKS_AGAIN,
         )  # fmt: skip
     numbers, poses = [], []
     for begin in range(0, len(lines), 5):
         line, words = lines[begin]
         place = f"line {line}"
         if len(words) != 3 or not words[0].isdecimal() or len(words[0]) > 9:
-            raise ParseError(path, place, "three whole numbers were expected.", _TANKS_AGAIN)
+            raise _bad(path, place, "three whole numbers were expected.")
         rows = [row for _, row in lines[begin + 1 : begin + 5]]
         if any(len(row) != 4 for row in rows):
-            raise ParseError(path, place, "four rows of four numbers must follow.", _TANKS_AGAIN)
+            raise _bad(path, place, "four rows of four numbers must follow.")
         matrix = _numbers(path, place, rows)
         _similarity(path, place, matrix)
         numbers.append(int(words[0]))
         poses.append(matrix)
     if len(set(numbers)) != len(numbers):
-        raise ParseError(path, "whole file", "a photo has two poses.", _TANKS_AGAIN)
+        raise _bad(path, "whole file", "a photo has two poses.")
     return np.array(numbers, np.int64), np.array(poses)
 
 
@@ -374,12 +337,10 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     try:
         size_bytes = path.stat().st_size
         if size_bytes > limits.MAX_JSON_BYTES:
-            raise ParseError(path, "whole file", f"{size_bytes} bytes are too many.", _TANKS_AGAIN)
+            raise _bad(path, "whole file", f"{size_bytes} bytes are too many.")
         text = path.read_bytes().decode("utf-8-sig", errors="replace")
     except OSError as error:
-        raise ParseError(
-            path, "whole file", f"cannot be read: {error.strerror}.", _TANKS_AGAIN
-        ) from None
+        raise _bad(path, "whole file", f"cannot be read: {error.strerror}.") from None
     return list(enumerate(text.splitlines(), 1))
 
 
@@ -387,9 +348,9 @@ def _numbers(path: Path, place: str, rows: list[list[str]]) -> np.ndarray:
     try:
         values = np.array([[float(word) for word in row] for row in rows])
     except ValueError as error:
-        raise ParseError(path, place, f"{error}.", _TANKS_AGAIN) from None
+        raise _bad(path, place, f"{error}.") from None
     if not np.isfinite(values).all():
-        raise ParseError(path, place, "a number is not finite.", _TANKS_AGAIN)
+        raise _bad(path, place, "a number is not finite.")
     return values
 
 
@@ -397,13 +358,13 @@ def _similarity(path: Path, place: str, matrix: np.ndarray) -> Similarity:
     linear = matrix[:3, :3]
     determinant = float(np.linalg.det(linear))
     if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
-        raise ParseError(path, place, "the last row must be 0 0 0 1.", _TANKS_AGAIN)
+        raise _bad(path, place, "the last row must be 0 0 0 1.")
     if not determinant > 0:
-        raise ParseError(path, place, "the matrix mirrors or flattens.", _TANKS_AGAIN)
+        raise _bad(path, place, "the matrix mirrors or flattens.")
     scale = determinant ** (1.0 / 3.0)
     u, _, vt = np.linalg.svd(linear / scale)
     if np.abs(u @ vt - linear / scale).max() > _ROTATION_TOLERANCE:
-        raise ParseError(path, place, "not a rotation with a scale.", _TANKS_AGAIN)
+        raise _bad(path, place, "not a rotation with a scale.")
     return Similarity(scale, u @ vt, matrix[:3, 3])
 
 
@@ -459,13 +420,9 @@ def align_to_log(cameras: Sequence[Camera], scene: TanksScene, *, seed: int) -> 
         )
     centers = np.array([cameras[i].center for i in known])
     found = umeyama_ransac(
-        centers,
-        scene.log_centers[rows[known]],
-        threshold=RANSAC_DISTANCE,
-        iterations=RANSAC_ITERATIONS,
-        seed=seed,
-        with_scale=True,
-    )
+        centers, scene.log_centers[rows[known]], threshold=RANSAC_DISTANCE,
+        iterations=RANSAC_ITERATIONS, seed=seed, with_scale=True,
+    )  # fmt: skip
     if found.inliers.mean() < MIN_AGREEING_SHARE:
         raise DatasetError(
             f"{int(found.inliers.sum())} of {len(known)} cameras match the trajectory of "
@@ -476,19 +433,10 @@ def align_to_log(cameras: Sequence[Camera], scene: TanksScene, *, seed: int) -> 
 
 
 def score_tanks(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    cameras: Sequence[Camera],
-    scene: TanksScene,
-    start: Similarity,
-    *,
-    refine: bool,
-    protocols: Sequence[str],
-    samples: int = SAMPLES,
-    seed: int = 0,
-    threads: int = 1,
-    progress: Progress | None = None,
-) -> dict[str, dict[str, Any]]:
+    vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera], scene: TanksScene,
+    start: Similarity, *, refine: bool, protocols: Sequence[str], samples: int = SAMPLES,
+    seed: int = 0, threads: int = 1, progress: Progress | None = None,
+) -> dict[str, dict[str, Any]]:  # fmt: skip
     """Score a mesh by the data set's protocol: sampling, refinement, crop, voxel tau / 2, F1.
 
     ``uniform`` samples uniformly (1e6 samples, or ``samples`` if that is less, for the refinement);
@@ -496,17 +444,9 @@ def score_tanks(
     surface seen by the cameras, downsampled to voxels of tau / 4. ``legacy`` uses vertices and
     face centres. Each is refined separately, as in the original scripts.
 
-    Parameters
-    ----------
-    vertices, faces : (v, 3), (f, 3)
-        In the job's frame, like the cameras.
-    start : Similarity
-        ``truth_from_job`` before the refinement.
-
-    Returns
-    -------
-    dict
-        For each protocol ``score``, ``transform``, ``refinement`` (or ``None``); plain JSON values.
+    Vertices (v, 3) and faces (f, 3) are in the job's frame, like the cameras; ``start`` is
+    ``truth_from_job`` before the refinement. Returns for each protocol ``score``, ``transform``
+    and ``refinement`` (or ``None``), plain JSON values.
 
     Raises
     ------
@@ -537,9 +477,8 @@ def score_tanks(
         if refine:
             probe = points
             if protocol == "uniform" and len(near):
-                probe = sample_uniformly(
-                    vertices, near, min(samples, ALIGNMENT_SAMPLES), seed=seed
-                ).points
+                few = min(samples, ALIGNMENT_SAMPLES)
+                probe = sample_uniformly(vertices, near, few, seed=seed).points
             refinement = refine_as_tanks(
                 probe, truth, start, scene.threshold, inside=scene.crop.inside, threads=threads
             )
@@ -575,14 +514,9 @@ def _near_faces(
 
 
 def _scan(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    cameras: Sequence[Camera],
-    scene: TanksScene,
-    start: Similarity,
-    threads: int,
-    progress: Progress,
-) -> np.ndarray:
+    vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera], scene: TanksScene,
+    start: Similarity, threads: int, progress: Progress,
+) -> np.ndarray:  # fmt: skip
     """Return the points that cameras see in the (widened) crop, downsampled to tau / 4."""
     if not cameras:
         raise UsageError(
@@ -599,10 +533,10 @@ def _scan(
         progress.check()
         seen = start.points(scan_virtually(vertices, faces, [camera], threads=threads).points)
         near = ((seen >= low - margin) & (seen <= high + margin)).all(1)
-        kept.append(voxel_downsample_points(seen[near], voxel))
+        kept.append(voxel_downsample(seen[near], voxel))
         count += len(kept[-1])
         if count > SCAN_KEPT_POINTS:
-            kept = [voxel_downsample_points(np.concatenate(kept), voxel)]
+            kept = [voxel_downsample(np.concatenate(kept), voxel)]
             # The rest cannot get sparser: downsample again only after as many new points.
             count = 0
-    return back.points(voxel_downsample_points(np.concatenate(kept), voxel))
+    return back.points(voxel_downsample(np.concatenate(kept), voxel))

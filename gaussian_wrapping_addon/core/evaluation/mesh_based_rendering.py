@@ -26,7 +26,7 @@ from ..settings import TextureSettings
 from ..texture.texture_mesh import texture_mesh
 from ..texture.unwrap.unwrap import Unwrap
 from .color_field import ColorField, ColorFieldSettings, Contraction, Samples, fit_color_field
-from .mesh_rendering import OnView
+from .mesh_rendering import OnView, check_sizes
 
 # -- Bake a mesh's texture again without some photos, for an unbiased comparison with them --------
 
@@ -52,34 +52,21 @@ class _PhotoSubset:
 
 
 def bake_held_out_texture(
-    textured: TexturedMesh,
-    scene: Scene,
-    photos: PhotoSource,
-    names: Collection[str],
-    reduction: int,
-    work_folder: Path,
-    progress: Progress,
-    *,
-    threads: int,
-) -> TexturedMesh:
+    textured: TexturedMesh, scene: Scene, photos: PhotoSource, names: Collection[str],
+    reduction: int, work_folder: Path, progress: Progress, *, threads: int,
+) -> TexturedMesh:  # fmt: skip
     """Bake the colours again on the same UVs from all photos except the named ones.
+
+    At least one photo must remain. The result has no normal map and no occlusion, which unlit
+    pictures do not show.
 
     Parameters
     ----------
-    textured : TexturedMesh
-        Scene frame.
-    names : collection of str
-        Photos to leave out; at least one must remain.
     reduction : int
         Factor by which the compared pictures are coarser than the photos: the texture is reduced
         by the largest power of two up to it.
     work_folder : Path
         For temporary files, all removed before returning.
-
-    Returns
-    -------
-    TexturedMesh
-        Without normal map and occlusion, which unlit pictures do not show.
     """
     kept = [i for i, view in enumerate(scene.views) if view.camera.name not in names]
     full_px = len(textured.albedo)
@@ -92,10 +79,7 @@ def bake_held_out_texture(
     charts = uv_charts(graph, mesh.faces, uvs)
     unwrapped = Unwrap(uvs, charts, "kept", gutter_px, face_atlas=textured.face_atlas)
     settings = TextureSettings(
-        size_px=size_px,
-        gutter_px=max(1, math.floor(gutter_px)),
-        normal_map="off",
-        ambient_occlusion="off",
+        size_px, max(1, math.floor(gutter_px)), normal_map="off", ambient_occlusion="off"
     )
     part = dataclasses.replace(scene, views=tuple(scene.views[i] for i in kept))
     return texture_mesh(
@@ -124,8 +108,7 @@ class MeshBasedSettings:
 
     max_samples: int = 3_000_000
     """Training pixels that are used, of each photo at most an equal share, drawn evenly."""
-    seed: int = 0
-    """Of the draw."""
+    seed: int = 0  # of the draw
     outline_margin: float = 0.02
     """Where outlines are given: distance around them, as a share of the long side of the photo,
     within which pixels are compared."""
@@ -136,12 +119,9 @@ class MeshBasedSettings:
 class PhotoView:
     """A photo with its camera."""
 
-    camera: Camera
-    """In the mesh's frame, of the size of the photo."""
-    photo: np.ndarray
-    """(h, w, 3) uint8, or floats whose white is 1."""
-    counted: np.ndarray | None = None
-    """(h, w) bool: pixels that may be used; all without it."""
+    camera: Camera  # in the mesh's frame, of the size of the photo
+    photo: np.ndarray  # (h, w, 3) uint8, or floats whose white is 1
+    counted: np.ndarray | None = None  # (h, w) bool: pixels that may be used; all without it.
     outline: np.ndarray | None = None
     """(h, w) bool: where the photo shows what the mesh should show. Outside of it the photo is
     taken as black, as if the thing had been photographed alone."""
@@ -152,8 +132,7 @@ class MeshBasedView:
     """Figures of one test photo."""
 
     name: str
-    scores: ViewScores
-    """Over the compared pixels; uncovered ones are black."""
+    scores: ViewScores  # Over the compared pixels; uncovered ones are black.
     covered_psnr: float | None
     """dB, over compared pixels that a face covers; ``None`` if there are none."""
     inside_psnr: float | None
@@ -168,15 +147,10 @@ class MeshBasedView:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; unmeasured ones are absent."""
-        values = {
-            "name": self.name,
-            **self.scores.to_json(),
-            "covered_psnr": self.covered_psnr,
-            "inside_psnr": self.inside_psnr,
-            "uncovered": self.uncovered,
-            "beyond": self.beyond,
-        }
-        return {key: value for key, value in values.items() if value is not None}
+        names = ("covered_psnr", "inside_psnr", "uncovered", "beyond")
+        own = {name: getattr(self, name) for name in names}
+        measured = {name: value for name, value in own.items() if value is not None}
+        return {"name": self.name, **self.scores.to_json(), **measured}
 
 
 @dataclass(frozen=True)
@@ -184,17 +158,14 @@ class MeshBasedRendering:
     """Figures of all test photos; means are over photos with equal weights."""
 
     views: tuple[MeshBasedView, ...]
-    left_out: int
-    """Test photos without a pixel to compare."""
+    left_out: int  # test photos without a pixel to compare
     training_views: int
     training_pixels: int
     """Pixels of training photos that a face covers."""
-    samples: int
-    """Those of them that the field was fitted to."""
+    samples: int  # those of them that the field was fitted to
     training_psnr: float | None
     """dB at the samples: how well the field could follow the training photos."""
-    field_vertices: tuple[int, int]
-    """Of the fine and the coarse lattice."""
+    field_vertices: tuple[int, int]  # of the fine and the coarse lattice
     settings: MeshBasedSettings
 
     def mean(self, name: str) -> float | None:
@@ -207,32 +178,21 @@ class MeshBasedRendering:
         names = ("psnr", "ssim", "lpips", "covered_psnr", "inside_psnr", "uncovered", "beyond")
         means = {name: self.mean(name) for name in names}
         values = {
-            **means,
-            "views": [view.to_json() for view in self.views],
-            "left_out": self.left_out,
-            "background": "black",
-            "training_views": self.training_views,
-            "training_pixels": self.training_pixels,
-            "samples": self.samples,
-            "training_psnr": self.training_psnr,
-            "field_vertices": list(self.field_vertices),
+            **means, "views": [view.to_json() for view in self.views], "left_out": self.left_out,
+            "background": "black", "training_views": self.training_views,
+            "training_pixels": self.training_pixels, "samples": self.samples,
+            "training_psnr": self.training_psnr, "field_vertices": list(self.field_vertices),
             "settings": asdict(self.settings),
-        }
+        }  # fmt: skip
         return {key: value for key, value in values.items() if value is not None}
 
 
 def mesh_based_rendering(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    training: Sequence[PhotoView],
-    test: Sequence[PhotoView],
-    settings: MeshBasedSettings | None = None,
-    *,
-    lpips: Lpips | None = None,
-    threads: int = 0,
-    progress: Progress | None = None,
+    vertices: np.ndarray, faces: np.ndarray, training: Sequence[PhotoView],
+    test: Sequence[PhotoView], settings: MeshBasedSettings | None = None, *,
+    lpips: Lpips | None = None, threads: int = 0, progress: Progress | None = None,
     on_view: OnView | None = None,
-) -> MeshBasedRendering:
+) -> MeshBasedRendering:  # fmt: skip
     """Fit colours on the mesh to the training photos, and compare with the test photos.
 
     A pixel is covered if the ray through its centre meets a face from either side. An uncovered
@@ -241,10 +201,8 @@ def mesh_based_rendering(
     Parameters
     ----------
     vertices, faces : (v, 3) float64, (f, 3)
-    training : sequence of PhotoView
-        The only photos that the field is fitted to.
-    test : sequence of PhotoView
-        The only photos that are compared.
+    training, test : sequence of PhotoView
+        The only photos that the field is fitted to, and the only ones that are compared.
     threads : int
         0 uses every core; the result does not depend on it, except for the last digits of LPIPS.
     on_view : callable, optional
@@ -278,13 +236,11 @@ def mesh_based_rendering(
         found = _compare(surface, color_field, view, settings, lpips, on_view)
         if found is not None:
             views.append(found)
-    vertices_of_field = (0, 0)
-    if color_field is not None:
-        near, far = color_field.levels
-        vertices_of_field = (len(near.vertices), len(far.vertices))
+    levels = () if color_field is None else color_field.levels
+    near, far = [len(level.vertices) for level in levels] or [0, 0]
     return MeshBasedRendering(
         tuple(views), len(test) - len(views), len(training), pixels,
-        0 if samples is None else len(samples.points), reached, vertices_of_field, settings,
+        0 if samples is None else len(samples.points), reached, (near, far), settings,
     )  # fmt: skip
 
 
@@ -313,14 +269,7 @@ def _check(training: Sequence[PhotoView], test: Sequence[PhotoView]) -> None:
             "Hold photos out of training, or give a folder of test photos.",
         )
     for view in (*training, *test):
-        size = view.camera.height, view.camera.width
-        for picture in (view.photo, view.counted, view.outline):
-            if picture is not None and picture.shape[:2] != size:
-                raise UsageError(
-                    f"{view.camera.name}: a picture of {picture.shape[:2]} pixels (height, width) "
-                    f"for a camera of {size}.",
-                    "Resize the camera or the picture.",
-                )
+        check_sizes(view.camera, view.photo, view.counted, view.outline)
     centers = np.array([view.camera.center for view in training])
     spread = max(float(np.ptp(centers, axis=0).max()), float(np.finfo(np.float64).tiny))
     for view in test:
@@ -393,13 +342,9 @@ def _draw(
 
 
 def _compare(
-    surface: _Surface,
-    color_field: ColorField | None,
-    view: PhotoView,
-    settings: MeshBasedSettings,
-    lpips: Lpips | None,
-    on_view: OnView | None,
-) -> MeshBasedView | None:
+    surface: _Surface, color_field: ColorField | None, view: PhotoView,
+    settings: MeshBasedSettings, lpips: Lpips | None, on_view: OnView | None,
+) -> MeshBasedView | None:  # fmt: skip
     camera, target = view.camera, _target(view)
     depth = surface.depth(camera)
     covered = np.isfinite(depth)

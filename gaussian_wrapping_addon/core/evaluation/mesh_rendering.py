@@ -40,8 +40,7 @@ class TexturedView:
 
     image: np.ndarray
     """(h, w, 3) uint8; :data:`BACKGROUND` outside the mesh, blended along silhouettes."""
-    coverage: np.ndarray
-    """(h, w) float32 in [0, 1]: share of the pixel's rays that meet the mesh."""
+    coverage: np.ndarray  # (h, w) float32 in [0, 1]: share of the pixel's rays that meet the mesh
 
     @property
     def covered(self) -> np.ndarray:
@@ -55,14 +54,10 @@ class TexturedView:
 
 
 class TexturedRenderer:
-    """Render one textured mesh from many cameras; faces are two-sided.
+    """Render one textured mesh of the scene frame from many cameras; faces are two-sided.
 
-    Parameters
-    ----------
-    textured : TexturedMesh
-        In the scene frame; surfaces nearer than ``depth_buffer.NEAR_DEPTH`` are clipped.
-    threads : int
-        0 uses every core; the result does not depend on it.
+    Surfaces nearer than ``depth_buffer.NEAR_DEPTH`` are clipped. 0 threads use every core; the
+    result does not depend on their number.
     """
 
     def __init__(self, textured: TexturedMesh, *, threads: int = 0) -> None:
@@ -74,14 +69,9 @@ class TexturedRenderer:
         self._atlas = textured.atlas_of_faces
 
     def render(self, camera: Camera, size: tuple[int, int] | None = None) -> TexturedView:
-        """Render from a camera of the scene frame.
+        """Render from a camera of the scene frame, whose view is resampled.
 
-        Parameters
-        ----------
-        camera : Camera
-            Of any size; its view is resampled.
-        size : (width, height), optional
-            Size of the picture in pixels; by default that of the camera.
+        ``size`` is the width and height of the picture in pixels, by default that of the camera.
         """
         width, height = size or (camera.width, camera.height)
         fine = camera.resized(width * SUPERSAMPLING, height * SUPERSAMPLING)
@@ -123,17 +113,9 @@ def _pixel_sums(rays: np.ndarray) -> np.ndarray:
 
 @kernel(fast=False)
 def _shade(
-    hit: Any,
-    begin: int,
-    end: int,
-    local: Any,
-    faces: Any,
-    uvs: Any,
-    intrinsics: Any,
-    pixels: Any,
-    levels: Any,
-    image: Any,
-) -> None:
+    hit: Any, begin: int, end: int, local: Any, faces: Any, uvs: Any, intrinsics: Any, pixels: Any,
+    levels: Any, image: Any,
+) -> None:  # fmt: skip
     side_x, side_y = float(levels[0, 1]), float(levels[0, 2])
     normal = np.empty(3)
     for row in range(begin, end):
@@ -199,26 +181,20 @@ OnView = Callable[[str, np.ndarray, np.ndarray], None]
 class MeshView:
     """Figures of one photo."""
 
-    name: str
-    """Name of the camera."""
+    name: str  # name of the camera
     scores: ViewScores
     covered: float
     """Share of the candidate pixels (of the mask, or of the whole photo without one) that the mesh
     covers wholly."""
-    uncovered: float
-    """Share of the candidate pixels in which no ray meets a face."""
-    whole_psnr: float
-    """PSNR over all candidate pixels, black where no face covers them, dB."""
+    uncovered: float  # share of the candidate pixels in which no ray meets a face
+    whole_psnr: float  # PSNR over all candidate pixels, black where no face covers them, dB
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; ``lpips`` only if measured."""
         return {
-            "name": self.name,
-            **self.scores.to_json(),
-            "covered": self.covered,
-            "uncovered": self.uncovered,
-            "whole_psnr": self.whole_psnr,
-        }
+            "name": self.name, **self.scores.to_json(), "covered": self.covered,
+            "uncovered": self.uncovered, "whole_psnr": self.whole_psnr,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -230,43 +206,17 @@ class MeshRenderingScore:
     """``"mask"``: pixels of the given masks; ``"covered"``: pixels that the mesh covers wholly."""
     left_out: int
     """Photos without a valid pixel, or without one on which an SSIM window can be centred."""
-    lpips_note: str = ""
-    """Why LPIPS is missing."""
+    lpips_note: str = ""  # why LPIPS is missing
 
-    @property
-    def psnr(self) -> float | None:
-        """Mean PSNR, dB; ``None`` without any view."""
-        return _mean([view.scores.psnr for view in self.views])
-
-    @property
-    def ssim(self) -> float | None:
-        """Mean SSIM; ``None`` without any view."""
-        return _mean([view.scores.ssim for view in self.views])
-
-    @property
-    def lpips(self) -> float | None:
-        """Mean LPIPS of the views with a value; ``None`` without any."""
-        return _mean([v.scores.lpips for v in self.views if v.scores.lpips is not None])
-
-    @property
-    def covered(self) -> float | None:
-        """Mean covered share; ``None`` without any view."""
-        return _mean([view.covered for view in self.views])
-
-    @property
-    def uncovered(self) -> float | None:
-        """Mean uncovered share; ``None`` without any view."""
-        return _mean([view.uncovered for view in self.views])
-
-    @property
-    def whole_psnr(self) -> float | None:
-        """Mean PSNR that counts uncovered pixels as black, dB; ``None`` without any view."""
-        return _mean([view.whole_psnr for view in self.views])
+    def mean(self, name: str) -> float | None:
+        """Return the mean over the views that have the figure: a key of their JSON values."""
+        found = [values[name] for view in self.views if name in (values := view.to_json())]
+        return sum(found) / len(found) if found else None
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; unmeasured values are absent, and no value is infinite."""
         names = ("psnr", "ssim", "lpips", "covered", "uncovered", "whole_psnr")
-        means = {name: getattr(self, name) for name in names}
+        means = {name: self.mean(name) for name in names}
         values: dict[str, Any] = {
             "views": [view.to_json() for view in self.views],
             **{name: value for name, value in means.items() if value is not None},
@@ -279,16 +229,10 @@ class MeshRenderingScore:
 
 
 def render_views(
-    textured: TexturedMesh,
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    *,
-    masks: Sequence[np.ndarray] | None = None,
-    counted: Sequence[np.ndarray | None] | None = None,
-    lpips: Lpips | None = None,
-    threads: int = 0,
-    on_view: OnView | None = None,
-) -> MeshRenderingScore:
+    textured: TexturedMesh, cameras: Sequence[Camera], images: Sequence[np.ndarray], *,
+    masks: Sequence[np.ndarray] | None = None, counted: Sequence[np.ndarray | None] | None = None,
+    lpips: Lpips | None = None, threads: int = 0, on_view: OnView | None = None,
+) -> MeshRenderingScore:  # fmt: skip
     """Render the mesh from each camera and compare with its photo.
 
     PSNR, SSIM and LPIPS are those of :func:`~.image_metrics.score_images` over the valid
@@ -297,8 +241,6 @@ def render_views(
 
     Parameters
     ----------
-    textured : TexturedMesh
-        Scene frame.
     cameras : sequence of Camera
         In the mesh's frame (see ``Camera.moved``), each of the size of its photo.
     images : sequence of (h, w, 3) uint8, or floats whose white is 1
@@ -310,7 +252,6 @@ def render_views(
         front of the mesh in the photo are errors.
     counted : sequence of ((h, w) bool or None), optional
         Candidate pixels of each photo, such as the photo's own mask.
-    lpips : Lpips, optional
     threads : int
         0 uses every core; the result does not depend on it, except for the last digits of LPIPS.
     on_view : callable, optional
@@ -332,7 +273,7 @@ def render_views(
         _one_each(counted, cameras, "masks"),
         strict=True,
     ):
-        _check_sizes(camera, photo, mask, may_count)
+        check_sizes(camera, photo, mask, may_count)
         view = renderer.render(camera)
         candidates = np.ones(view.covered.shape, np.bool_)
         for part in (mask, may_count):
@@ -344,15 +285,10 @@ def render_views(
             continue
         scores = score_images(view.image, photo, judged, lpips=lpips, threads=threads)
         count = np.count_nonzero(candidates)
-        views.append(
-            MeshView(
-                camera.name,
-                scores,
-                np.count_nonzero(view.covered & candidates) / count,
-                np.count_nonzero((view.coverage == 0.0) & candidates) / count,
-                min(psnr(view.on_black(), photo, candidates), PSNR_CAP_DB),
-            )
-        )
+        covered = np.count_nonzero(view.covered & candidates) / count
+        uncovered = np.count_nonzero((view.coverage == 0.0) & candidates) / count
+        whole = min(psnr(view.on_black(), photo, candidates), PSNR_CAP_DB)
+        views.append(MeshView(camera.name, scores, covered, uncovered, whole))
         if on_view is not None:
             on_view(camera.name, photo, view.image)
     pixels = "covered" if masks is None else "mask"
@@ -369,7 +305,8 @@ def _one_each(given: Sequence[Any] | None, cameras: Sequence[Camera], what: str)
     return given
 
 
-def _check_sizes(camera: Camera, *pictures: np.ndarray | None) -> None:
+def check_sizes(camera: Camera, *pictures: np.ndarray | None) -> None:
+    """Raise ``UsageError`` if a picture differs in size from its camera."""
     for picture in pictures:
         if picture is not None and picture.shape[:2] != (camera.height, camera.width):
             raise UsageError(
@@ -386,7 +323,3 @@ def _note(lpips: Lpips | None, views: list[MeshView]) -> str:
     if views and all(view.scores.lpips is None for view in views):
         return "The pictures are too small for LPIPS."
     return ""
-
-
-def _mean(values: list[float]) -> float | None:
-    return sum(values) / len(values) if values else None

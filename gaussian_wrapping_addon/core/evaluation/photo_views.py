@@ -38,9 +38,7 @@ TEST_CAMERAS = "cameras.json"
 """Cameras of a folder whose photos are in ``images/``; what the benchmarks' scenes have."""
 
 
-def photo_views(
-    scene: Scene, indices: Iterable[int], *, max_image_px: int = LONG_SIDE_PX
-) -> list[PhotoView]:
+def photo_views(scene: Scene, indices: Iterable[int], *, max_image_px: int) -> list[PhotoView]:
     """Return photos of a scene in its world frame, black pixels of masks left out.
 
     Raises
@@ -49,25 +47,15 @@ def photo_views(
         A photo was changed or removed.
     """
     store = PhotoStore(scene, max_image_px)
-    return [
-        PhotoView(
-            store.camera(index).moved(scene.world_from_scene),
-            store.photo(index),
-            store.mask(index),
-        )
-        for index in indices
-    ]
+    world = scene.world_from_scene
+    return [PhotoView(store.camera(i).moved(world), store.photo(i), store.mask(i)) for i in indices]
 
 
 def folder_scene(path: Path, work_folder: Path, progress: Progress, *, threads: int) -> Scene:
     """Return the photos of a folder, undistorted where needed, in the frame of their cameras.
 
-    Parameters
-    ----------
-    path : Path
-        COLMAP project, ``transforms.json``, or a folder with :data:`TEST_CAMERAS` and ``images/``.
-    work_folder : Path
-        Undistorted photos are written here.
+    The folder is a COLMAP project, one with ``transforms.json``, or one with :data:`TEST_CAMERAS`
+    and ``images/``; undistorted photos are written into ``work_folder``.
 
     Raises
     ------
@@ -84,9 +72,7 @@ def folder_scene(path: Path, work_folder: Path, progress: Progress, *, threads: 
             f"{path.name} holds photos without cameras.",
             "Give a COLMAP project or a transforms.json in the frame of the mesh.",
         )
-    prepared, _, _ = prepare_views(
-        read_poses(kind), kind, work_folder, progress, threads=threads
-    )  # fmt: skip
+    prepared, _, _ = prepare_views(read_poses(kind), kind, work_folder, progress, threads=threads)
     views = []
     for view in prepared:
         focal_x, focal_y, middle_x, middle_y = view.pinhole.params
@@ -129,21 +115,15 @@ def _written_views(folder: Path) -> list[View]:
 
 
 GAP_PX = 12
-JPEG_QUALITY = 88
+_JPEG: dict[str, Any] = {"format": "JPEG", "quality": 88}
 
 
 def write_side_by_side(
     path: Path, left: np.ndarray, right: np.ndarray, *, max_width_px: int | None = None
 ) -> None:
-    """Write a PNG or JPEG, depending on the path's suffix.
+    """Write a PNG or JPEG, depending on the path's suffix, of two (h, w, 3) uint8 images.
 
-    Parameters
-    ----------
-    path : Path
-        Its folder must exist.
-    left, right : (h, w, 3) uint8
-    max_width_px : int, optional
-        A wider picture is scaled down.
+    A picture wider than ``max_width_px`` is scaled down.
 
     Raises
     ------
@@ -162,10 +142,8 @@ def write_side_by_side(
         low = max(1, round(height * max_width_px / picture.width))
         picture = picture.resize((max_width_px, low), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
-    if path.suffix == ".png":
-        picture.save(stream, format="PNG")
-    else:
-        picture.save(stream, format="JPEG", quality=JPEG_QUALITY)
+    options = {"format": "PNG"} if path.suffix == ".png" else _JPEG
+    picture.save(stream, **options)
     try:
         write_bytes(path, stream.getvalue())
     except OSError as error:
@@ -192,16 +170,9 @@ NOTE_GAUSSIANS = (
 
 
 def compare_with_photos(
-    textured: TexturedMesh,
-    scene: Scene,
-    photos: PhotoSource,
-    held_out: Collection[str],
-    folder: Path,
-    progress: Progress,
-    *,
-    from_gaussians: bool = False,
-    threads: int = 0,
-) -> dict[str, Any]:
+    textured: TexturedMesh, scene: Scene, photos: PhotoSource, held_out: Collection[str],
+    folder: Path, progress: Progress, *, from_gaussians: bool = False, threads: int = 0,
+) -> dict[str, Any]:  # fmt: skip
     """Evaluate mesh-based rendering over covered pixels, and write some of the comparisons.
 
     Comparison with a photo from which the texture was baked is biased. If photos were held out, a
@@ -209,11 +180,6 @@ def compare_with_photos(
 
     Parameters
     ----------
-    textured : TexturedMesh
-        Scene frame.
-    scene : Scene
-        Views of the photos.
-    photos : PhotoStore
     held_out : collection of str
         Names of photos held out of training. Up to :data:`MAX_PHOTOS` evenly spaced ones of these
         are compared, or of all photos if none were held out.
@@ -315,8 +281,7 @@ def choose_view(
         inside = (depth > 0) & (pixels > 0).all(axis=1)
         inside &= (pixels < [camera.width, camera.height]).all(axis=1)
         facing = (cross[hit[covered]] * (corners[hit[covered], 0] - camera.center)).sum(axis=1) < 0
-        share = float(facing.sum()) / covered.size
-        score = share * float(inside.mean()) ** 2
+        score = float(facing.sum()) / covered.size * float(inside.mean()) ** 2
         if score > best_score:
             best, best_score = index, score
     return best
@@ -339,29 +304,11 @@ def _crop(textured: TexturedMesh, camera: Camera, threads: int) -> tuple[int, in
 
 
 def write_preview(
-    textured: TexturedMesh,
-    scene: Scene,
-    photos: PhotoSource,
-    path: Path,
-    *,
-    view: int | None = None,
-    threads: int = 0,
-) -> None:
-    """Write a PNG: left the part of a photo that shows the mesh, right its rendering.
+    textured: TexturedMesh, scene: Scene, photos: PhotoSource, path: Path, *, threads: int = 0,
+) -> None:  # fmt: skip
+    """Write a PNG: left the part of a photo that shows the mesh best, right its rendering.
 
-    Parameters
-    ----------
-    textured : TexturedMesh
-        Scene frame.
-    scene : Scene
-        Views of the photos.
-    photos : PhotoStore
-    path : Path
-        Its folder must exist.
-    view : int or None
-        Photo to show; ``None`` chooses the one that shows the mesh best.
-    threads : int
-        0 uses every core.
+    With 0 threads, every core is used.
 
     Raises
     ------
@@ -371,8 +318,7 @@ def write_preview(
     from PIL import Image
 
     threads = threads or default_threads()
-    count = len(scene.views)
-    index = choose_view(textured, photos, count, threads=threads) if view is None else view
+    index = choose_view(textured, photos, len(scene.views), threads=threads)
     full = photos.camera(index, 1)
     left, top, right, bottom = _crop(textured, full, threads)
     part = dataclasses.replace(

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -41,10 +41,8 @@ discrepancy: 1 / g and 1 / g^2 with g^3 = g + 1."""
 class SurfaceSamples:
     """Points on a surface, in the frame of the mesh they come from."""
 
-    points: np.ndarray
-    """(n, 3) float64."""
-    normals: np.ndarray
-    """(n, 3) float64, unit length, or 0 if unknown; oriented like the surface."""
+    points: np.ndarray  # (n, 3) float64
+    normals: np.ndarray  # (n, 3) float64, unit length, or 0 if unknown; oriented like the surface.
 
     def __len__(self) -> int:
         return len(self.points)
@@ -80,19 +78,8 @@ def sample_uniformly(
     faces; several points on one face follow a low-discrepancy sequence. The density on any part of
     the surface therefore depends on its area and not on its tessellation.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int
-    count : int
-        Exact number of samples.
-    seed : int
-        The same seed gives bitwise identical samples.
-
-    Returns
-    -------
-    SurfaceSamples
-        With the normals of the faces; degenerate faces get no samples.
+    Of vertices (v, 3) float64 and faces (f, 3) int, exactly ``count`` samples are drawn, with the
+    normals of their faces; degenerate faces get none. The same seed gives bitwise identical ones.
 
     Raises
     ------
@@ -146,13 +133,9 @@ def sample_legacy(vertices: np.ndarray, faces: np.ndarray) -> SurfaceSamples:
 
 
 def scan_virtually(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    cameras: Sequence[Camera],
-    *,
-    threads: int = 1,
+    vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera], *, threads: int = 1,
     step_px: float = 1.0,
-) -> SurfaceSamples:
+) -> SurfaceSamples:  # fmt: skip
     """Collect the first hits of all pixels of cameras on a mesh (docs/method.md, section 9.1).
 
     No near plane and no back-face culling: faces occlude from both sides. Points lie on their faces
@@ -162,12 +145,11 @@ def scan_virtually(
 
     Parameters
     ----------
-    vertices : (v, 3) float64
-    faces : (f, 3) int
+    vertices, faces : (v, 3) float64, (f, 3) int
     cameras : sequence of Camera
         In the frame of the mesh.
     threads : int
-        Threads to use; the result does not depend on it.
+        The result does not depend on it.
     step_px : float
         Distance between rays in pixels of the cameras; 2 gives a quarter of the points.
 
@@ -212,54 +194,31 @@ def _weights_on_faces(corners: np.ndarray, rays: np.ndarray) -> np.ndarray:
 
     Clamped to the triangle, so that rounding moves no point of a grazing ray off its face.
     """
-    volumes = np.stack(
-        [
-            (rays * np.cross(corners[:, (k + 1) % 3], corners[:, (k + 2) % 3])).sum(1)
-            for k in range(3)
-        ],
-        1,
-    )  # (n, 3), of one sign where the ray hits the face
+    pairs = [(corners[:, (k + 1) % 3], corners[:, (k + 2) % 3]) for k in range(3)]
+    # (n, 3), of one sign where the ray hits the face
+    volumes = np.stack([(rays * np.cross(*pair)).sum(1) for pair in pairs], 1)
     sign = np.sign(volumes.sum(1, keepdims=True))
     weights = np.maximum(volumes * sign, 0.0)
     total = weights.sum(1, keepdims=True)
     return np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1.0 / 3.0)
 
 
-def voxel_downsample(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
-    """Replace the samples in each voxel by their mean, as point-cloud tools do.
+def voxel_downsample(points: np.ndarray, voxel: float) -> np.ndarray:
+    """Replace the points (n, 3) in each voxel of this side by their mean, as cloud tools do.
 
-    The grid begins half a voxel before the smallest coordinates. Mean normals are normalised; they
-    are 0 where the normals in a voxel cancel.
-
-    Parameters
-    ----------
-    voxel : float
-        Side of a voxel, > 0, in the samples' frame.
-
-    Returns
-    -------
-    SurfaceSamples
-        In order of the voxels (x, then y, then z).
+    The grid begins half a voxel before the smallest coordinates; the means are in the order of the
+    voxels (x, then y, then z).
 
     Raises
     ------
     UsageError
         ``voxel`` is not a positive number, or too small to index the voxels.
     """
-    group, members = _cells(samples.points, voxel)
-    if len(samples) == 0:
-        return samples
-    low = samples.points.min(0)
-    normals = _means(samples.normals, group, members)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    known = length > 1e-9  # shorter means result from normals that cancel, up to rounding
-    normals = np.where(known, normals / np.where(known, length, 1.0), 0.0)
-    return SurfaceSamples(_means(samples.points - low, group, members) + low, normals)
-
-
-def voxel_downsample_points(points: np.ndarray, voxel: float) -> np.ndarray:
-    """Downsample (n, 3) points without normals; see :func:`voxel_downsample`."""
-    return voxel_downsample(SurfaceSamples(points, np.zeros_like(points)), voxel).points
+    group, members = _cells(points, voxel)
+    if len(points) == 0:
+        return points
+    low = points.min(0)
+    return _means(points - low, group, members) + low
 
 
 def choose_per_cell(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
@@ -344,25 +303,6 @@ MIN_CAMERAS = 2
 _AGAIN = "Make the scene again."
 
 
-class CropVolume(Protocol):
-    """Volume outside which samples are not evaluated."""
-
-    def inside(self, points: np.ndarray) -> np.ndarray:
-        """Return whether (n, 3) points are inside, (n,) bool."""
-        ...
-
-
-@dataclass(frozen=True)
-class RegionCrop:
-    """The convex body of a region as a crop volume."""
-
-    region: Region
-
-    def inside(self, points: np.ndarray) -> np.ndarray:
-        """Return whether (n, 3) points are inside or on the boundary, (n,) bool."""
-        return self.region.contains(points)
-
-
 @dataclass(frozen=True)
 class Truth:
     """The true surface, in the frame of the surfaces compared with it.
@@ -374,16 +314,13 @@ class Truth:
     """
 
     samples: SurfaceSamples
-    vertices: np.ndarray | None = None
-    """(v, 3) float64, or ``None`` if only a cloud is known."""
-    faces: np.ndarray | None = None
-    """(f, 3) int."""
+    vertices: np.ndarray | None = None  # (v, 3) float64, or ``None`` if only a cloud is known
+    faces: np.ndarray | None = None  # (f, 3) int
     thin: np.ndarray | None = None
     """(n,) bool: the sample lies on a thin structure; ``None`` if not labelled."""
     seen: np.ndarray | None = None
-    """(n,) int32: number of training cameras that see the sample, or (n,) bool: visible or not;
-    ``None`` if unknown."""
-    crop: CropVolume | None = None
+    """(n,) int32: number of training cameras that see the sample; ``None`` if unknown."""
+    crop: Region | None = None  # samples outside are not evaluated
 
     def __post_init__(self) -> None:
         count = len(self.samples)
@@ -414,13 +351,13 @@ class Truth:
         """Return whether each sample is inside the crop, (n,) bool."""
         if self.crop is None:
             return np.ones(len(self.samples), np.bool_)
-        return self.crop.inside(self.samples.points)
+        return self.crop.contains(self.samples.points)
 
-    def visible(self, min_cameras: int = MIN_CAMERAS) -> np.ndarray:
-        """Return whether at least ``min_cameras`` see each sample, (n,) bool; true if unknown."""
+    def visible(self) -> np.ndarray:
+        """Return whether enough cameras see each sample, (n,) bool; true if unknown."""
         if self.seen is None:
             return np.ones(len(self.samples), np.bool_)
-        return self.seen if self.seen.dtype == np.bool_ else self.seen >= min_cameras
+        return self.seen >= MIN_CAMERAS
 
     def kept(self, mask: np.ndarray) -> Truth:
         """Return the same surface with the samples selected by a (n,) bool mask."""
@@ -471,13 +408,9 @@ def read_truth(folder: Path) -> Truth:
     )
     try:
         return Truth(
-            samples,
-            entries["vertices"].astype(np.float64),
-            faces,
-            entries["thin"],
-            entries["seen"].astype(np.int32),
-            RegionCrop(read_region(Path(folder) / CROP_FILE)),
-        )
+            samples, entries["vertices"].astype(np.float64), faces, entries["thin"],
+            entries["seen"].astype(np.int32), read_region(Path(folder) / CROP_FILE),
+        )  # fmt: skip
     except ParseError:
         raise
     except DatasetError as error:
@@ -495,11 +428,9 @@ MIN_THIN_SHARE = 0.01
 """Recall of thin parts is not meaningful if a smaller share of the true samples is thin."""
 
 SCAN_RAYS = 4_000_000
-"""Rays of a virtual scan unless a step is given: at most about 400 MB of points."""
+"""Rays of a virtual scan, which steps over pixels of more: at most about 400 MB of points."""
 
-Shares = tuple[float, ...]
-"""One number in [0, 1] for each threshold."""
-
+Shares = tuple[float, ...]  # one number in [0, 1] for each threshold
 _Mesh = tuple[np.ndarray, np.ndarray]
 
 
@@ -560,15 +491,9 @@ class CloudScore:
 
 
 def score_surface(
-    predicted: SurfaceSamples,
-    predicted_mesh: _Mesh | None,
-    truth: Truth,
-    thresholds: Sequence[float],
-    *,
-    reached: SurfaceSamples | None = None,
-    min_cameras: int = MIN_CAMERAS,
-    threads: int = 1,
-) -> SurfaceScore:
+    predicted: SurfaceSamples, predicted_mesh: _Mesh | None, truth: Truth,
+    thresholds: Sequence[float], *, reached: SurfaceSamples | None = None, threads: int = 1,
+) -> SurfaceScore:  # fmt: skip
     """Compare samples of a surface with the truth.
 
     The crop selects the samples that are evaluated, on either side, but not what they are compared
@@ -578,7 +503,7 @@ def score_surface(
       mesh, or of its cloud if it has no mesh;
     - recall: share of evaluated true samples within it of ``predicted_mesh``, or if that is
       ``None`` of the samples ``reached``, or else of the predicted ones; visible recall: of those
-      that at least ``min_cameras`` cameras see; thin recall: of those that are thin and, if
+      that at least :data:`MIN_CAMERAS` cameras see; thin recall: of those that are thin and, if
       known, visible;
     - F1: harmonic mean of the two, 0 if both are 0;
     - normals: over all evaluated samples of either side, at any distance, if both the sample and
@@ -592,15 +517,12 @@ def score_surface(
         In the truth's frame, like the mesh.
     predicted_mesh : (vertices, faces) or None
         Given for the uniform protocol; ``None`` for scan and legacy, which evaluate a cloud.
-    truth : Truth
     thresholds : sequence of float
         Distances > 0 in the truth's frame.
     reached : SurfaceSamples, optional
         A denser set from which ``predicted`` was evenly subsampled.
-    min_cameras : int
-        Not used where ``truth.seen`` is boolean.
     threads : int
-        Threads of the search in clouds; the result does not depend on it.
+        Of the search in clouds; the result does not depend on it.
 
     Raises
     ------
@@ -613,7 +535,7 @@ def score_surface(
         raise UsageError("No true sample lies inside the crop.", "Check the crop's frame.")
     inside = np.ones(len(predicted), np.bool_)
     if truth.crop is not None and len(predicted):
-        inside = truth.crop.inside(predicted.points)
+        inside = truth.crop.contains(predicted.points)
     true, shown = truth.samples.kept(judged), predicted.kept(inside)
 
     accuracy, there = _nearest(shown, truth.mesh, truth.samples, threads)
@@ -622,61 +544,42 @@ def score_surface(
         completeness, back = _nearest(true, predicted_mesh, cloud, threads)
     else:
         completeness, back = np.full(len(true), np.inf), np.zeros((len(true), 3))
-    visible = truth.visible(min_cameras)[judged]
+    visible = truth.visible()[judged]
     thin = np.zeros(len(true), np.bool_) if truth.thin is None else truth.thin[judged] & visible
     precision, recall = _shares(accuracy, limits), _shares(completeness, limits)
     knows_seen = truth.seen is not None and bool(visible.any())
     cosines = (shown.normals * there).sum(1), (true.normals * back).sum(1)
-    known = (
-        shown.normals.any(1) & there.any(1),
-        true.normals.any(1) & back.any(1),
-    )
+    known = shown.normals.any(1) & there.any(1), true.normals.any(1) & back.any(1)
     pairs = [cosine[mask] for cosine, mask in zip(cosines, known, strict=True)]
     means = _mean(accuracy), _mean(completeness)
     medians = _median(accuracy), _median(completeness)
     return SurfaceScore(
-        thresholds=limits,
-        precision=precision,
-        recall=recall,
+        thresholds=limits, precision=precision, recall=recall,
         f1=tuple(_f1(p, r) for p, r in zip(precision, recall, strict=True)),
         visible_recall=_shares(completeness[visible], limits) if knows_seen else None,
         thin_recall=_shares(completeness[thin], limits) if thin.any() else None,
-        accuracy_mean=means[0],
-        accuracy_median=medians[0],
-        completeness_mean=means[1],
-        completeness_median=medians[1],
-        chamfer_mean=(means[0] + means[1]) / 2,
+        accuracy_mean=means[0], accuracy_median=medians[0], completeness_mean=means[1],
+        completeness_median=medians[1], chamfer_mean=(means[0] + means[1]) / 2,
         chamfer_median=(medians[0] + medians[1]) / 2,
         normal_consistency=_symmetric_mean([np.abs(values) for values in pairs]),
         normal_agreement=_symmetric_mean([(values > 0).astype(np.float64) for values in pairs]),
-        predicted_count=len(shown),
-        truth_count=len(true),
-        visible_count=int(visible.sum()) if knows_seen else 0,
-        thin_count=int(thin.sum()),
-    )
+        predicted_count=len(shown), truth_count=len(true),
+        visible_count=int(visible.sum()) if knows_seen else 0, thin_count=int(thin.sum()),
+    )  # fmt: skip
 
 
 def score_protocols(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    truth: Truth,
-    cameras: Sequence[Camera],
-    thresholds: Sequence[float],
-    *,
-    count: int = 200_000,
-    seed: int = 0,
-    threads: int = 1,
+    vertices: np.ndarray, faces: np.ndarray, truth: Truth, cameras: Sequence[Camera],
+    thresholds: Sequence[float], *, count: int = 200_000, seed: int = 0, threads: int = 1,
     protocols: Sequence[str] = PROTOCOLS,
-    step_px: float | None = None,
-    min_cameras: int = MIN_CAMERAS,
-) -> dict[str, SurfaceScore]:
+) -> dict[str, SurfaceScore]:  # fmt: skip
     """Score a mesh by several protocols (docs/method.md, section 9.1).
 
     - ``uniform``: ``count`` samples uniform over the mesh; recall is measured against the mesh
       itself, so it does not depend on their density. Inner sides and hidden parts count.
     - ``scan``: the surface seen by the cameras, downsampled to one point per voxel of half the
       smallest threshold, so that parts near many cameras do not weigh more. Recall is measured
-      against all points seen, and only over the true samples that at least ``min_cameras``
+      against all points seen, and only over the true samples that at least :data:`MIN_CAMERAS`
       cameras see (all, if unknown), because a scan cannot reach others. Hidden parts do not count
       on either side. The distance between neighbouring points of the scan must be well below the
       thresholds.
@@ -687,26 +590,17 @@ def score_protocols(
     ----------
     vertices, faces : (v, 3), (f, 3)
         The mesh in the truth's frame, possibly empty.
-    truth : Truth
     cameras : sequence of Camera
         In the truth's frame; only used by ``scan``.
     thresholds : sequence of float
         Distances > 0.
     count, seed
-        See :func:`~.surface_scores.sample_uniformly`.
+        See :func:`sample_uniformly`.
     threads : int
-        Threads to use, 0 for every core; the result does not depend on it. Distances to meshes
-        always use every core (see :func:`~.sampling.distances_to_mesh`).
+        0 for every core; the result does not depend on it. Distances to meshes always use every
+        core (see :func:`~.sampling.distances_to_mesh`).
     protocols : sequence of str
-        Elements of :data:`PROTOCOLS`.
-    step_px : float, optional
-        See :func:`~.surface_scores.scan_virtually`; by default the smallest with at most
-        :data:`SCAN_RAYS` rays in total.
-
-    Returns
-    -------
-    dict of str to SurfaceScore
-        By protocol, in the given order.
+        Elements of :data:`PROTOCOLS`, in the order of the result.
 
     Raises
     ------
@@ -726,15 +620,16 @@ def score_protocols(
         elif protocol == "scan":
             if len(cameras) == 0:
                 raise UsageError("A virtual scan needs cameras.", "Give those of the photos.")
-            visible = truth.visible(min_cameras)
+            visible = truth.visible()
             if not visible.any():
                 raise UsageError(
-                    f"No true sample is seen by {min_cameras} cameras.", "Require fewer cameras."
+                    f"No true sample is seen by {MIN_CAMERAS} cameras.", "Require fewer cameras."
                 )
             judged = truth.kept(visible)
             predicted = SurfaceSamples.empty()
             if len(faces):
-                step = _scan_step(cameras) if step_px is None else step_px
+                rays = sum(camera.width * camera.height for camera in cameras)
+                step = max(1.0, math.sqrt(rays / SCAN_RAYS))
                 reached = scan_virtually(vertices, faces, cameras, threads=threads, step_px=step)
                 predicted = choose_per_cell(reached, min(limits) / 2)
         elif protocol == "legacy":
@@ -744,35 +639,30 @@ def score_protocols(
         # A mesh of degenerate faces only counts as empty.
         result[protocol] = score_surface(
             predicted, mesh if len(predicted) else None, judged, limits,
-            reached=reached, min_cameras=min_cameras, threads=threads,
+            reached=reached, threads=threads,
         )  # fmt: skip
     return result
 
 
 def score_clouds(
-    predicted_points: np.ndarray,
-    truth_points: np.ndarray,
-    threshold: float,
-    *,
-    voxel: float | None,
-    threads: int = 1,
-) -> CloudScore:
+    predicted_points: np.ndarray, truth_points: np.ndarray, threshold: float, *,
+    voxel: float | None, threads: int = 1,
+) -> CloudScore:  # fmt: skip
     """Compare point clouds by the protocol of Tanks and Temples, after alignment and crop.
 
     See docs/method.md, section 9.1.
 
     Parameters
     ----------
-    predicted_points : (n, 3) float64
-        May be empty; precision, recall and F1 are then 0.
-    truth_points : (m, 3) float64
+    predicted_points, truth_points : (n, 3), (m, 3) float64
+        Without predicted ones precision, recall and F1 are 0.
     threshold : float
         A point counts within this distance (``<=``).
     voxel : float or None
         Both clouds are first downsampled to one mean per voxel of this side; the protocol uses
         half of the threshold. ``None``: no downsampling.
     threads : int
-        Threads of the search; the result does not depend on it.
+        Of the search; the result does not depend on it.
 
     Raises
     ------
@@ -786,7 +676,7 @@ def score_clouds(
         if not np.isfinite(points).all():
             raise UsageError(f"The {name} cloud has a point that is not finite.", "Remove it.")
         if voxel is not None:
-            points = voxel_downsample_points(points, voxel)
+            points = voxel_downsample(points, voxel)
         clouds.append(points)
     predicted, truth = clouds
     if len(truth) == 0:
@@ -798,11 +688,6 @@ def score_clouds(
         limit, precision, recall, _f1(precision, recall), _mean(accuracy), _mean(completeness),
         len(predicted), len(truth),
     )  # fmt: skip
-
-
-def _scan_step(cameras: Sequence[Camera]) -> float:
-    pixels = sum(camera.width * camera.height for camera in cameras)
-    return max(1.0, math.sqrt(pixels / SCAN_RAYS))
 
 
 def _uniform(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> SurfaceSamples:
@@ -821,12 +706,9 @@ def _nearest(
         distances, face, _ = distances_to_mesh(samples.points, *mesh)
         if len(mesh[1]) == 0:
             return distances, np.zeros((len(samples), 3))
-        met = np.asarray(mesh[1])[face]  # (n, 3), vertices of the nearest faces
-        low = np.asarray(mesh[0], np.float64)
-        corners = low[met]  # (n, 3, 3)
+        corners = np.asarray(mesh[0], np.float64)[np.asarray(mesh[1])[face]]  # (n, 3, 3)
         flat = (corners - corners[:, :1]).reshape(-1, 3)
-        normals, _ = face_normals(flat, np.arange(len(flat)).reshape(-1, 3))
-        return distances, normals
+        return distances, face_normals(flat, np.arange(len(flat)).reshape(-1, 3))[0]
     distances, index = distances_to_cloud(samples.points, cloud.points, threads=threads)
     if len(cloud) == 0:
         return distances, np.zeros((len(samples), 3))

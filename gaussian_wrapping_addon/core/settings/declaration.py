@@ -33,12 +33,9 @@ class Range:
 
     low: float
     high: float = math.inf
-    zero: str = ""
-    """Meaning of 0, if it is allowed in addition to the range."""
-    words: str = ""
-    """Replaces the generated description."""
-    below_high: bool = False
-    """Whether ``high`` itself is excluded."""
+    zero: str = ""  # meaning of 0, if it is allowed in addition to the range
+    words: str = ""  # replaces the generated description
+    below_high: bool = False  # whether ``high`` itself is excluded
 
     @property
     def wanted(self) -> str:
@@ -111,12 +108,10 @@ def _plain(number: float) -> str:
 
 PRESETS = ("draft", "standard", "fine", "paper", "large")
 SELECTION_MODES = ("auto", "on", "off")
-"""Of an optional part of the model; ``"auto"`` selects it by evidence in the photos."""
+"""Of what is chosen by evidence in the photos where it is ``"auto"``."""
 SWITCH = ("off", "on")
 
-DEVICE = r"auto|cpu|cuda(:[0-9]{1,3})?"
-"""Pattern of the devices that a job can be given."""
-
+DEVICE = r"auto|cpu|cuda(:[0-9]{1,3})?"  # pattern of the devices that a job can be given
 COMPUTERS = r"|local|(tcp|tls)://(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253}):[0-9]{1,5}"
 """Pattern of where the parts of a job run; empty: here, in one process."""
 MAX_PROCESSES = 64
@@ -128,9 +123,6 @@ MASKS_MADE = ("off", "region")
 MODEL_RANGES = ("imagenet", "half", "unit")
 """Colours of a segmentation model: mean and deviation of ImageNet, -0.5 to 0.5, 0 to 1."""
 MAX_MASK_GROW_PX = 200
-GEOREFERENCES = ("auto", "on", "off")
-TURNTABLE_MODES = ("auto", "on", "off")
-PANORAMA_MODES = ("auto", "on", "off")
 CORRELATIONS = ("signed", "squared")
 SPACINGS = ("adaptive", "uniform")
 MESH_METHODS = ("pam", "pivots")
@@ -144,8 +136,7 @@ MAX_LODS = 8
 TEXTURE_SOURCES = ("photos", "gaussians")
 UV_CHOICES = ("auto", "own", "new")
 """Of a mesh from elsewhere; ``"auto"``: its own if it has any."""
-UP_AXES = ("auto", "y", "z")
-"""Of a mesh file; ``"auto"``: as the format is exported."""
+UP_AXES = ("auto", "y", "z")  # Of a mesh file; ``"auto"``: as the format is exported.
 
 
 # -- Declare a setting once, as a field of a settings class with metadata -------------------------
@@ -172,23 +163,18 @@ Owner = Literal["scene", "training", "preferences"]
 """Owner of a property in Blender: ``Scene.gwrap``, ``Scene.gwrap.training``, or the add-on."""
 
 PanelName = Literal[
-    "dataset",
-    "train",
-    "train_advanced",
-    "mesh",
-    "mesh_advanced",
-    "texture",
-    "computers",
+    "dataset", "train", "train_advanced", "mesh", "mesh_advanced", "texture", "computers",
     "preferences",
-]
+]  # fmt: skip
 """A panel in Blender."""
 
-JOB = "job"
-"""Group of the settings that are direct fields of the job's settings."""
-
-_SCOPES: Mapping[str, Scope] = {"training": "training", "meshing": "region", "texture": "region"}
+JOB = "job"  # group of the settings that are direct fields of the job's settings
+_SCOPES: Mapping[str, Scope] = {
+    JOB: "training", "training": "training", "meshing": "region", "texture": "region",
+}  # fmt: skip
 _PANEL_NAMES: Mapping[str, PanelName] = {
-    "training": "train_advanced", "meshing": "mesh_advanced", "texture": "texture",
+    JOB: "train_advanced", "training": "train_advanced", "meshing": "mesh_advanced",
+    "texture": "texture",
 }  # fmt: skip
 
 
@@ -196,19 +182,14 @@ _PANEL_NAMES: Mapping[str, PanelName] = {
 class Option:
     """How a setting is given on the command line."""
 
-    name: str
-    """With its leading dashes."""
+    name: str = ""  # With its leading dashes; empty: the setting's.
     metavar: str = ""
     help: str = ""
     """Replaces the setting's help."""
-    scope: Scope | None = None
-    """``None``: by the setting's group."""
-    exclusive: str = ""
-    """Options with the same name here exclude each other."""
-    flag: str = ""
-    """If not empty, the option takes no value and sets the setting to this word."""
-    many: bool = False
-    """Whether it takes several values and may be repeated."""
+    scope: Scope | None = None  # ``None``: by the setting's group
+    exclusive: str = ""  # options with the same name here exclude each other
+    flag: str = ""  # if not empty, the option takes no value and sets the setting to this word
+    many: bool = False  # whether it takes several values and may be repeated
     own: bool = False
     """Whether it is an option of its own; others are given as ``--set NAME=VALUE``."""
     parse: Callable[[Any], Any] | None = None
@@ -229,6 +210,11 @@ class Item:
     description: str
 
 
+def auto_on_off(auto: str, on: str, off: str) -> tuple[Item, ...]:
+    """Return the entries of a setting that is ``"auto"``, ``"on"`` or ``"off"``, by tooltips."""
+    return Item("auto", "Auto", auto), Item("on", "On", on), Item("off", "Off", off)
+
+
 @dataclass(frozen=True)
 class PanelProperty:
     """How a setting is shown in Blender. Property names and identifiers are stored in .blend files.
@@ -240,12 +226,9 @@ class PanelProperty:
     description: str
     name: str = ""
     """Name of the property; empty uses the setting's."""
-    items: tuple[Item, ...] = ()
-    """Entries of an enum; identifiers are the values in upper case."""
-    default: Any = None
-    """Default of the property, if it differs from the setting's."""
-    preset_if_zero: bool = False
-    """Whether 0, the property's default, uses the preset's number."""
+    items: tuple[Item, ...] = ()  # Entries of an enum; identifiers are the values in upper case.
+    default: Any = None  # default of the property, if it differs from the setting's
+    preset_if_zero: bool = False  # whether 0, the property's default, uses the preset's number
     low: float | None = None
     """Smallest number, if it differs from the smallest that the check allows."""
     soft_low: float | None = None
@@ -256,16 +239,11 @@ class PanelProperty:
     subtype: str = ""
     unit: str = ""
     """Blender's subtype and unit, such as ``"DISTANCE"`` and ``"LENGTH"``."""
-    owner: Owner | None = None
-    """``None``: by the setting's group."""
-    panel_name: PanelName | None = None
-    """The panel; ``None``: by the setting's group."""
-    order: int = 100
-    """Position within the panel; equal numbers keep the order of declaration."""
-    drawn_label: str = ""
-    """Shorter label in the panel, if its title provides the context."""
-    expand: bool = False
-    """Whether all entries of an enum are shown side by side."""
+    owner: Owner | None = None  # ``None``: by the setting's group
+    panel_name: PanelName | None = None  # The panel; ``None``: by the setting's group.
+    order: int = 100  # Position within the panel; equal numbers keep the order of declaration.
+    drawn_label: str = ""  # shorter label in the panel, if its title provides the context
+    expand: bool = False  # whether all entries of an enum are shown side by side
     shown_if: tuple[str, str | bool | int] | None = None
     """Property of the scene and its value for which this one is shown."""
     default_if_hidden: bool = False
@@ -277,8 +255,7 @@ class Declaration:
     """The declaration of one setting."""
 
     default: Any
-    help: str
-    """What the setting does, in full sentences."""
+    help: str  # what the setting does, in full sentences
     check: Check | None = None
     unit: str = ""
     presets: Mapping[str, Any] = field(default_factory=dict)
@@ -287,15 +264,12 @@ class Declaration:
     panel: PanelProperty | None = None
     model_selection: bool = False
     """Whether it selects a part of the model: ``--needs`` sets all of these."""
-    affects_result: bool = True
-    """Whether the result depends on it; if not, stage keys exclude it."""
+    affects_result: bool = True  # Whether the result depends on it; if not, stage keys exclude it.
     since: str = ""
     """Version that added it; empty: 0.1.0. Stage keys exclude a later setting at its default, so
     that results of earlier versions stay valid."""
-    path: str = ""
-    """Dotted, within the job's settings, such as ``"training.iterations"``."""
-    kind: Any = None
-    """The type: ``int``, ``float``, ``str`` or ``tuple[str, ...]``."""
+    path: str = ""  # dotted, within the job's settings, such as ``"training.iterations"``
+    kind: Any = None  # the type: ``int``, ``float``, ``str`` or ``tuple[str, ...]``
 
     @property
     def name(self) -> str:
@@ -333,7 +307,7 @@ class Declaration:
     def property_owner(self) -> Owner:
         """The owner of its property in Blender."""
         assert self.panel is not None
-        return self.panel.owner or ("training" if self.group == "training" else "scene")
+        return self.panel.owner or ("training" if self.group in (JOB, "training") else "scene")
 
     @property
     def panel_name(self) -> PanelName:
@@ -364,33 +338,9 @@ class Declaration:
         return {self.to_panel(item.value): item.value for item in self.panel.items}[stored]
 
 
-def setting(
-    default: Any,
-    *,
-    help: str,
-    check: Check | None = None,
-    unit: str = "",
-    presets: Mapping[str, Any] | None = None,
-    option: Option | None = None,
-    panel: PanelProperty | None = None,
-    model_selection: bool = False,
-    affects_result: bool = True,
-    since: str = "",
-) -> Any:
+def setting(default: Any, **declared: Any) -> Any:
     """Declare a setting as a field of a settings class; see :class:`Declaration`."""
-    declared = Declaration(
-        default,
-        help,
-        check,
-        unit,
-        presets or {},
-        option,
-        panel,
-        model_selection,
-        affects_result,
-        since,
-    )
-    return field(default=default, metadata={_KEY: declared})
+    return field(default=default, metadata={_KEY: Declaration(default, **declared)})
 
 
 @functools.cache
@@ -413,7 +363,10 @@ def _walk(kind: type, prefix: str) -> Iterable[Declaration]:
         if dataclasses.is_dataclass(hint):
             yield from _walk(typing.cast(type, hint), f"{path}.")
         elif isinstance(declared, Declaration):
-            yield dataclasses.replace(declared, path=path, kind=hint)
+            option = declared.option
+            if option is not None and not option.name:
+                option = dataclasses.replace(option, name=f"--{entry.name.replace('_', '-')}")
+            yield dataclasses.replace(declared, path=path, kind=hint, option=option)
         else:
             raise TypeError(f"{kind.__name__}.{entry.name} is not declared by setting()")
 

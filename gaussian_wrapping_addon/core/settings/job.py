@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -17,15 +17,13 @@ from ..names import JOB_FORMATS
 from .declaration import (
     COMPUTERS,
     DEVICE,
-    GEOREFERENCES,
     MASKS_MADE,
     MAX_MASK_GROW_PX,
     MAX_PROCESSES,
     MODEL_RANGES,
-    PANORAMA_MODES,
     PRESETS,
+    SELECTION_MODES,
     SWITCH,
-    TURNTABLE_MODES,
     Choices,
     Condition,
     Declaration,
@@ -34,6 +32,7 @@ from .declaration import (
     PanelProperty,
     Range,
     Subset,
+    auto_on_off,
     declarations,
     has_kind,
     setting,
@@ -47,75 +46,7 @@ from .training import TrainingSettings
 # -- Settings of a job's engine: on which processes and computers its parts run -------------------
 
 
-LOCAL = "local"
-"""A cluster of this computer, made for a job and gone with it."""
-
-
-def computers_setting() -> Any:
-    """Return the declaration of ``computers``."""
-    return setting(
-        "",
-        help="What runs the parts of a job. Empty: this process, one after another; local: several "
-        "processes of this computer; tls://HOST:PORT: the computers of a Dask scheduler.",
-        check=Condition(
-            lambda value: re.fullmatch(COMPUTERS, value) is not None,
-            "local or tls://HOST:PORT",
-        ),
-        option=Option(
-            "--computers",
-            "local|tls://HOST:PORT",
-            "run parts side by side: in processes of this computer, or at a Dask scheduler's",
-            scope="region",
-            own=True,
-        ),
-        affects_result=False,
-        since="0.2.0",
-    )
-
-
-def processes_setting() -> Any:
-    """Return the declaration of ``processes``."""
-    return setting(
-        2,
-        help="Parts that run side by side on this computer.",
-        check=Range(1, MAX_PROCESSES),
-        unit="processes",
-        option=Option(
-            "--processes",
-            help="parts side by side with --computers local",
-            scope="region",
-            own=True,
-        ),
-        panel=PanelProperty(
-            "Processes",
-            "Parts of a job that run side by side on this computer, each with its own memory",
-            default=1,
-            owner="scene",
-            panel_name="computers",
-            soft_high=8,
-        ),
-        affects_result=False,
-        since="0.2.0",
-    )
-
-
-def certificates_setting() -> Any:
-    """Return the declaration of ``certificates``."""
-    return setting(
-        "",
-        help="Folder of the certificates for tls:// addresses; empty: the one that the environment "
-        "variable GW_CERTIFICATES names.",
-        option=Option(
-            "--certificates",
-            "DIR",
-            "certificates for tls:// addresses",
-            scope="region",
-            parse=lambda text: str(Path(text)),
-            own=True,
-        ),
-        affects_result=False,
-        since="0.2.0",
-    )
+LOCAL = "local"  # a cluster of this computer, made for a job and gone with it
 
 
 # -- Printed markers as a setting: dictionary and side, such as ``4x4_50:0.05`` -------------------
@@ -136,10 +67,8 @@ MARKERS_WANTED = "DICTIONARY:SIZE, such as 4x4_50:0.05, the size in metres"
 class MarkerSpec:
     """Which markers were printed."""
 
-    dictionary: str
-    """A name of :data:`MARKER_DICTIONARIES`."""
-    side_m: float
-    """Side of the black square, metres."""
+    dictionary: str  # a name of :data:`MARKER_DICTIONARIES`
+    side_m: float  # side of the black square, metres
 
 
 def marker_spec(text: str) -> MarkerSpec | None:
@@ -191,14 +120,16 @@ def are_markers(text: str) -> bool:
 # -- All settings of one job, and its presets -----------------------------------------------------
 
 
-def _formats(text: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(word for word in text.split(",") if word))
-
-
-def _distinct(words: list[str]) -> tuple[str, ...]:
+def _distinct(words: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(words))
 
 
+def _path(text: str) -> str:
+    return str(Path(text))
+
+
+# Packed, as a survey of all settings needs few lines.
+# fmt: off
 @dataclass(frozen=True)
 class JobSettings:
     """All settings of one job."""
@@ -208,52 +139,38 @@ class JobSettings:
         help="Quality against time: sets the numbers of the training that have no value of their "
         "own.",
         check=Choices(PRESETS),
-        option=Option("--preset", help="quality against time", scope="training", own=True),
+        option=Option("--preset", help="quality against time", own=True),
         panel=PanelProperty(
-            "Preset",
-            "Quality against time",
+            "Preset", "Quality against time",
             items=(
                 Item("draft", "Draft", "A first look: small images, few Gaussians"),
                 Item("standard", "Standard", "For most scenes"),
                 Item(
-                    "fine",
-                    "Fine",
-                    "Larger images and more Gaussians; needs several times as long",
+                    "fine", "Fine", "Larger images and more Gaussians; needs several times as long",
                 ),
                 Item(
-                    "paper",
-                    "Paper",
+                    "paper", "Paper",
                     "The published settings: 30,000 iterations on whole photos, nothing decided "
                     "automatically; many hours to days on a processor",
                 ),
                 Item(
-                    "large",
-                    "Large",
+                    "large", "Large",
                     "For a GPU: large photos, many Gaussians and iterations; hours on a processor",
                 ),
             ),
-            panel_name="train",
-            expand=True,
+            owner="scene", panel_name="train", expand=True,
         ),
     )
     seed: int = setting(
-        0,
-        help="Seed of all random numbers.",
-        check=Range(0, 2**31 - 1),
-        option=Option("--seed", help="seed of all random numbers", scope="training", own=True),
+        0, help="Seed of all random numbers.", check=Range(0, 2**31 - 1),
+        option=Option("--seed", help="seed of all random numbers", own=True),
     )
     threads: int = setting(
-        0,
-        help="Processor threads; 0 uses every core this process may use.",
-        check=Range(0, 1024),
+        0, help="Processor threads; 0 uses every core this process may use.", check=Range(0, 1024),
         unit="threads",
-        option=Option(
-            "--threads", help="processor threads; 0 uses every core", scope="training", own=True
-        ),
+        option=Option("--threads", help="processor threads; 0 uses every core", own=True),
         panel=PanelProperty(
-            "Threads",
-            "Processor threads for jobs; 0 uses all",
-            owner="preferences",
+            "Threads", "Processor threads for jobs; 0 uses all", owner="preferences",
             panel_name="preferences",
         ),
         affects_result=False,
@@ -269,73 +186,86 @@ class JobSettings:
             "auto, cpu, cuda or cuda:N with the number of a GPU",
         ),
         option=Option(
-            "--device",
-            "auto|cpu|cuda|cuda:N",
-            "where to compute; auto: an NVIDIA GPU where one can be used",
-            scope="training",
-            own=True,
+            "--device", "auto|cpu|cuda|cuda:N",
+            "where to compute; auto: an NVIDIA GPU where one can be used", own=True,
         ),
         panel=PanelProperty(
-            "Device",
-            "Where jobs compute what can run on a GPU",
+            "Device", "Where jobs compute what can run on a GPU",
             items=(
                 Item("auto", "Auto", "An NVIDIA GPU where one can be used, else the processor"),
                 Item("cpu", "Processor", "Never a GPU"),
                 Item("cuda", "NVIDIA GPU", "The first GPU; jobs that cannot use it are refused"),
             ),
-            owner="preferences",
-            panel_name="preferences",
+            owner="preferences", panel_name="preferences",
         ),
-        affects_result=False,
-        since="0.2.0",
+        affects_result=False, since="0.2.0",
     )
-    computers: str = computers_setting()
-    processes: int = processes_setting()
-    certificates: str = certificates_setting()
+    computers: str = setting(
+        "",
+        help="What runs the parts of a job. Empty: this process, one after another; local: several "
+        "processes of this computer; tls://HOST:PORT: the computers of a Dask scheduler.",
+        check=Condition(
+            lambda value: re.fullmatch(COMPUTERS, value) is not None, "local or tls://HOST:PORT",
+        ),
+        option=Option(
+            "--computers", "local|tls://HOST:PORT",
+            "run parts side by side: in processes of this computer, or at a Dask scheduler's",
+            scope="region", own=True,
+        ),
+        affects_result=False, since="0.2.0",
+    )
+    processes: int = setting(
+        2, help="Parts that run side by side on this computer.", check=Range(1, MAX_PROCESSES),
+        unit="processes",
+        option=Option(
+            "--processes", help="parts side by side with --computers local", scope="region",
+            own=True,
+        ),
+        panel=PanelProperty(
+            "Processes",
+            "Parts of a job that run side by side on this computer, each with its own memory",
+            default=1, owner="scene", panel_name="computers", soft_high=8,
+        ),
+        affects_result=False, since="0.2.0",
+    )
+    certificates: str = setting(
+        "",
+        help="Folder of the certificates for tls:// addresses; empty: the one that the environment "
+        "variable GW_CERTIFICATES names.",
+        option=Option(
+            "--certificates", "DIR", "certificates for tls:// addresses", scope="region",
+            parse=_path, own=True,
+        ),
+        affects_result=False, since="0.2.0",
+    )
     regions: tuple[str, ...] = setting(
         ("auto",),
         help="What is meshed: auto, all, or the paths of region files (JSON, or .rsbox of "
         "RealityScan).",
         check=Condition(lambda value: len(value) > 0, "at least one region"),
         option=Option(
-            "--region",
-            "auto|all|REGION.json",
-            "what is meshed (default: auto)",
-            scope="region",
-            many=True,
-            parse=_distinct,
-            own=True,
+            "--region", "auto|all|REGION.json", "what is meshed (default: auto)", scope="region",
+            many=True, parse=_distinct, own=True,
         ),
     )
     export: tuple[str, ...] = setting(
-        ("glb",),
-        help="File formats that the meshes are written in.",
-        check=Subset(JOB_FORMATS),
+        ("glb",), help="File formats that the meshes are written in.", check=Subset(JOB_FORMATS),
         option=Option(
-            "--export",
-            help=f"file formats, comma separated, of {','.join(JOB_FORMATS)}",
-            scope="region",
-            parse=_formats,
-            own=True,
+            "--export", help=f"file formats, comma separated, of {','.join(JOB_FORMATS)}",
+            scope="region", parse=lambda text: _distinct(filter(None, text.split(","))), own=True,
         ),
     )
     start_splat: str = setting(
-        "",
-        help="PLY of Gaussians that training starts from; empty starts from the sparse points.",
+        "", help="PLY of Gaussians that training starts from; empty starts from the sparse points.",
         option=Option(
-            "--start-splat",
-            "FILE.ply",
-            "Gaussians that training starts from, instead of the sparse points",
-            scope="training",
-            parse=lambda text: str(Path(text)),
+            "--start-splat", "FILE.ply",
+            "Gaussians that training starts from, instead of the sparse points", parse=_path,
         ),
         panel=PanelProperty(
             "Start from Splat",
             "PLY of a Gaussian splat of the same photos and cameras, made here or elsewhere; "
             "empty starts from the points of the cameras",
             subtype="FILE_PATH",
-            owner="training",
-            panel_name="train_advanced",
         ),
     )
     turntable: str = setting(
@@ -343,24 +273,19 @@ class JobSettings:
         help="Whether the camera stood still while the object turned. The background is then left "
         "out of the search for cameras, and masked. Auto sees it by matches that stay where they "
         "are; of photos without cameras only.",
-        check=Choices(TURNTABLE_MODES),
+        check=Choices(SELECTION_MODES),
         option=Option(
             "--turntable",
-            help="the camera stood still while the object turned: mask what stands still",
-            scope="training",
-            own=True,
+            help="the camera stood still while the object turned: mask what stands still", own=True,
         ),
         panel=PanelProperty(
             "Turntable",
             "The camera stood still while the object turned: the background is left out of the "
             "search for cameras, and masked",
-            items=(
-                Item("auto", "Auto", "Where the photos show it"),
-                Item("on", "On", "All photos of one size are from one place"),
-                Item("off", "Off", "Nothing is left out"),
+            items=auto_on_off(
+                "Where the photos show it", "All photos of one size are from one place",
+                "Nothing is left out",
             ),
-            owner="training",
-            panel_name="train_advanced",
         ),
     )
     equirectangular: str = setting(
@@ -368,58 +293,35 @@ class JobSettings:
         help="Whether photos without cameras are 360 degree panoramas, which are cut into pinhole "
         "views. Auto: where all are exactly twice as wide as high and none says another projection "
         "(XMP GPano).",
-        check=Choices(PANORAMA_MODES),
-        since="0.2.0",
+        check=Choices(SELECTION_MODES), since="0.2.0",
         option=Option(
             "--equirectangular",
             help="photos without cameras are 360 degree panoramas: cut them into views",
-            scope="training",
         ),
         panel=PanelProperty(
             "360° Photos",
             "Photos without cameras are equirectangular panoramas: each is cut into 14 views",
-            items=(
-                Item("auto", "Auto", "Where all photos are exactly twice as wide as high"),
-                Item("on", "On", "All photos are panoramas"),
-                Item("off", "Off", "Photos are used as they are"),
+            items=auto_on_off(
+                "Where all photos are exactly twice as wide as high", "All photos are panoramas",
+                "Photos are used as they are",
             ),
-            owner="training",
-            panel_name="train_advanced",
         ),
     )
     mask_invert: str = setting(
-        "off",
-        help="Masks are white where photos are left out.",
-        check=Choices(SWITCH),
-        option=Option(
-            "--mask-invert",
-            help="masks are white where photos are left out",
-            flag="on",
-            scope="training",
-        ),
-        panel=PanelProperty(
-            "Invert Masks",
-            "Mask files are white where the photos are left out",
-            owner="training",
-            panel_name="train_advanced",
-        ),
+        "off", help="Masks are white where photos are left out.", check=Choices(SWITCH),
+        option=Option("--mask-invert", help="masks are white where photos are left out", flag="on"),
+        panel=PanelProperty("Invert Masks", "Mask files are white where the photos are left out"),
     )
     mask_grow_px: int = setting(
         0,
         help="Border that is kept around what masks keep, or taken away where negative, in pixels "
         "of the photos.",
-        check=Range(-MAX_MASK_GROW_PX, MAX_MASK_GROW_PX),
-        unit="pixels",
+        check=Range(-MAX_MASK_GROW_PX, MAX_MASK_GROW_PX), unit="pixels",
         option=Option(
-            "--mask-grow",
-            help="pixels by which what masks keep grows, or shrinks where negative",
-            scope="training",
+            "--mask-grow", help="pixels by which what masks keep grows, or shrinks where negative",
         ),
         panel=PanelProperty(
-            "Grow Masks",
-            "Pixels by which what the mask files keep grows; negative shrinks it",
-            owner="training",
-            panel_name="train_advanced",
+            "Grow Masks", "Pixels by which what the mask files keep grows; negative shrinks it",
         ),
     )
     georeference: str = setting(
@@ -427,22 +329,18 @@ class JobSettings:
         help="Whether GPS positions in the photos give metres, place on the earth and up. Auto: "
         "where the photos come without cameras and the positions determine these; with cameras "
         "the place is written into sidecars only. On: also with cameras, or the job is refused.",
-        check=Choices(GEOREFERENCES),
+        check=Choices(SELECTION_MODES),
         option=Option(
             "--georeference",
             help="metres, place and up by the photos' GPS; auto: where it is good",
-            scope="training",
         ),
         panel=PanelProperty(
             "Georeference",
             "Metres, place on the earth and up direction from the GPS of the photos",
-            items=(
-                Item("auto", "Auto", "Photos without cameras, if GPS is good enough"),
-                Item("on", "On", "Also photos with cameras; refused if GPS is not good enough"),
-                Item("off", "Off", "GPS is not read"),
+            items=auto_on_off(
+                "Photos without cameras, if GPS is good enough",
+                "Also photos with cameras; refused if GPS is not good enough", "GPS is not read",
             ),
-            owner="training",
-            panel_name="train_advanced",
         ),
         since="0.2.0",
     )
@@ -453,18 +351,13 @@ class JobSettings:
         "worker's Python.",
         check=Condition(are_markers, f"empty, or {MARKERS_WANTED}"),
         option=Option(
-            "--markers",
-            "DICTIONARY:SIZE",
+            "--markers", "DICTIONARY:SIZE",
             "printed markers in the photos, such as 4x4_50:0.05, side in metres: gives the scale",
-            scope="training",
-            parse=checked_markers,
-            own=True,
+            parse=checked_markers, own=True,
         ),
         panel=PanelProperty(
             "Markers",
             "Printed markers in the photos: dictionary and side in metres, such as 4x4_50:0.05",
-            owner="training",
-            panel_name="train_advanced",
         ),
         since="0.2.0",
     )
@@ -473,19 +366,13 @@ class JobSettings:
         help="Text file of control points: known places and the pixels that show them. The scene "
         "gets their frame, in metres.",
         option=Option(
-            "--control-points",
-            "FILE.txt",
-            "known places and the pixels that show them: gives scale, place and up",
-            scope="training",
-            parse=lambda text: str(Path(text)),
+            "--control-points", "FILE.txt",
+            "known places and the pixels that show them: gives scale, place and up", parse=_path,
             own=True,
         ),
         panel=PanelProperty(
-            "Control Points",
-            "Text file of known places and the pixels of photos that show them",
+            "Control Points", "Text file of known places and the pixels of photos that show them",
             subtype="FILE_PATH",
-            owner="training",
-            panel_name="train_advanced",
         ),
         since="0.2.0",
     )
@@ -496,9 +383,7 @@ class JobSettings:
         check=Choices(MASKS_MADE),
         option=Option(
             "--make-masks",
-            help="region: mask the photos to what stands in the region files (--region)",
-            scope="training",
-            own=True,
+            help="region: mask the photos to what stands in the region files (--region)", own=True,
         ),
         since="0.2.0",
     )
@@ -514,19 +399,15 @@ class JobSettings:
         help="ONNX file of a model that tells an object from its background; masks the photos to "
         "what it finds. Nothing is downloaded. Empty uses none.",
         option=Option(
-            "--mask-model",
-            "FILE.onnx",
+            "--mask-model", "FILE.onnx",
             "segmentation model that masks the photos; needs onnxruntime in the worker",
-            scope="training",
-            parse=lambda text: str(Path(text)),
+            parse=_path,
         ),
         panel=PanelProperty(
             "Mask Model",
             "ONNX file of a segmentation model, such as U2-Net, IS-Net or BiRefNet: photos are "
             "masked to the object that it finds; empty uses none",
             subtype="FILE_PATH",
-            owner="training",
-            panel_name="train_advanced",
         ),
         since="0.2.0",
     )
@@ -539,18 +420,14 @@ class JobSettings:
             "--mask-model-range",
             help="colours that the mask model wants: imagenet (U2-Net, BiRefNet), half (IS-Net) "
             "or unit",
-            scope="training",
         ),
         panel=PanelProperty(
-            "Model Colors",
-            "Range of colours that the mask model expects; no effect without one",
+            "Model Colors", "Range of colours that the mask model expects; no effect without one",
             items=(
                 Item("imagenet", "ImageNet", "Mean and deviation of ImageNet: U2-Net, BiRefNet"),
                 Item("half", "-0.5 to 0.5", "Range that IS-Net expects"),
                 Item("unit", "0 to 1", "Colours as the photos have them"),
             ),
-            owner="training",
-            panel_name="train_advanced",
         ),
         since="0.2.0",
     )
@@ -558,21 +435,15 @@ class JobSettings:
         0,
         help="Frames of a video that are used: the sharpest of so many stretches of equal motion, "
         "fewer where a stretch is blurred. 0 chooses 40 to 200 by how far the picture moves.",
-        check=Range(MIN_IMAGES, MAX_CHOSEN_FRAMES, zero="by the motion"),
-        unit="frames",
+        check=Range(MIN_IMAGES, MAX_CHOSEN_FRAMES, zero="by the motion"), unit="frames",
         option=Option(
-            "--frames",
-            help="frames of a video that are used; 0: by its motion",
-            scope="training",
-            exclusive="video frames",
-            own=True,
+            "--frames", help="frames of a video that are used; 0: by its motion",
+            exclusive="video frames", own=True,
         ),
         panel=PanelProperty(
             "Frames",
             "Number of frames used, the sharpest ones; 0 chooses by the motion in the video",
-            owner="scene",
-            panel_name="dataset",
-            soft_high=300,
+            owner="scene", panel_name="dataset", soft_high=300,
         ),
         since="0.2.0",
     )
@@ -581,25 +452,16 @@ class JobSettings:
         help="Frames of a video that are used for each of its seconds, the sharpest of each "
         "stretch, whatever the motion; 0 chooses by the motion. Applies where no number of frames "
         "is given.",
-        check=Range(0.05, 240.0, zero="by the motion"),
-        unit="frames per second",
+        check=Range(0.05, 240.0, zero="by the motion"), unit="frames per second",
         option=Option(
-            "--fps",
-            "X",
+            "--fps", "X",
             help="frames of a video that are used for each of its seconds; 0: by its motion",
-            scope="training",
-            exclusive="video frames",
-            own=True,
+            exclusive="video frames", own=True,
         ),
         panel=PanelProperty(
-            "Frames per Second",
-            "Frames used per second of the video; 0 chooses by the motion",
-            owner="scene",
-            panel_name="dataset",
-            soft_high=10,
-            precision=2,
-            shown_if=("video_frames", 0),
-            default_if_hidden=True,
+            "Frames per Second", "Frames used per second of the video; 0 chooses by the motion",
+            owner="scene", panel_name="dataset", soft_high=10, precision=2,
+            shown_if=("video_frames", 0), default_if_hidden=True,
         ),
         since="0.2.0",
     )
@@ -618,6 +480,7 @@ class JobSettings:
         return self
 
 
+# fmt: on
 def preset(name: str, **overrides: Any) -> JobSettings:
     """Return the settings of ``"draft"``, ``"standard"``, ``"fine"``, ``"paper"`` or ``"large"``.
 
@@ -654,22 +517,18 @@ FORMAT: Final = "GaussianWrappingSettings"
 VERSION: Final = 1
 MAX_BYTES: Final = 64 * 1024
 """A file with every setting has about 2 kB."""
-MAX_NOTES: Final = 5
-"""Of a file that holds something else; the others are counted."""
-_SHOWN_NAME: Final = 40
-"""Characters of an unknown entry that a note shows."""
+MAX_NOTES: Final = 5  # Of a file that holds something else; the others are counted.
+_SHOWN_NAME: Final = 40  # characters of an unknown entry that a note shows
 
 
 @dataclass(frozen=True)
 class SavedSettings:
     """Contents of a file of saved settings."""
 
-    values: dict[str, Any]
-    """By path; 0 leaves a number to the preset."""
+    values: dict[str, Any]  # By path; 0 leaves a number to the preset.
     panel: dict[str, Any]
     """Choices of the panel that are no settings of a job, by property, not validated."""
-    notes: tuple[str, ...]
-    """What was left out, a sentence each."""
+    notes: tuple[str, ...]  # what was left out, a sentence each
 
 
 def savable_settings() -> list[Declaration]:

@@ -31,40 +31,33 @@ def _size(text: str) -> int:
     return int(text)
 
 
+# Packed, as a survey of all settings needs few lines.
+# fmt: off
 @dataclass(frozen=True)
 class TextureSettings:
     """How the mesh is unwrapped and textured."""
 
     size_px: int = setting(
-        0,
-        help="Side of the square texture; 0 derives it from the photos' footprint.",
-        check=Range(64, 8192, zero="automatic"),
-        unit="pixels",
+        0, help="Side of the square texture; 0 derives it from the photos' footprint.",
+        check=Range(64, 8192, zero="automatic"), unit="pixels",
         option=Option(
-            "--texture-size",
-            "auto|N",
-            "side of the texture in pixels (default: auto)",
-            parse=_size,
-            own=True,
+            "--texture-size", "auto|N", "side of the texture in pixels (default: auto)",
+            parse=_size, own=True,
         ),
         panel=PanelProperty(
-            "Texture Size",
-            "Side of the texture",
-            name="texture_size",
+            "Texture Size", "Side of the texture", name="texture_size",
             items=(
                 Item(0, "Automatic", "As many pixels as the photos provide"),
                 *(Item(s, str(s), f"{s} pixels each way") for s in (1024, 2048, 4096, 8192)),
             ),
-            order=10,
-            drawn_label="Size",
+            order=10, drawn_label="Size",
         ),
     )
     gutter_px: int = setting(
         8,
         help="Margin around each chart of a 4096-pixel texture; in proportion for smaller ones, "
         "but at least 2.",
-        check=Range(1, 64),
-        unit="pixels",
+        check=Range(1, 64), unit="pixels",
     )
     normal_map: str = setting(
         "auto",
@@ -76,11 +69,10 @@ class TextureSettings:
             help="normal map with the dense mesh's detail; auto: where --faces removed faces",
         ),
         panel=PanelProperty(
-            "Normal Map",
-            "Detail of the mesh before its faces were limited, as a texture",
+            "Normal Map", "Detail of the mesh before its faces were limited, as a texture",
             items=(
                 Item(
-                    "auto", "Automatic", "Where the faces are limited: the detail that was removed"
+                    "auto", "Automatic", "Where the faces are limited: the detail that was removed",
                 ),
                 Item("on", "On", "Always; flat where no face was removed"),
                 Item("off", "Off", "No normal map"),
@@ -89,28 +81,23 @@ class TextureSettings:
         ),
     )
     ambient_occlusion: str = setting(
-        "off",
-        help="Ambient occlusion map of the dense mesh.",
-        check=Choices(SWITCH),
+        "off", help="Ambient occlusion map of the dense mesh.", check=Choices(SWITCH),
         option=Option("--ambient-occlusion", help="bake ambient occlusion", flag="on"),
         panel=PanelProperty(
-            "Ambient Occlusion",
-            "Bake ambient occlusion as a texture, for glTF and game engines",
+            "Ambient Occlusion", "Bake ambient occlusion as a texture, for glTF and game engines",
             order=50,
         ),
     )
     lods: int = setting(
         0,
         help="Levels of detail below the mesh, each with a quarter of the faces of the one above.",
-        check=Range(0, MAX_LODS),
-        unit="levels",
+        check=Range(0, MAX_LODS), unit="levels",
         option=Option(
-            "--lods", "N", "coarser levels below the mesh, each with a quarter of the faces"
+            "--lods", "N", "coarser levels below the mesh, each with a quarter of the faces",
         ),
         panel=PanelProperty(
             "Levels of Detail",
-            "Coarser meshes, each with a quarter of the faces of the one before",
-            order=60,
+            "Coarser meshes, each with a quarter of the faces of the one before", order=60,
         ),
     )
     source: str = setting(
@@ -123,31 +110,24 @@ class TextureSettings:
             help="colours of the photos, or the view-independent colours of the Gaussians",
         ),
         panel=PanelProperty(
-            "Texture From",
-            "Where the colours of the texture come from",
-            name="texture_source",
+            "Texture From", "Where the colours of the texture come from", name="texture_source",
             items=(
                 Item("photos", "Photos", "The photos' own pixels, blended: the finest detail"),
                 Item(
-                    "gaussians",
-                    "Gaussians",
+                    "gaussians", "Gaussians",
                     "Colours of the Gaussians, without highlights and passers-by: even, but softer",
                 ),
             ),
-            order=30,
-            drawn_label="Colors From",
-            expand=True,
+            order=30, drawn_label="Colors From", expand=True,
         ),
     )
     max_atlases: int = setting(
         0,
         help="Textures that the mesh may be spread over where the photos show more than one holds; "
         "0 is 1, or a few where one of the largest would not do.",
-        check=Range(1, MAX_ATLASES, zero="automatic"),
-        unit="textures",
+        check=Range(1, MAX_ATLASES, zero="automatic"), unit="textures",
         option=Option(
-            "--max-atlases",
-            "N",
+            "--max-atlases", "N",
             "spread over up to N textures where the photos show more than one holds; 0: automatic",
         ),
         panel=PanelProperty(
@@ -157,3 +137,4 @@ class TextureSettings:
             order=20,
         ),
     )
+# fmt: on

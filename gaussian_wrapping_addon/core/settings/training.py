@@ -18,6 +18,7 @@ from .declaration import (
     Option,
     PanelProperty,
     Range,
+    auto_on_off,
     declarations,
     setting,
 )
@@ -30,399 +31,243 @@ from .declaration import (
 
 _WEIGHT = Range(0.0, 1000.0)
 _SHARE = Range(0.0, 1.0)
-_METHOD_COUNT = Range(1, 10**6)
+_COUNT = Range(1, 10**6)
 _OF_ITERATIONS = "share of iterations"
 
 
 def _constant(
-    default: Any,
-    option: str,
-    help: str,
-    check: Check,
-    *,
-    unit: str = "",
-    paper: Any = None,
-    large: Any = None,
-    since: str = "",
+    default: Any, help: str, check: Check, *, paper: Any = None, large: Any = None, **more: Any
 ) -> Any:
-    """Declare a constant of the method with its option and values of presets, if others.
+    """Declare a constant of the method, whose option has its name.
 
-    Parameters
-    ----------
-    paper, large : optional
-        The published value, and that of the preset for GPUs.
+    ``paper`` and ``large`` are the published value and that of the preset for GPUs, if others.
     """
     values = {"paper": paper, "large": large}
     presets = {name: value for name, value in values.items() if value is not None}
-    metavar = "" if isinstance(check, Choices) else "X"
-    shown = Option(option, metavar)
-    return setting(
-        default, help=help, check=check, unit=unit, presets=presets, option=shown, since=since
-    )
+    option = Option(metavar="" if isinstance(check, Choices) else "X")
+    return setting(default, help=help, check=check, presets=presets, option=option, **more)
 
 
+# Packed, as a survey of all settings needs few lines.
+# fmt: off
 @dataclass(frozen=True)
 class MethodSettings:
     """Constants of the training. Milestones are shares of the iterations."""
 
     pixels_per_iteration: int = _constant(
-        80_000,
-        "--pixels-per-iteration",
-        "An iteration trains on a window of a photo with at most about this many pixels.",
-        Range(1000, 10**9),
-        unit="pixels",
-        paper=10**9,
-        large=10**9,
+        80_000, "An iteration trains on a window of a photo with at most about this many pixels.",
+        Range(1000, 10**9), unit="pixels", paper=10**9, large=10**9,
     )
     coarse_to_fine: str = _constant(
         "on",
-        "--coarse-to-fine",
         "Training begins on photos at a quarter and half of their size. off: full size throughout.",
-        Choices(SWITCH),
-        paper="off",
-        since="0.2.0",
+        Choices(SWITCH), paper="off", since="0.2.0",
     )
     filter_variance: float = _constant(
         0.05,
-        "--filter-variance",
         "Variance of the 3D filter. The published 0.2 takes opacity from what is as thin as a "
         "pixel.",
-        _SHARE,
-        unit="squared pixels",
-        paper=0.2,
-        since="0.2.0",
+        _SHARE, unit="squared pixels", paper=0.2, since="0.2.0",
     )
     short_run_power: float = _constant(
         0.4,
-        "--short-run-power",
         "Learning rates of n iterations grow with (30000 / n) to this power; 0 leaves them as "
         "published.",
-        _SHARE,
-        since="0.2.0",
+        _SHARE, since="0.2.0",
     )
-    lambda_dssim: float = _constant(
-        0.2, "--lambda-dssim", "Weight of the D-SSIM term of the colour loss.", _SHARE
-    )
-    lambda_depth_normal: float = _constant(
-        0.05, "--lambda-depth-normal", "Weight of the depth-normal loss.", _WEIGHT
-    )
+    lambda_dssim: float = _constant(0.2, "Weight of the D-SSIM term of the colour loss.", _SHARE)
+    lambda_depth_normal: float = _constant(0.05, "Weight of the depth-normal loss.", _WEIGHT)
     lambda_depth_prior: float = _constant(
-        0.1,
-        "--lambda-depth-prior",
-        "Weight of the depths that stereo confirmed, after a dense start.",
-        _WEIGHT,
-        paper=0.0,
+        0.1, "Weight of the depths that stereo confirmed, after a dense start.", _WEIGHT, paper=0.0,
         since="0.2.0",
     )
     lambda_opacity: float = _constant(
-        0.001,
-        "--lambda-opacity",
-        "Weight of the opacity prior: what photos leave open is opaque.",
-        _WEIGHT,
-        paper=0.0,
+        0.001, "Weight of the opacity prior: what photos leave open is opaque.", _WEIGHT, paper=0.0,
         since="0.2.0",
     )
-    lambda_normal: float = _constant(
-        0.03, "--lambda-normal", "Weight of the normal loss.", _WEIGHT, paper=0.05
-    )
+    lambda_normal: float = _constant(0.03, "Weight of the normal loss.", _WEIGHT, paper=0.05)
     lambda_photometric: float = _constant(
         0.15,
-        "--lambda-photometric",
         "Weight of the multi-view photometric loss, a quarter of the method's: with its 0.6, runs "
         "with a tenth of its iterations lose detail.",
-        _WEIGHT,
-        paper=0.6,
+        _WEIGHT, paper=0.6,
     )
-    lambda_geometric: float = _constant(
-        0.02, "--lambda-geometric", "Weight of the multi-view geometric loss.", _WEIGHT
-    )
+    lambda_geometric: float = _constant(0.02, "Weight of the multi-view geometric loss.", _WEIGHT)
     correlation: str = _constant(
-        "signed",
-        "--correlation",
-        "Correlation of two patches: signed, or squared, where -1 is as good as 1.",
-        Choices(CORRELATIONS),
-        paper="squared",
+        "signed", "Correlation of two patches: signed, or squared, where -1 is as good as 1.",
+        Choices(CORRELATIONS), paper="squared",
     )
     depth_from: float = _constant(
-        7 / 30,
-        "--depth-from",
-        "Start of the depth-normal loss and the multi-view terms.",
-        _SHARE,
+        7 / 30, "Start of the depth-normal loss and the multi-view terms.", _SHARE,
         unit=_OF_ITERATIONS,
     )
     multi_view_until: float = _constant(
         0.75,
-        "--multi-view-until",
         "End of the multi-view terms. What noise in the photos has displaced can settle after it.",
-        _SHARE,
-        unit=_OF_ITERATIONS,
-        paper=1.0,
+        _SHARE, unit=_OF_ITERATIONS, paper=1.0,
     )
     multi_view_pixels: int = _constant(
-        4000,
-        "--multi-view-pixels",
-        "Pixels of an iteration at which the multi-view terms are evaluated.",
-        Range(1, 10**9),
-        unit="pixels",
-        paper=10**9,
+        4000, "Pixels of an iteration at which the multi-view terms are evaluated.",
+        Range(1, 10**9), unit="pixels", paper=10**9,
     )
     multi_view_every: int = _constant(
-        1,
-        "--multi-view-every",
-        "The multi-view terms are evaluated in every n-th iteration, with n times the weight.",
-        Range(1, 1000),
-        unit="iterations",
+        1, "The multi-view terms are evaluated in every n-th iteration, with n times the weight.",
+        Range(1, 1000), unit="iterations",
     )
     neighbour_distance: float = _constant(
-        1.0,
-        "--neighbour-distance",
-        "Largest distance of two cameras whose photos are compared.",
-        Range(0.0, 100.0),
-        unit="scene radii",
-        paper=0.3,
-        since="0.2.0",
+        1.0, "Largest distance of two cameras whose photos are compared.", Range(0.0, 100.0),
+        unit="scene radii", paper=0.3, since="0.2.0",
     )
     neighbour_overlap: float = _constant(
-        0.3,
-        "--neighbour-overlap",
-        "Least share of a camera's sparse points that lie in the other's image, too.",
-        _SHARE,
-        unit="share",
-        paper=0.0,
-        since="0.2.0",
+        0.3, "Least share of a camera's sparse points that lie in the other's image, too.", _SHARE,
+        unit="share", paper=0.0, since="0.2.0",
     )
     # The usual sum of 5e-6 is far below the noise of photos: such patches agree by chance, displace
     # the surface at random, and a surface displaced at random recedes.
     patch_contrast: float = _constant(
-        0.012,
-        "--patch-contrast",
-        "Least standard deviation of grey, in [0, 1], of a patch that is compared.",
-        _SHARE,
-        paper=(5e-6 / 49) ** 0.5,
-        since="0.2.0",
+        0.012, "Least standard deviation of grey, in [0, 1], of a patch that is compared.", _SHARE,
+        paper=(5e-6 / 49) ** 0.5, since="0.2.0",
     )
     # Plain walls and glaze show shading and stains at a larger scale only.
     patch_sizes: int = _constant(
         3,
-        "--patch-sizes",
         "Patch sizes, each twice the one before: a larger one is taken where smaller ones are "
         "flat.",
-        Range(1, 5),
-        paper=1,
-        since="0.2.0",
+        Range(1, 5), paper=1, since="0.2.0",
     )
     # Beyond it there is no plane, as for a spoke before a wall, and thin parts would be pulled
     # towards what lies behind. With 1, thin parts gain slightly more, but rooms lose most of the
     # terms' benefit.
     patch_rise: float = _constant(
-        4.0,
-        "--patch-rise",
-        "Largest deviation of the surface from the plane of a patch that is compared.",
-        Range(0.0, 1e9),
-        unit="half sides of the patch",
-        paper=1e9,
-        since="0.2.0",
+        4.0, "Largest deviation of the surface from the plane of a patch that is compared.",
+        Range(0.0, 1e9), unit="half sides of the patch", paper=1e9, since="0.2.0",
     )
     degree_every: float = _constant(
         1 / 6,
-        "--degree-every",
         "After each such share of the iterations the degree of the harmonics rises by one, where "
         "`harmonics` is on.",
-        Range(1e-6, 1.0),
-        unit=_OF_ITERATIONS,
-        paper=1 / 30,
-        since="0.2.0",
+        Range(1e-6, 1.0), unit=_OF_ITERATIONS, paper=1 / 30, since="0.2.0",
     )
     densify_from: float = _constant(
-        0.5 / 30, "--densify-from", "Start of densification.", _SHARE, unit=_OF_ITERATIONS
+        0.5 / 30, "Start of densification.", _SHARE, unit=_OF_ITERATIONS,
     )
-    densify_until: float = _constant(
-        0.5, "--densify-until", "End of densification.", _SHARE, unit=_OF_ITERATIONS
-    )
-    densify_every: int = _constant(
-        100, "--densify-every", "Interval of densification.", _METHOD_COUNT, unit="iterations"
-    )
+    densify_until: float = _constant(0.5, "End of densification.", _SHARE, unit=_OF_ITERATIONS)
+    densify_every: int = _constant(100, "Interval of densification.", _COUNT, unit="iterations")
     densify_score: float = _constant(
         0.3,
-        "--densify-score",
         "Share of the gradient threshold from which a Gaussian may be densified while the budget "
         "has room.",
-        _SHARE,
-        unit="share",
-        paper=1.0,
-        since="0.2.0",
+        _SHARE, unit="share", paper=1.0, since="0.2.0",
     )
     min_opacity: float = _constant(
         0.02,
-        "--min-opacity",
         "Density control removes Gaussians whose raw opacity is smaller. Short runs hardly recover "
         "what the published 0.05 removes.",
-        _SHARE,
-        paper=0.05,
-        since="0.2.0",
+        _SHARE, paper=0.05, since="0.2.0",
     )
     free_views: int = _constant(
         2,
-        "--free-views",
         "After a dense start, Gaussians that so many photos see through are removed at intervals; "
         "0 removes none.",
-        Range(0, 1000),
-        unit="photos",
-        paper=0,
-        since="0.2.0",
+        Range(0, 1000), unit="photos", paper=0, since="0.2.0",
     )
     overlap_price: float = _constant(
         2e-5,
-        "--overlap-price",
         "Footprint regulariser, where `growth` is auto: cost, in the unit of the loss, of one more "
         "Gaussian over every pixel.",
-        _SHARE,
-        paper=0.0,
+        _SHARE, paper=0.0,
     )
     # Of 40 photos of a thing in a studio, this prunes as many as half a per cent of the weights of
     # all views together would.
     prune_share: float = _constant(
         0.03,
-        "--prune-share",
         "Where `growth` is auto, Gaussians that in no training view belong to more than the least "
         "contributors, which together make up this share of its blending weights, are pruned at "
         "intervals; 0 prunes none.",
-        Range(0.0, 0.5, below_high=True),
-        unit="share",
-        paper=0.0,
+        Range(0.0, 0.5, below_high=True), unit="share", paper=0.0,
     )
     orient_from: float = _constant(
-        20 / 30, "--orient-from", "Start of the orientation loss.", _SHARE, unit=_OF_ITERATIONS
+        20 / 30, "Start of the orientation loss.", _SHARE, unit=_OF_ITERATIONS,
     )
     first_sign: float = _constant(
         0.5,
-        "--first-sign",
         "First magnitude of the sign of an orientation, towards the cameras; 0 lets the normal "
         "loss find the side.",
-        _SHARE,
-        paper=0.0,
-        since="0.2.0",
+        _SHARE, paper=0.0, since="0.2.0",
     )
     wrap_rounds: int = setting(
         3,
         help="Rounds in which clones of opposite orientation are added; 0 trains the orientation "
         "alone.",
-        check=Range(0, 20),
-        presets={"draft": 2, "fine": 4, "paper": 5, "large": 4},
-        unit="rounds",
+        check=Range(0, 20), presets={"draft": 2, "fine": 4, "paper": 5, "large": 4}, unit="rounds",
         option=Option("--wrap-rounds", "N", "rounds of clones; 0 trains the orientation alone"),
     )
-    wrap_from: float = _constant(
-        22 / 30, "--wrap-from", "First round of clones.", _SHARE, unit=_OF_ITERATIONS
-    )
-    wrap_until: float = _constant(
-        26 / 30, "--wrap-until", "Last round of clones.", _SHARE, unit=_OF_ITERATIONS
-    )
+    wrap_from: float = _constant(22 / 30, "First round of clones.", _SHARE, unit=_OF_ITERATIONS)
+    wrap_until: float = _constant(26 / 30, "Last round of clones.", _SHARE, unit=_OF_ITERATIONS)
     wrap_share: float = _constant(
-        0.05, "--wrap-share", "Share of the Gaussians that a round may clone.", _SHARE, unit="share"
+        0.05, "Share of the Gaussians that a round may clone.", _SHARE, unit="share",
     )
     wrap_divisor: int = _constant(
-        2,
-        "--wrap-divisor",
-        "Views are rendered at their size divided by this to find normal errors.",
-        Range(1, 8),
-        paper=1,
-        since="0.2.0",
+        2, "Views are rendered at their size divided by this to find normal errors.", Range(1, 8),
+        paper=1, since="0.2.0",
     )
+
+# fmt: on
 
 
 # -- Settings of the training ---------------------------------------------------------------------
 
 
-_TRAINING_COUNT = Range(1, 10**6)
 _SECONDS = Range(0.0, words="a number of seconds, 0 or more")
 
 
 def _model_selection(
-    *,
-    help: str,
-    paper: str,
-    option: Option,
-    label: str,
-    tooltip: str,
-    auto: str,
-    on: str,
-    off: str,
-    since: str = "",
+    *, paper: str, label: str, tooltip: str, auto: str, on: str, off: str, **more: Any
 ) -> Any:
     """Declare whether a part of the model is used: ``"auto"``, ``"on"`` or ``"off"``.
 
-    Parameters
-    ----------
-    paper : str
-        Value in the preset of that name.
-    label, tooltip : str
-        Of the property in the panel; `auto`, `on` and `off` are the tooltips of its entries.
+    ``paper`` is the value in the preset of that name; ``label`` and ``tooltip`` are of the property
+    in the panel, ``auto``, ``on`` and ``off`` the tooltips of its entries.
     """
-    items = (Item("auto", "Auto", auto), Item("on", "On", on), Item("off", "Off", off))
     return setting(
-        "auto",
-        help=help,
-        check=Choices(SELECTION_MODES),
-        presets={"paper": paper},
-        option=option,
-        panel=PanelProperty(label, tooltip, items=items),
-        model_selection=True,
-        since=since,
-    )
+        "auto", check=Choices(SELECTION_MODES), presets={"paper": paper}, model_selection=True,
+        panel=PanelProperty(label, tooltip, items=auto_on_off(auto, on, off)), **more,
+    )  # fmt: skip
 
 
-def _part_of_paper(*, help: str, option: Option, label: str, tooltip: str, name: str) -> Any:
+def _part_of_paper(*, label: str, tooltip: str, name: str, **more: Any) -> Any:
     """Declare a part that only Paper has unless asked for, as meshes hardly gain by it or lose.
 
-    Version 0.1.0 decided on it from the photos: job files of then say ``"auto"``.
-
-    Parameters
-    ----------
-    label, tooltip, name : str
-        Of the property in the panel; `name` is not the setting's, which .blend files hold as an
-        enum.
+    Version 0.1.0 decided on it from the photos: job files of then say ``"auto"``. The property in
+    the panel has a ``name`` that is not the setting's, which .blend files hold as an enum.
     """
     return setting(
-        "off",
-        help=help,
-        check=Choices(SWITCH, earlier=("auto",)),
-        presets={"paper": "on"},
-        option=option,
-        panel=PanelProperty(label, tooltip, name=name),
-        model_selection=True,
-    )
+        "off", check=Choices(SWITCH, earlier=("auto",)), presets={"paper": "on"},
+        model_selection=True, panel=PanelProperty(label, tooltip, name=name), **more,
+    )  # fmt: skip
 
 
+# fmt: off
 @dataclass(frozen=True)
 class TrainingSettings(MethodSettings):
     """How the Gaussians are trained. Milestones are fractions of ``iterations``."""
 
     iterations: int = setting(
-        3000,
-        help="Training iterations.",
-        check=_TRAINING_COUNT,
-        unit="iterations",
+        3000, help="Training iterations.", check=_COUNT, unit="iterations",
         presets={"draft": 800, "fine": 4000, "paper": 30_000, "large": 7000},
         option=Option("--iterations", "N", "training iterations instead of the preset's", own=True),
         panel=PanelProperty(
-            "Iterations",
-            "Steps of the training; 0 takes the preset's number",
-            preset_if_zero=True, soft_high=30_000, step=100,
+            "Iterations", "Steps of the training; 0 takes the preset's number", preset_if_zero=True,
+            soft_high=30_000, step=100,
         ),
-    )  # fmt: skip
+    )
     extra_iterations: int = setting(
-        0,
-        help="Iterations added to a finished training, at its last learning rates.",
-        check=Range(0, 10**6),
-        unit="iterations",
+        0, help="Iterations added to a finished training, at its last learning rates.",
+        check=Range(0, 10**6), unit="iterations",
         option=Option("--iterations", "N", "iterations to be added", scope="more", own=True),
     )
     max_gaussians: int = setting(
-        80_000,
-        help="Largest number of Gaussians.",
-        check=Range(100, 20_000_000),
-        unit="Gaussians",
+        80_000, help="Largest number of Gaussians.", check=Range(100, 20_000_000), unit="Gaussians",
         presets={"draft": 40_000, "fine": 120_000, "paper": 6_000_000, "large": 300_000},
         option=Option("--max-gaussians", "N", "cap of Gaussians instead of the preset's", own=True),
         panel=PanelProperty(
@@ -431,12 +276,9 @@ class TrainingSettings(MethodSettings):
             "0 takes the preset's number",
             preset_if_zero=True, soft_high=1_000_000, step=1000,
         ),
-    )  # fmt: skip
+    )
     max_image_px: int = setting(
-        640,
-        help="Long side of the finest training image.",
-        check=Range(32, 16384),
-        unit="pixels",
+        640, help="Long side of the finest training image.", check=Range(32, 16384), unit="pixels",
         presets={"draft": 480, "fine": 1024, "paper": 1600, "large": 1600},
         option=Option("--max-image-px", "N", "training size instead of the preset's", own=True),
         panel=PanelProperty(
@@ -445,22 +287,19 @@ class TrainingSettings(MethodSettings):
             "0 takes the preset's number",
             preset_if_zero=True, soft_high=4096, step=100, subtype="PIXEL",
         ),
-    )  # fmt: skip
+    )
     sh_degree: int = setting(
         2,
         help="Highest degree of the spherical harmonics; `harmonics` selects how much of it is "
         "used.",
-        check=Range(0, 3),
-        presets={"draft": 1, "fine": 3, "paper": 3, "large": 3},
+        check=Range(0, 3), presets={"draft": 1, "fine": 3, "paper": 3, "large": 3},
         option=Option("--sh-degree", "0..3", "highest degree of the spherical harmonics"),
     )
     holdout_every: int = setting(
-        8,
-        help="Every n-th photo, sorted by name, is held out for measuring; 0 holds out none.",
-        check=Range(0, 10**6, words="0 or more"),
-        unit="photos",
+        8, help="Every n-th photo, sorted by name, is held out for measuring; 0 holds out none.",
+        check=Range(0, 10**6, words="0 or more"), unit="photos",
         option=Option(
-            "--holdout", "N", "hold out each n-th photo for measuring; 0 holds out none", own=True
+            "--holdout", "N", "hold out each n-th photo for measuring; 0 holds out none", own=True,
         ),
     )
     harmonics: str = _part_of_paper(
@@ -473,18 +312,15 @@ class TrainingSettings(MethodSettings):
         name="reflections",
     )
     exposure: str = _model_selection(
-        help="Gain and offset per photo.",
-        paper="off",
+        help="Gain and offset per photo.", paper="off",
         option=Option("--exposure", help="gain and offset per photo"),
-        label="Exposure",
-        tooltip="Brightness and tint that differ from photo to photo",
+        label="Exposure", tooltip="Brightness and tint that differ from photo to photo",
         auto="Where the same points differ in brightness from photo to photo",
         on="Always learn a brightness and a tint for each photo",
         off="All photos were taken with the same settings and light",
     )
     multi_view: str = _model_selection(
-        help="Loss terms that compare neighbouring photos.",
-        paper="on",
+        help="Loss terms that compare neighbouring photos.", paper="on",
         option=Option("--multi-view", help="terms that compare neighbouring photos"),
         label="Compare Photos",
         tooltip="Check each surface in neighbouring photos while training (multi-view terms)",
@@ -506,12 +342,10 @@ class TrainingSettings(MethodSettings):
         "the cap stops it; off: none are added.",
         paper="on",
         option=Option(
-            "--growth", help="more Gaussians: while they lower the error, up to the cap, or none"
+            "--growth", help="more Gaussians: while they lower the error, up to the cap, or none",
         ),
-        label="Add Gaussians",
-        tooltip="Whether more Gaussians are added where detail is missing",
-        auto="Add Gaussians while they lower the error",
-        on="Add Gaussians up to the limit",
+        label="Add Gaussians", tooltip="Whether more Gaussians are added where detail is missing",
+        auto="Add Gaussians while they lower the error", on="Add Gaussians up to the limit",
         off="Keep the number that training starts with",
     )
     full_size: str = _model_selection(
@@ -519,7 +353,7 @@ class TrainingSettings(MethodSettings):
         "trained on at half size; on: always full size; off: half size.",
         paper="on",
         option=Option(
-            "--full-size", help="photos at their full size, also where half size shows as much"
+            "--full-size", help="photos at their full size, also where half size shows as much",
         ),
         label="Full Photo Size",
         tooltip="Train on photos at their full size, within the limit below",
@@ -535,17 +369,14 @@ class TrainingSettings(MethodSettings):
         label="Dense Start",
         tooltip="Match neighbouring photos before training, and start on the surfaces found",
         auto="Where neighbouring photos show the same surfaces",
-        on="On whatever surfaces matching finds",
-        off="Start from the sparse points alone",
+        on="On whatever surfaces matching finds", off="Start from the sparse points alone",
         since="0.2.0",
     )
     match_px: int = setting(
         640,
         help="Longest side of photos when they are matched for a dense start; larger ones are "
         "halved until they fit.",
-        check=Range(32, 4096),
-        unit="pixels",
-        presets={"draft": 320},
+        check=Range(32, 4096), unit="pixels", presets={"draft": 320},
         option=Option("--match-px", "N", "photo size when photos are matched for a dense start"),
         since="0.2.0",
     )
@@ -558,8 +389,7 @@ class TrainingSettings(MethodSettings):
         tooltip="Move each photo's camera by fractions of a pixel to where its photo fits best",
         auto="Where photos show that the given cameras are inexact",
         on="Always refine; the frame of all cameras together stays",
-        off="Take the cameras as they are given",
-        since="0.2.0",
+        off="Take the cameras as they are given", since="0.2.0",
     )
     region_weight: float = setting(
         1.0,
@@ -567,8 +397,7 @@ class TrainingSettings(MethodSettings):
         "limited.",
         check=Range(1.0, 1000.0),
         option=Option(
-            "--region-weight",
-            "W",
+            "--region-weight", "W",
             "Gaussians inside the regions count this many times where their number is limited",
         ),
     )
@@ -589,17 +418,11 @@ class TrainingSettings(MethodSettings):
             "where the masks were made of a turntable, of a region or by a model",
         ),
         panel=PanelProperty(
-            "Masks",
-            "Meaning of the masked parts of the photos; no effect without masks",
+            "Masks", "Meaning of the masked parts of the photos; no effect without masks",
             items=(
+                Item("ignore", "Ignore", "Masked pixels are not trained on; anything may be there"),
                 Item(
-                    "ignore",
-                    "Ignore",
-                    "Masked pixels are not trained on; anything may be there",
-                ),
-                Item(
-                    "background",
-                    "Background",
+                    "background", "Background",
                     "Masked pixels show empty space: only the subject is modelled",
                 ),
                 Item("auto", "Auto", "Background for a turntable and for made masks, else Ignore"),
@@ -610,31 +433,24 @@ class TrainingSettings(MethodSettings):
         1,
         help="Parts of the scene that are trained each by itself, after a coarse training of the "
         "whole, and then joined; on several computers only. 1 trains the scene in one piece.",
-        check=Range(1, MAX_BLOCKS),
-        unit="blocks",
+        check=Range(1, MAX_BLOCKS), unit="blocks",
         option=Option("--blocks", help="with --computers: train the scene in this many parts"),
         since="0.2.0",
     )
     checkpoint_every_s: float = setting(
-        60.0,
-        help="Time between two checkpoints.",
-        check=_SECONDS,
-        unit="seconds",
+        60.0, help="Time between two checkpoints.", check=_SECONDS, unit="seconds",
         affects_result=False,
     )
     preview_every_s: float = setting(
-        20.0,
-        help="Time between two preview pictures of a running training; 0 writes none.",
-        check=_SECONDS,
-        unit="seconds",
-        affects_result=False,
+        20.0, help="Time between two preview pictures of a running training; 0 writes none.",
+        check=_SECONDS, unit="seconds", affects_result=False,
         option=Option(
-            "--preview-every",
-            "S",
+            "--preview-every", "S",
             "seconds between two preview pictures of the training; 0 writes none",
         ),
     )
 
 
+# fmt: on
 MODEL_SELECTION = tuple(d.name for d in declarations(TrainingSettings) if d.model_selection)
 """Parts of the model that can be switched on and off, or left to the photos (``"auto"``)."""

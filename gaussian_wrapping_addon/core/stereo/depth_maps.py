@@ -7,7 +7,7 @@ import io
 import logging
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,40 +26,23 @@ from .matching import NO_PRIOR, MatchingLevel, grey_levels, in_image, source_vie
 # -- Planes of triangles between points whose depth is known (docs/method.md, section 11.6) -------
 
 
-LEAST_COSINE = 0.15
-"""Between ray and normal: steeper triangles mostly bridge the edge of a thing."""
-
+LEAST_COSINE = 0.15  # between ray and normal: steeper triangles mostly bridge the edge of a thing
 HIDDEN_SHARE = 1.25
 """A point this much farther away than the nearest one of its cell counts as hidden."""
 
-BEHIND_SHARE = 1.05
-"""A point this much farther away than the pixel's own depth is hidden."""
-
-_CELLS = 24
-"""Cells along the long side of an image."""
-
+BEHIND_SHARE = 1.05  # a point this much farther away than the pixel's own depth is hidden
+_CELLS = 24  # cells along the long side of an image
 _LEAST_AREA = 1e-9
 
 
 def points_in_view(
     camera: Camera, points: np.ndarray, inverse_depths: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels (m, 2) and inverse depths (m,) of the points that a photo may show.
+    """Return pixels (m, 2) and inverse depths (m,), float64, of the points that a photo may show.
 
-    Hidden is what lies behind other points of its cell, or behind known depths.
-
-    Parameters
-    ----------
-    points : (n, 3)
-        In the frame of the camera.
-    inverse_depths : (h, w) array, optional
-        Of the photo, in its size.
-
-    Returns
-    -------
-    pixels : (m, 2) float64
-        Centres of pixels at whole numbers.
-    inverse_depths : (m,) float64
+    Hidden is what lies behind other points of its cell, or behind known ``inverse_depths`` (h, w)
+    of the photo. Points (n, 3) are in the frame that the camera stands in; pixels have their
+    centres at whole numbers.
     """
     inside, depth = in_image(camera, points)
     pixels = camera.project(points[inside])[0] - 0.5
@@ -81,16 +64,8 @@ def points_in_view(
 def triangle_planes(pixels: np.ndarray, inverse_depths: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the (h, w, 3) float32 planes of the Delaunay triangles of points in an image.
 
-    Parameters
-    ----------
-    pixels : (n, 2)
-        Centres of pixels at whole numbers.
-    inverse_depths : (n,)
-
-    Returns
-    -------
-    (h, w, 3) float32
-        (w, a, b) of each pixel (:mod:`~.matching`); 0 outside all triangles and in steep ones.
+    Of pixels (n, 2) with centres at whole numbers and inverse depths (n,): (w, a, b) of each pixel
+    (:mod:`~.matching`), 0 outside all triangles and in steep ones.
     """
     shape = (camera.height, camera.width)
     nothing = np.zeros((*shape, 3), np.float32)
@@ -139,18 +114,14 @@ _logger = logging.getLogger(__name__)
 COARSE_SWEEPS, COARSE_GEOMETRIC_SWEEPS, FINE_SWEEPS = 3, 2, 2
 """Sweeps at the coarse level before and after photos are compared, and at the fine level."""
 
-GEOMETRIC_COST = 0.15
-"""Of a pixel of forward-backward error."""
-
+GEOMETRIC_COST = 0.15  # of a pixel of forward-backward error
 RANDOM_SHARE = 0.25
 """Share of the pixels that start with a random plane although triangles cover them."""
 
 NEAREST_FACTOR, FARTHEST_FACTOR = 1.5, 0.02
 """Range of the inverse depths over that of the sparse points."""
 
-FEW_POINTS = 20
-"""A photo with fewer of them takes the range from all points."""
-
+FEW_POINTS = 20  # a photo with fewer of them takes the range from all points
 MOST_PIXELS = 12_000_000
 """Of all photos together at that size; more photos are matched at a smaller one."""
 
@@ -178,57 +149,39 @@ TEXTURE_VARIANCE = 20.0
 class DepthMap:
     """What stereo found in one photo."""
 
-    camera: Camera
-    """Of this size, scene frame."""
-    depth: np.ndarray
-    """(h, w) float32 z-depth of the best plane, scene units, confirmed or not."""
-    normal: np.ndarray
-    """(h, w, 3) float32 unit normals towards the camera, scene frame."""
+    camera: Camera  # of this size, scene frame
+    depth: np.ndarray  # (h, w) float32 z-depth of the best plane, scene units, confirmed or not
+    normal: np.ndarray  # (h, w, 3) float32 unit normals towards the camera, scene frame
     confidence: np.ndarray
     """(h, w) float32 in [0, 1], 0 where sources do not confirm the depth or a mask excludes the
     pixel; an order, no probability."""
-    agreeing: np.ndarray
-    """(h, w) uint8 number of sources whose depth agrees."""
+    agreeing: np.ndarray  # (h, w) uint8 number of sources whose depth agrees
     cost: np.ndarray
     """(h, w) float32 mean cost in the two best sources; about 1 where nothing matches."""
-    color: np.ndarray
-    """(h, w, 3) uint8."""
-    mask: np.ndarray | None
-    """(h, w) bool, true where the photo counts."""
+    color: np.ndarray  # (h, w, 3) uint8
+    mask: np.ndarray | None  # (h, w) bool, true where the photo counts
     free: np.ndarray | None = None
     """(h, w) float32 z-depth of parts without texture but for their borders, 0 elsewhere: the
     photo shows nothing before it. ``None`` until such parts were looked for."""
 
 
 def estimate_depth_maps(
-    photos: PhotoSource,
-    views: Sequence[int],
-    points: np.ndarray,
-    progress: Progress,
-    *,
-    side_px: int,
-    seed: int = 0,
-    threads: int = 0,
-) -> list[DepthMap]:
+    photos: PhotoSource, views: Sequence[int], points: np.ndarray, progress: Progress, *,
+    side_px: int, seed: int = 0, threads: int = 0,
+) -> list[DepthMap]:  # fmt: skip
     """Estimate the depth maps of photos; the result does not depend on ``threads``.
 
     Parameters
     ----------
-    photos : PhotoSource
     views : sequence of int
-        Views to match with each other.
+        Views to match with each other; the result is in their order, and empty where there are too
+        few points or views to compare, or a photo is too small to be halved.
     points : (n, 3) float64
         Sparse points, scene frame: they tell the range of depths and which photos to compare.
     progress : Progress
         Updated after each photo and level; checked for cancellation.
     side_px : int
         Longest side at which photos are matched (:func:`least_divisor`).
-
-    Returns
-    -------
-    list of DepthMap
-        In the order of ``views``; empty where there are too few points or views to compare, or a
-        photo is too small to be halved.
     """
     threads = threads or default_threads()
     views = list(views)
@@ -276,15 +229,11 @@ class _Matcher:
                 level.sweep(view, turn, self.seed, fresh=True)
 
         self._each(photometric, COARSE_SWEEPS)
-        depths = level.inverse_depths()
-        for view in range(len(level)):
-            level.confirm(view, depths)
+        level.confirm_all()
         level.compare_brightness()
         for turn in range(COARSE_GEOMETRIC_SWEEPS):
             self._geometric_sweep(level, COARSE_SWEEPS + turn, turn == 0, 1)
-        depths = level.inverse_depths()
-        for view in range(len(level)):
-            level.confirm(view, depths)
+        level.confirm_all()
         return level
 
     def fine(self, coarse: MatchingLevel, divisor: int) -> tuple[MatchingLevel, list[np.ndarray]]:
@@ -293,8 +242,7 @@ class _Matcher:
         self._each(lambda view: level.start_from(coarse, view), 0)
         for turn in range(FINE_SWEEPS):
             self._geometric_sweep(level, COARSE_SWEEPS + turn, turn == 0, 4)
-        depths = level.inverse_depths()
-        return level, [level.confirm(view, depths) for view in range(len(level))]
+        return level, level.confirm_all()
 
     def _level(self, divisor: int) -> MatchingLevel:
         cameras = [self.photos.camera(view, divisor) for view in self.views]
@@ -306,10 +254,9 @@ class _Matcher:
     ) -> None:
         """Sweep over all photos, comparing with the depths that all had before."""
         depths = level.inverse_depths()
-        coarse = weight == 1
 
         def run(view: int) -> None:
-            prior = self._prior(level, view, coarse) if with_prior else NO_PRIOR
+            prior = self._prior(level, view, reliable=weight == 1) if with_prior else NO_PRIOR
             level.sweep(
                 view, turn, self.seed, geometric=GEOMETRIC_COST, inverse_depths=depths, prior=prior
             )
@@ -369,7 +316,7 @@ class _Matcher:
 def _reliable_pixels(level: MatchingLevel, view: int) -> tuple[np.ndarray, np.ndarray]:
     """Return row and column of the best pixel of each cell that sources confirm."""
     cost, width = level.costs[view], level.greys[view].shape[1]
-    good = (_count(level.confirmed[view]) >= RELIABLE_SOURCES) & (cost < RELIABLE_COST)
+    good = (_BITS[level.confirmed[view]] >= RELIABLE_SOURCES) & (cost < RELIABLE_COST)
     row, column = np.nonzero(good)
     cell = (row // PRIOR_CELL_PX) * (width // PRIOR_CELL_PX + 1) + column // PRIOR_CELL_PX
     order = np.lexsort((cost[row, column], cell))
@@ -380,7 +327,7 @@ def _reliable_pixels(level: MatchingLevel, view: int) -> tuple[np.ndarray, np.nd
 def _depth_map(
     level: MatchingLevel, view: int, means: np.ndarray, color: np.ndarray, mask: np.ndarray | None
 ) -> DepthMap:
-    count = _count(level.confirmed[view])
+    count = _BITS[level.confirmed[view]]
     floor = 1.0 + TEXTURE_VARIANCE / np.maximum(level.variances[view], 1e-3)
     correlation = np.clip((1.0 - level.costs[view]) * floor, 0.0, 1.0)
     good = (count >= LEAST_SOURCES) & (correlation > LEAST_CORRELATION)
@@ -391,15 +338,10 @@ def _depth_map(
     confidence = np.minimum(count / CERTAIN_SOURCES, 1.0) * np.sqrt(correlation)
     camera = level.cameras[view]
     normal = -plane_normals(level.planes_of(view), camera) @ camera.rotation
+    depth = (1.0 / np.maximum(means, 1.0 / limits.FINITE_Z_MAX)).astype(np.float32)
+    confidence = np.where(good, confidence, 0.0).astype(np.float32)
     return DepthMap(
-        camera,
-        (1.0 / np.maximum(means, 1.0 / limits.FINITE_Z_MAX)).astype(np.float32),
-        normal.astype(np.float32),
-        np.where(good, confidence, 0.0).astype(np.float32),
-        count,
-        level.costs[view],
-        color,
-        mask,
+        camera, depth, normal.astype(np.float32), confidence, count, level.costs[view], color, mask
     )
 
 
@@ -417,11 +359,8 @@ def _from_aside(level: MatchingLevel, view: int, means: np.ndarray) -> np.ndarra
     return found
 
 
-def _count(bits: np.ndarray) -> np.ndarray:
-    return np.bitwise_count(bits) if hasattr(np, "bitwise_count") else _BITS[bits]
-
-
 _BITS = np.array([bin(value).count("1") for value in range(256)], np.uint8)
+"""Number of bits that are set, of each byte."""
 
 
 def _depth_range(camera: Camera, points: np.ndarray) -> tuple[float, float]:
@@ -446,14 +385,8 @@ def matching_divisor(cameras: Sequence[Camera], most_px: int) -> int:
 def least_divisor(side_px: float, pixels: float, most_px: int) -> int:
     """Return the least power of 2 that brings photos below both limits.
 
-    Parameters
-    ----------
-    side_px : float
-        Long side of the largest photo.
-    pixels : float
-        Of all photos together: divided, at most :data:`MOST_PIXELS`.
-    most_px : int
-        Long side, divided, at most.
+    Divided by it, the long side of the largest photo is at most ``most_px``, and all photos
+    together have at most :data:`MOST_PIXELS`.
     """
     divisor = 1
     while side_px / divisor > most_px or pixels / divisor**2 > MOST_PIXELS:
@@ -464,43 +397,23 @@ def least_divisor(side_px: float, pixels: float, most_px: int) -> int:
 # -- Parts of photos where stereo finds nothing: sky, far distance, what other photos do not show
 
 
-CELL_PX = 8
-"""Side of the cells of a photo, at the size it was matched at."""
-
-OPEN_SHARE = 0.75
-"""Share of a cell's pixels that must be unexplained for the cell to be open."""
-
-BEHIND_COST = 0.7
-"""Matching cost from which a pixel is unexplained: nothing matches."""
+CELL_PX = 8  # side of the cells of a photo, at the size it was matched at
+OPEN_SHARE = 0.75  # share of a cell's pixels that must be unexplained for the cell to be open
+BEHIND_COST = 0.7  # matching cost from which a pixel is unexplained: nothing matches
 
 
 def open_cells(depth_map: DepthMap) -> np.ndarray:
-    """Return the cells of a photo where nothing matches.
-
-    Returns
-    -------
-    (h // CELL_PX, w // CELL_PX) bool
-    """
+    """Return the cells of a photo where nothing matches, (h // CELL_PX, w // CELL_PX) bool."""
     unknown = (depth_map.agreeing == 0) & (depth_map.cost >= BEHIND_COST)
     if depth_map.mask is not None:
         unknown &= depth_map.mask
-    found: np.ndarray = by_cell(unknown.astype(np.float64)) >= OPEN_SHARE
-    return found
+    return by_cell(unknown.astype(np.float64)) >= OPEN_SHARE
 
 
 def cells_of(points: np.ndarray, depth_map: DepthMap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the points that whole cells of a photo show.
+    """Return which of the points (n, 3), scene frame, whole cells of a photo show.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Scene frame.
-
-    Returns
-    -------
-    indices : (m,) int64
-    row, column : (m,) int64
-        Their cells.
+    Returns their indices, and rows and columns of their cells, (m,) int64 each.
     """
     indices, row, column, _ = depth_map.camera.shown(points)
     row, column = row // CELL_PX, column // CELL_PX
@@ -512,26 +425,21 @@ def cells_of(points: np.ndarray, depth_map: DepthMap) -> tuple[np.ndarray, np.nd
 def shown_open(points: np.ndarray, depth_map: DepthMap) -> np.ndarray:
     """Return the indices of the points (n, 3) that a photo shows in open cells."""
     indices, row, column = cells_of(points, depth_map)
-    found: np.ndarray = indices[open_cells(depth_map)[row, column]]
-    return found
+    return indices[open_cells(depth_map)[row, column]]
 
 
 def by_cell(image: np.ndarray) -> np.ndarray:
     """Return the means of an image over its cells, (rows, columns) or (rows, columns, 3)."""
     rows, columns = (side // CELL_PX for side in image.shape[:2])
     whole = image[: rows * CELL_PX, : columns * CELL_PX]
-    means: np.ndarray = whole.reshape(rows, CELL_PX, columns, CELL_PX, *image.shape[2:]).mean(
-        (1, 3)
-    )
-    return means
+    cells = whole.reshape(rows, CELL_PX, columns, CELL_PX, *image.shape[2:])
+    return np.asarray(cells.mean((1, 3)))
 
 
 # -- Points with normals, colours and sizes from depth maps (docs/method.md, section 11.7) --------
 
 
-LIKE_NORMAL = 0.7
-"""Least cosine between the normals of pixels of one surface."""
-
+LIKE_NORMAL = 0.7  # least cosine between the normals of pixels of one surface
 OUTLIER_SIGMAS = 1.5
 """Pixels farther from the mean along the normal are left out of the second mean."""
 
@@ -568,16 +476,7 @@ def fuse(depth_maps: Sequence[DepthMap], wanted: int) -> DensePoints:
     One point for each cell of an octree whose level follows the footprint of a pixel, so that
     points are even in the resolution of the photos, not in space. The most confident pixel of a
     cell leads; its place along its normal is the trimmed mean of the cell's pixels of like normal.
-
-    Parameters
-    ----------
-    depth_maps : sequence of DepthMap
-    wanted : int
-        Number of points, within some per cent; fewer where there are fewer pixels.
-
-    Returns
-    -------
-    DensePoints
+    Their number is the wanted one within some per cent; fewer where there are fewer pixels.
     """
     return merged(lifted(depth_maps, [m.confidence for m in depth_maps]), wanted)
 
@@ -604,22 +503,14 @@ def merged(pixels: DensePoints, wanted: int) -> DensePoints:
         # A cell of two pixels can lose both to rounding.
         weight = np.where(np.bincount(cell, trimmed)[cell] > 0, trimmed, weight)
     found = pixels.select(first)
-    return DensePoints(
-        found.positions + mean[:, None] * found.normals,
-        found.normals,
-        found.colors,
-        found.sizes * size,
-        found.confidences,
-    )
+    positions = found.positions + mean[:, None] * found.normals
+    return replace(found, positions=positions, sizes=found.sizes * size)
 
 
 def lifted(depth_maps: Sequence[DepthMap], weights: Sequence[np.ndarray]) -> DensePoints:
     """Return the pixels of positive weight as points; their size is the footprint of a pixel.
 
-    Parameters
-    ----------
-    weights : sequence of (h, w) float32
-        Become confidences.
+    The weights, (h, w) float32 of each depth map, become confidences.
     """
     parts = []
     for depth_map, weight in zip(depth_maps, weights, strict=True):
@@ -627,20 +518,15 @@ def lifted(depth_maps: Sequence[DepthMap], weights: Sequence[np.ndarray]) -> Den
         depth = depth_map.depth[good].astype(np.float64)
         points = camera.rays()[good] * depth[:, None] - camera.cam_from_world[:, 3]
         parts.append(
-            DensePoints(
-                points @ camera.rotation,
-                depth_map.normal[good].astype(np.float64),
-                depth_map.color[good],
-                depth / camera.fx,
-                weight[good],
+            (
+                points @ camera.rotation, depth_map.normal[good].astype(np.float64),
+                depth_map.color[good], depth / camera.fx, weight[good],
             )
-        )
+        )  # fmt: skip
     if not parts:
         none = np.zeros((0, 3))
         return DensePoints(none, none, none.astype(np.uint8), np.zeros(0), np.zeros(0, np.float32))
-    return DensePoints(
-        *(np.concatenate(arrays) for arrays in zip(*(vars(p).values() for p in parts), strict=True))
-    )
+    return DensePoints(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def _cell_size(pixels: DensePoints, wanted: int) -> float:
@@ -674,33 +560,21 @@ def _cells(pixels: DensePoints, size: float) -> np.ndarray:
 MOST_COST = 0.7
 """A depth that no source confirms is a guess if it costs less; else nothing is known."""
 
-UNCONFIRMED_WEIGHT = 0.2
-"""Weight of a depth that no source confirms; each source adds as much."""
-
-CLEARANCE = 0.5
-"""Sizes of a point from confirmed ones within which it is left out."""
-
+UNCONFIRMED_WEIGHT = 0.2  # Weight of a depth that no source confirms; each source adds as much.
+CLEARANCE = 0.5  # sizes of a point from confirmed ones within which it is left out
 SEEN_THROUGH_SHARE = 0.03
 """A confirmed depth this much larger than a point's sees through the point."""
 
-SEEN_THROUGH_VIEWS = 2
-"""Views that must see through a point for it to be left out."""
-
-OPEN_VIEWS = 2
-"""Views that must show a point where nothing matches for it to be left out."""
+SEEN_THROUGH_VIEWS = 2  # views that must see through a point for it to be left out
+OPEN_VIEWS = 2  # views that must show a point where nothing matches for it to be left out
 
 
 def fill_gaps(depth_maps: Sequence[DepthMap], confirmed: DensePoints, wanted: int) -> DensePoints:
     """Return points from unconfirmed depths, away from confirmed points and from free space.
 
-    Parameters
-    ----------
-    confirmed : DensePoints
-    wanted : int
-        Largest number of points, about.
+    At most about ``wanted``.
     """
-    weights = [_guessed(depth_map) for depth_map in depth_maps]
-    guesses = merged(lifted(depth_maps, weights), wanted)
+    guesses = merged(lifted(depth_maps, [_guessed(found) for found in depth_maps]), wanted)
     if len(guesses) == 0 or len(confirmed) == 0:
         return guesses
     distance, nearest = cKDTree(confirmed.positions).query(guesses.positions)
@@ -716,18 +590,9 @@ def count_views(
     depth_maps: Sequence[DepthMap],
     against: Callable[[np.ndarray, DepthMap], np.ndarray],
 ) -> np.ndarray:
-    """Count the views that speak against each point.
+    """Count the views that speak against each point (n, 3), scene frame, (n,) int64.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Scene frame.
-    against : callable
-        Returns the indices of the points that a view speaks against, each once.
-
-    Returns
-    -------
-    (n,) int64
+    ``against`` returns the indices of the points that a view speaks against, each once.
     """
     count = np.zeros(len(points), np.int64)
     for depth_map in depth_maps:
@@ -739,8 +604,7 @@ def seen_through(points: np.ndarray, depth_map: DepthMap) -> np.ndarray:
     """Return the indices of the points (n, 3) with a view's confirmed depth clearly behind them."""
     shown, row, column, depth = depth_map.camera.shown(points)
     behind = depth_map.depth[row, column] > (1.0 + SEEN_THROUGH_SHARE) * depth
-    found: np.ndarray = shown[behind & (depth_map.confidence[row, column] > 0)]
-    return found
+    return np.asarray(shown[behind & (depth_map.confidence[row, column] > 0)])
 
 
 def _guessed(depth_map: DepthMap) -> np.ndarray:
@@ -769,12 +633,10 @@ and there training finds the surface better than windows do."""
 class DepthPrior:
     """What is known of the depths of one photo."""
 
-    camera: Camera
-    """Of this size, scene frame."""
+    camera: Camera  # of this size, scene frame
     depth: np.ndarray
     """(h, w) float32 z-depth, scene units; 0 where nothing is confirmed or planar."""
-    confidence: np.ndarray
-    """(h, w) float32 in [0, 1]; 0 where nothing is confirmed."""
+    confidence: np.ndarray  # (h, w) float32 in [0, 1]; 0 where nothing is confirmed.
     known: np.ndarray
     """(h, w) float32 confirmed z-depth, of planes or not; 0 where nothing is confirmed."""
     free: np.ndarray
@@ -833,20 +695,11 @@ def save_priors(folder: Path, priors: Mapping[int, DepthPrior], key: str) -> Non
 def load_priors(
     folder: Path, cameras: Mapping[int, Camera], key: str, views: Collection[int] | None = None
 ) -> dict[int, DepthPrior] | None:
-    """Read what :func:`save_priors` wrote for the same key.
+    """Read what :func:`save_priors` wrote for the same key, of some views or all.
 
-    Parameters
-    ----------
-    cameras : mapping of int to Camera
-        Of all views that were matched, at the size they were matched at.
-    views : collection of int, optional
-        Those that priors are wanted for; by default all.
-
-    Returns
-    -------
-    dict of int to DepthPrior, or None
-        ``None`` where the file is missing, damaged or of another key: the priors follow from the
-        photos and can be made again.
+    The cameras are those of all views that were matched, at the size they were matched at. Returns
+    ``None`` where the file is missing, damaged or of another key: the priors follow from the photos
+    and can be made again.
     """
     wanted = cameras.keys() if views is None else views
     names = ["key", *(f"{layer}.{view}" for view in wanted for layer in _LAYERS)]

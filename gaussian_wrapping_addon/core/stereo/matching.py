@@ -45,11 +45,8 @@ confirmed."""
 BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG = 12.0, 5.0, 12.0
 """Angle between two rays to a point at which matching is best, and how fast it gets worse."""
 
-LEAST_GAIN = 1e-3
-"""Least share of the points for which a source is of use."""
-
-_MOST_POINTS = 1500
-"""Points that decide, subsampled from those given."""
+LEAST_GAIN = 1e-3  # least share of the points for which a source is of use
+_MOST_POINTS = 1500  # points that decide, subsampled from those given
 
 
 def source_views(cameras: Sequence[Camera], points: np.ndarray) -> list[np.ndarray]:
@@ -58,17 +55,8 @@ def source_views(cameras: Sequence[Camera], points: np.ndarray) -> list[np.ndarr
     A point in both images counts by the angle between its two rays and by the likeness of its two
     scales, the less the more sources chosen before hold it.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-    points : (n, 3) float64
-        Sparse points in the frame of the cameras.
-
-    Returns
-    -------
-    list of (k,) int64
-        Indices of at most :data:`MOST_SOURCES` other cameras, for each camera; empty where none
-        shares points with it.
+    Of sparse points (n, 3) in the frame of the cameras. Returns for each camera (k,) int64 indices
+    of at most :data:`MOST_SOURCES` others; none where no camera shares points with it.
     """
     count = len(cameras)
     points = points[:: max(1, -(-len(points) // _MOST_POINTS))]
@@ -122,18 +110,10 @@ def _sources_of(view: int, inside: np.ndarray, scale: np.ndarray, rays: np.ndarr
 KEPT_SOURCES = 2
 """Sources in which a pixel is judged: its best ones. The others may not see its surface."""
 
-REFINEMENTS = 2
-"""Random changes tried per pixel and sweep, the second half as large as the first."""
-
-LEAST_COSINE = F32(0.12)
-"""Between ray and normal, 83 degrees: more grazing planes are not tried."""
-
-GOOD_COST = F32(0.3)
-"""A pixel that costs less in the sources it kept is not judged in the others."""
-
-RANDOM_ABOVE = F32(0.5)
-"""A random plane is tried where the cost is at least this."""
-
+REFINEMENTS = 2  # random changes tried per pixel and sweep, the second half as large as the first
+LEAST_COSINE = F32(0.12)  # between ray and normal, 83 degrees: more grazing planes are not tried
+GOOD_COST = F32(0.3)  # a pixel that costs less in the sources it kept is not judged in the others
+RANDOM_ABOVE = F32(0.5)  # a random plane is tried where the cost is at least this
 SAME_SHARE = F32(0.001)
 """Planes nearer than this share of the depth over the whole window are the same: under 0.1 px."""
 
@@ -141,9 +121,7 @@ NEAR_VARIANCE_PX = 25.0
 ALIKE_LEVELS = 12.0
 """Widths of the two factors of a sample's weight: distance from the centre, difference in grey."""
 
-NORMAL_SPREAD = F32(20)
-"""Relative change of the normal per relative change of the depth, at most 1."""
-
+NORMAL_SPREAD = F32(20)  # relative change of the normal per relative change of the depth, at most 1
 PRIOR_STRENGTH, PRIOR_TEXTURE, PRIOR_SHARE = F32(0.25), F32(20), F32(0.01)
 """Largest cost of leaving the prior's plane; variance of grey at which half of it is left; share of
 the depth that counts as leaving it."""
@@ -366,9 +344,7 @@ _FIRST_SPAN, _LATER_SPAN = 0.1, 0.02
 _MEAN_PX = 5
 """Side of the window over which grey levels are averaged to compare the brightness of photos."""
 
-_MOST_SEED = 2**32 - 1
-"""Seeds of a sweep lie between 1 and this: the generator would stay at 0."""
-
+_MOST_SEED = 2**32 - 1  # seeds of a sweep lie between 1 and this: the generator would stay at 0
 NO_PRIOR = np.zeros((0, 0, 3), np.float32)
 NO_DEPTHS = np.zeros(1, np.float32)
 
@@ -404,12 +380,9 @@ class MatchingLevel:
     """
 
     def __init__(
-        self,
-        cameras: Sequence[Camera],
-        greys: Sequence[np.ndarray],
-        sources: Sequence[np.ndarray],
+        self, cameras: Sequence[Camera], greys: Sequence[np.ndarray], sources: Sequence[np.ndarray],
         depth_ranges: np.ndarray,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.cameras, self.greys, self.sources = list(cameras), list(greys), list(sources)
         self.depth_ranges = depth_ranges.astype(np.float32)
         count = len(self.greys)
@@ -447,25 +420,12 @@ class MatchingLevel:
         return np.ascontiguousarray(self.planes[..., 0]).reshape(-1)
 
     def sweep(
-        self,
-        view: int,
-        turn: int,
-        seed: int,
-        *,
-        fresh: bool = False,
-        geometric: float = 0.0,
-        inverse_depths: np.ndarray = NO_DEPTHS,
-        prior: np.ndarray = NO_PRIOR,
-    ) -> None:
-        """Run one sweep over a photo.
+        self, view: int, turn: int, seed: int, *, fresh: bool = False, geometric: float = 0.0,
+        inverse_depths: np.ndarray = NO_DEPTHS, prior: np.ndarray = NO_PRIOR,
+    ) -> None:  # fmt: skip
+        """Run one sweep over a photo; its number decides direction and farther neighbours.
 
-        Parameters
-        ----------
-        turn : int
-            Number of the sweep: it decides direction and farther neighbours.
-        seed : int
-        fresh, geometric, inverse_depths, prior
-            As in :func:`~.matching.sweep`.
+        ``fresh``, ``geometric``, ``inverse_depths`` and ``prior`` are as in :func:`sweep`.
         """
         if len(self.sources[view]) == 0:
             return
@@ -494,6 +454,11 @@ class MatchingLevel:
                 means,
             )  # fmt: skip
         return means
+
+    def confirm_all(self) -> list[np.ndarray]:
+        """Do so for all photos with the depths that they have now."""
+        depths = self.inverse_depths()
+        return [self.confirm(view, depths) for view in range(len(self))]
 
     def compare_brightness(self) -> None:
         """Measure gains between photos on the confirmed pixels; costs compare them from now on."""
@@ -536,12 +501,8 @@ class MatchingLevel:
             back_maps.append(_map(lens_here, rotation.T, -rotation.T @ offset, lens_there))
             sizes.append((there.width - 1, there.height - 1))
         bases = np.asarray(self.sources[view], np.uint64) * np.uint64(self._photo_pixels)
-        return (
-            np.array(maps, np.float32).reshape(-1, 12),
-            np.array(back_maps, np.float32).reshape(-1, 12),
-            np.array(sizes, np.float32).reshape(-1, 2),
-            bases,
-        )
+        forth, back = (np.array(rows, np.float32).reshape(-1, 12) for rows in (maps, back_maps))
+        return forth, back, np.array(sizes, np.float32).reshape(-1, 2), bases
 
 
 def _matrix(camera: Camera) -> np.ndarray:

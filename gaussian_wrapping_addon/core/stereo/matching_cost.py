@@ -90,20 +90,14 @@ AGREEING_PX = F32(1)
 AGREEING_SHARE = F32(0.01)
 """Largest forward-backward error and relative difference in depth of two views that agree."""
 
-LEAST_LEVEL = 16.0
-"""Darker pixels tell no gain."""
-
+LEAST_LEVEL = 16.0  # darker pixels tell no gain
 LEAST_TOLERANCE_LEVELS = 2.0
 TOLERANCE_PER_SPREAD = 3.0
 """Difference in grey levels that is as bad as any larger one: so many times the median difference
 of agreeing pixels, and at least that."""
 
-LEAST_PAIRS = 50
-"""Agreeing pixels of two photos below which their brightness is not compared."""
-
-MOST_PAIRS = 20_000
-"""Pixels of a photo that are looked at, at most."""
-
+LEAST_PAIRS = 50  # agreeing pixels of two photos below which their brightness is not compared
+MOST_PAIRS = 20_000  # pixels of a photo that are looked at, at most
 GAIN, RATE = 0, 1
 """Columns of a brightness: factor of the source's grey levels, and one over the tolerance, 0 where
 brightness is not compared."""
@@ -163,12 +157,9 @@ def confirm(
 
 
 def brightness_of(
-    means: np.ndarray,
-    inverse_depths: np.ndarray,
-    confirmed: np.ndarray,
-    maps: np.ndarray,
+    means: np.ndarray, inverse_depths: np.ndarray, confirmed: np.ndarray, maps: np.ndarray,
     other_means: list[np.ndarray],
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return (s, 2) float32: gain and rate of each source of a photo.
 
     A window on a smooth plain surface shows a ramp of shading, and a ramp correlates with itself at
@@ -176,16 +167,14 @@ def brightness_of(
 
     Parameters
     ----------
-    means : (h, w) float32
-        Mean grey level around each pixel.
+    means, other_means : (h, w) float32
+        Mean grey level around each pixel of the photo, and of its sources.
     inverse_depths : (h, w) float32
         Where ``confirmed`` is not 0.
     confirmed : (h, w) uint8
         Bits of the sources whose own depth agrees.
     maps : (s, 12) float32
         From the photo to its sources (:mod:`~.matching`).
-    other_means : list of (h', w') float32
-        As ``means``, of the sources.
     """
     found = np.tile(NO_BRIGHTNESS, (len(maps), 1))
     row, column = np.nonzero(confirmed)

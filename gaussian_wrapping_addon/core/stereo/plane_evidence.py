@@ -30,9 +30,7 @@ from .plane_fitting import (
 # -- Kernels that look points up in all photos ----------------------------------------------------
 
 
-AGREEING, ALIKE, THROUGH, UNLIKE, NEARER = range(5)
-"""Columns of what :func:`count_votes` counts."""
-
+AGREEING, ALIKE, THROUGH, UNLIKE, NEARER = range(5)  # columns of what :func:`count_votes` counts
 AGREEING_SHARE = 0.02
 """Largest relative difference of a point's depth and a photo's own, of those that agree."""
 
@@ -169,27 +167,22 @@ def correlate(
 # -- All photos packed, to ask them what they say about points on a plane -------------------------
 
 
-MOST_ASKED = 40
-"""Photos asked about the points of one; a regular choice of more."""
-
+MOST_ASKED = 40  # Photos asked about the points of one; a regular choice of more.
 LEAST_SHOWN = 0.9
 """Share of the pixels that must show a plane; photos need not be asked about another."""
 
 GAIN_PIXELS, LEAST_PAIRS = 600, 30
 """Confirmed pixels of a photo that gains are measured on, and least number of a pair of photos."""
 
-_DARK = 4.0
-"""Added to colours before ratios are taken, so that dark pixels do not decide."""
+_DARK = 4.0  # added to colours before ratios are taken, so that dark pixels do not decide
 
 
 @dataclass(frozen=True)
 class Votes:
     """What the other photos say about points, as shares of all that could contradict."""
 
-    like: float
-    """Depth agrees, or nothing is known there and the colour is like."""
-    through: float
-    """The depth there lies behind."""
+    like: float  # depth agrees, or nothing is known there and the colour is like
+    through: float  # the depth there lies behind
 
 
 @dataclass(frozen=True)
@@ -213,11 +206,7 @@ class PackedPhotos:
     ) -> np.ndarray:  # fmt: skip
         """Return (n, 5) int32 counts of :func:`count_votes` for pixels of a photo.
 
-        Parameters
-        ----------
-        pixels : (n, 2) float64
-            Centres whole.
-        inverse_depths : (n,) float64, positive
+        Pixels are (n, 2) float64, centres whole; their inverse depths (n,) are positive.
         """
         counts = np.zeros((len(pixels), 5), np.int32)
         column, row = pixels.astype(np.int64).T
@@ -261,14 +250,9 @@ def packed(depth_maps: Sequence[DepthMap], random: np.random.Generator) -> Packe
         part = (view, slice(cameras[view].height), slice(cameras[view].width))
         depths[part] = np.where(found.confidence > 0, found.depth, 0.0)
         images[part] = found.color
-    photos = PackedPhotos(
-        cameras,
-        np.array([_projection(camera) for camera in cameras]),
-        np.array([(camera.width, camera.height) for camera in cameras], np.int64),
-        depths,
-        images,
-        np.ones((len(cameras), 3)),
-    )
+    projections = np.array([_projection(camera) for camera in cameras])
+    sizes = np.array([(camera.width, camera.height) for camera in cameras], np.int64)
+    photos = PackedPhotos(cameras, projections, sizes, depths, images, np.ones((len(cameras), 3)))
     gains = np.exp(-_log_gains(photos, random))  # (n, 3)
     for view, gain in enumerate(gains):
         corrected = (images[view].astype(np.float32) + _DARK) * gain.astype(np.float32) - _DARK
@@ -319,18 +303,6 @@ def _ratio(
     return np.median(np.log(there / color[shown][agree]), axis=0)
 
 
-__all__ = [
-    "AGREEING",
-    "ALIKE",
-    "NEARER",
-    "THROUGH",
-    "PackedPhotos",
-    "Votes",
-    "packed",
-    "photos_asked",
-]
-
-
 # -- Planes moved until the faint texture of their segments matches between photos ----------------
 #
 # A window of 11 x 11 pixels on a plain wall shows less texture than noise; thousands of pixels
@@ -346,23 +318,15 @@ MOST_NOISE_LEVELS, MOST_COARSENING = 0.2, 4.0
 Noise lowers every correlation: those of a rendered room's true planes fell to .13 to .31
 where its photos were matched at full size."""
 
-NOISY_PHOTOS = 0.8
-"""Quantile of the photos' noise that the scales are made for."""
-
+NOISY_PHOTOS = 0.8  # quantile of the photos' noise that the scales are made for
 STEPS = ((0.01, 0.005), (0.0025, 0.00125, 0.0006, 0.0003))
 """Of the search at each scale, as shares of the depth at the edges of the plane's segments."""
-TURNS = 6
-"""Most turns of the search with one step."""
-
+TURNS = 6  # most turns of the search with one step
 PENALTY, PENALTY_STEP = 0.03, 0.015
 """Correlation that a change of the plane by such a share of the depth must gain at least."""
 
-CLIPPED_LEVELS = 4.0
-"""Texture is clipped at this many grey levels."""
-
-MOST_SAMPLES, LEAST_SAMPLES = 1200, 200
-"""Pixels of a segment that take part, and that it needs to."""
-
+CLIPPED_LEVELS = 4.0  # texture is clipped at this many grey levels
+MOST_SAMPLES, LEAST_SAMPLES = 1200, 200  # pixels of a segment that take part, and that it needs to
 MOST_SOURCES = 6
 LEAST_INSIDE = 0.3
 """Share of a segment's samples that must land on plain pixels of a source."""
@@ -400,16 +364,9 @@ class _Sampled:
 
 
 class Aligner:
-    """Moves planes to where the texture of plain pixels matches best.
+    """Moves planes to where the texture of all plain segments matches best.
 
-    Parameters
-    ----------
-    photos : PackedPhotos
-    segments : sequence of Segment
-        All plain ones.
-    random : numpy.random.Generator
-    progress : Progress
-        Checked for cancellation, here only.
+    ``progress`` is checked for cancellation while textures are drawn only.
     """
 
     def __init__(

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -38,12 +37,8 @@ from .plane_fitting import (
 # -- Which plane, or which two, a plain segment lies on -------------------------------------------
 
 
-LEAST_BORDER = 0.12
-"""Share of a segment's known depths, weighed, that its plane must explain."""
-
-PAIR_GAIN = 0.06
-"""Share that a second plane must explain besides."""
-
+LEAST_BORDER = 0.12  # share of a segment's known depths, weighed, that its plane must explain
+PAIR_GAIN = 0.06  # share that a second plane must explain besides
 LEAST_LIKE = 0.85
 """Share of the other photos' votes that must not contradict a plane (:class:`.Votes`)."""
 
@@ -54,9 +49,7 @@ photos."""
 LATER_SPREAD = 0.12
 """As :data:`~.plane_fitting.LEAST_SPREAD`, once planes are known from several photos."""
 
-FEW_VIEWS = 2.0
-"""A plane of n views counts n / (n + this)."""
-
+FEW_VIEWS = 2.0  # a plane of n views counts n / (n + this)
 MOST_RANKED, MOST_PAIRED, MOST_TRIED = 14, 6, 20
 """Planes of a segment that are looked at, of these put together in pairs, and choices whose votes
 are counted."""
@@ -72,9 +65,7 @@ ground goes on beyond a rod."""
 NEIGHBOURS, SPREADING_TURNS = 3, 4
 
 
-FAR_DISTANCE = 1e6
-"""Of points that stand for what lies too far away for parallax, scene units."""
-
+FAR_DISTANCE = 1e6  # of points that stand for what lies too far away for parallax, scene units
 FAR_SHARE, FAR_VOTES = 0.85, 2.0
 """Share of the other photos' votes that must be for the same colour and unknown depth, and votes a
 pixel needs on average, for a segment without a plane to lie far away: photos see the sky alike in
@@ -143,12 +134,7 @@ class PlaneSet:
 def assigned(segment: Segment, known: PlaneSet, *, first: bool) -> Assignment | None:
     """Return the planes that explain most of what is known around a segment and pass the votes.
 
-    Parameters
-    ----------
-    segment : Segment
-    known : PlaneSet
-    first : bool
-        Planes are proposals of single segments still.
+    At ``first`` planes are proposals of single segments still.
     """
     if not known.planes or segment.weights.sum() < LEAST_WEIGHT:
         return None
@@ -189,11 +175,8 @@ class _Choices:
         """Return the choices that explain enough, the best first."""
         rank = self.shares * np.minimum(self.spreads / FULL_SPREAD, 1.0)
         order = [int(k) for k in np.argsort(-rank)[:MOST_RANKED] if self.shares[k] > LEAST_RANKED]
-        found = [
-            (self.shares[k], Assignment((k,)))
-            for k in order
-            if self.spreads[k] >= self.least_spread
-        ]
+        wide = [k for k in order if self.spreads[k] >= self.least_spread]
+        found = [(self.shares[k], Assignment((k,))) for k in wide]
         found += list(self._pairs(order[:MOST_PAIRED]))
         found = [choice for choice in found if choice[0] >= LEAST_BORDER]
         found.sort(key=lambda c: -c[0] * self.trust[list(c[1].planes)].min())
@@ -255,12 +238,9 @@ def _colors(segment: Segment, photos: PackedPhotos) -> np.ndarray:
 
 
 def _taken_over(
-    own: Sequence[int],
-    segments: Sequence[Segment],
-    found: Sequence[Assignment | None],
-    colors: dict[int, np.ndarray],
-    known: PlaneSet,
-) -> dict[int, Assignment]:
+    own: Sequence[int], segments: Sequence[Segment], found: Sequence[Assignment | None],
+    colors: dict[int, np.ndarray], known: PlaneSet,
+) -> dict[int, Assignment]:  # fmt: skip
     """Return the assignments that segments of one photo take over in one turn."""
     camera = known.photos.cameras[segments[own[0]].view]
     done = np.zeros((camera.height, camera.width), np.int64)
@@ -277,9 +257,7 @@ def _taken_over(
         close = distance[segment.rows, segment.columns] <= GAP_PX
         if found[number] is not None or not close.any():
             continue
-        near, count = np.unique(
-            nearest[segment.rows, segment.columns][close], return_counts=True
-        )  # fmt: skip
+        near, count = np.unique(nearest[segment.rows, segment.columns][close], return_counts=True)
         for other in near[np.argsort(-count)][:NEIGHBOURS]:
             if np.abs(colors[number] - colors[int(other)]).max() > LIKE_LEVELS:
                 continue
@@ -308,16 +286,10 @@ _logger = logging.getLogger(__name__)
 LEAST_UNKNOWN = 0.4
 """Share of a large segment's pixels without confirmed depth from which it is looked into."""
 
-TURNS = 3
-"""Turns of assigning segments and fitting planes; the planes are aligned after the last."""
-
-LEAST_VIEWS = 2
-"""Photos whose segments a plane needs after the first turn."""
-
-NORMAL_COSINE = 0.95
-"""Of a confirmed pixel's normal with that of a plane it is fitted to."""
-FITTED_SHARE = 0.03
-"""Distance of such a pixel from the plane over that from the camera, at most."""
+TURNS = 3  # Turns of assigning segments and fitting planes; the planes are aligned after the last.
+LEAST_VIEWS = 2  # photos whose segments a plane needs after the first turn
+NORMAL_COSINE = 0.95  # of a confirmed pixel's normal with that of a plane it is fitted to
+FITTED_SHARE = 0.03  # distance of such a pixel from the plane over that from the camera, at most
 FITTED_PIXELS, LEAST_FITTED = 1500, 300
 """Of a segment at most; known depths of any normal are taken where a plane has fewer in all."""
 
@@ -332,9 +304,7 @@ AGREEING_PER_THROUGH, AGREEING_PER_NEARER = 2, 0.5
 """Photos that must agree with a filled pixel for each that sees through it or shows something
 before it."""
 
-KEPT_SHARE = 0.003
-"""A confirmed depth that differs less from the plane is kept."""
-
+KEPT_SHARE = 0.003  # a confirmed depth that differs less from the plane is kept
 FILLED_CONFIDENCE, FILLED_AGREEING = 0.5, 2
 
 BEHIND_MARGIN_PX, BEHIND_VIEWS, BEHIND_PER_AGREEING = 2, 2, 2
@@ -356,13 +326,8 @@ def fill_plain_parts(
     beside. So do those that other photos see through, onto a plane or onto what lies too far away
     for parallax, as the sky.
 
-    Parameters
-    ----------
-    depth_maps : sequence of DepthMap
-    points : (n, 3) float64
-        Sparse points, scene frame.
-    progress : Progress
-        Told once, at its end; checked for cancellation.
+    The sparse points (n, 3) are in the scene frame; progress is told once, at its end, and checked
+    for cancellation.
     """
     if len(depth_maps) < LEAST_VIEWS:
         return list(depth_maps)
@@ -454,20 +419,18 @@ def _fitted(
                 exact.append(tilted)
             else:
                 inverse = segment.inverse_depths[near]
-                points = lifted_pixels(camera, segment.places[near], inverse)
-                known.append((points, segment.weights[near] * inverse**2))
+                at = lifted_pixels(camera, segment.places[near], inverse)
+                known.append((at, segment.weights[near] * inverse**2))
         if len(views) < LEAST_VIEWS:
             continue
         if sum(len(part[0]) for part in exact) < LEAST_FITTED:
             exact = known + exact
         if not exact:
             continue
-        evidence = Plane(
-            plane.normal, plane.offset, plane.center,
-            np.concatenate([part[0] for part in exact]),
-            np.concatenate([part[1] for part in exact]),
-            support, frozenset(views), plane.distance,
-        )  # fmt: skip
+        points, weights = (np.concatenate(parts) for parts in zip(*exact, strict=True))
+        evidence = replace(
+            plane, points=points, weights=weights, support=support, views=frozenset(views)
+        )
         result.append(refined(evidence))
     return result
 
@@ -478,11 +441,8 @@ def _tilted_alike(
     """Return confirmed points in and around a segment that lie on a plane and have its normal."""
     camera = depth_map.camera
     top, left = max(segment.rows.min() - BORDER_PX, 0), max(segment.columns.min() - BORDER_PX, 0)
-    box = (
-        slice(top, segment.rows.max() + BORDER_PX + 1),
-        slice(left, segment.columns.max() + BORDER_PX + 1),
-    )
-    row, column = np.nonzero(depth_map.confidence[box] > 0)
+    low, right = segment.rows.max() + BORDER_PX + 1, segment.columns.max() + BORDER_PX + 1
+    row, column = np.nonzero(depth_map.confidence[top:low, left:right] > 0)
     row, column = row + top, column + left
     depth = depth_map.depth[row, column].astype(np.float64)
     points = lifted_pixels(camera, np.stack([column, row], 1).astype(np.float64), 1.0 / depth)
@@ -632,7 +592,7 @@ class _Filled:
         confidence = np.where(lost | far, np.float32(0), depth_map.confidence)
         confidence[filled] = FILLED_CONFIDENCE
         agreeing = np.where(filled, np.uint8(FILLED_AGREEING), depth_map.agreeing)
-        return dataclasses.replace(
+        return replace(
             depth_map, depth=depth, normal=normal, confidence=confidence,
             agreeing=np.where(far, np.uint8(0), agreeing),
             cost=np.where(far, WORST_COST, depth_map.cost),

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,9 +18,7 @@ from .depth_maps import DepthMap, points_in_view
 # -- Noise of photos in their plain parts (docs/method.md, section 11.12) -------------------------
 
 
-DARKEST, BRIGHTEST = 1.0, 254.0
-"""Grey levels between which noise shows."""
-
+DARKEST, BRIGHTEST = 1.0, 254.0  # grey levels between which noise shows
 SIDES_PX = (1, 2)
 """Of the squares whose means are looked at. Resizing and JPEG take noise of single pixels away and
 leave that of squares, which texture is made of, too; squares of 4 px show faint texture itself."""
@@ -45,12 +43,8 @@ def noise_levels(color: np.ndarray, plain: np.ndarray) -> np.ndarray:
     [Immerkaer 1996], of pixels and of means of squares; the largest counts. Too few plain pixels
     tell no noise: 0.
 
-    Parameters
-    ----------
-    color : (h, w, c) float32
-        Channels of the photo as taken.
-    plain : (h, w) bool
-        Pixels without texture; those that are black or saturated are left out, as they show none.
+    Of the channels (h, w, c) float32 of the photo as taken, at ``plain`` pixels (h, w) bool, those
+    without texture; what is black or saturated is left out, as it shows none.
     """
     usable = plain & ((color > DARKEST) & (color < BRIGHTEST)).all(-1)
     found = np.zeros(color.shape[-1])
@@ -97,22 +91,14 @@ SMOOTHING_PX = (0.7, 1.0, 1.4, 2.0, 2.8)
 CLEAR_OF_NOISE = 4.5
 """The first width is taken at which that difference is so many standard deviations of noise."""
 
-LEAST_SHARE = 0.0008
-"""Of the pixels of a photo that a segment needs."""
-
+LEAST_SHARE = 0.0008  # of the pixels of a photo that a segment needs
 LARGE_SHARE = 0.004
 """Of the pixels of a photo from which a segment proposes planes; smaller ones may take over those
 of their neighbours."""
 
-BORDER_PX = 5
-"""Width of the band around a segment whose confirmed depths count."""
-
-MOST_BORDER = 600
-"""Known depths of a segment, at most; a regular choice of more."""
-
-SPARSE_WEIGHT = 3.0
-"""Of a sparse point inside a segment; confirmed pixels of the border weigh 1."""
-
+BORDER_PX = 5  # width of the band around a segment whose confirmed depths count
+MOST_BORDER = 600  # Known depths of a segment, at most; a regular choice of more.
+SPARSE_WEIGHT = 3.0  # Of a sparse point inside a segment; confirmed pixels of the border weigh 1.
 INSIDE_WEIGHT = 0.3
 """Of a confirmed pixel inside: windows without texture also agree where they should not."""
 
@@ -121,16 +107,14 @@ INSIDE_WEIGHT = 0.3
 class Segment:
     """Connected pixels without texture."""
 
-    view: int
-    """Number of the depth map."""
+    view: int  # number of the depth map
     rows: np.ndarray  # (p,) int64
     columns: np.ndarray  # (p,) int64
     places: np.ndarray  # (b, 2) float64 pixels of known depths in and around it, centres whole
     inverse_depths: np.ndarray  # (b,) of those
     weights: np.ndarray  # (b,)
     large: bool
-    unknown: float
-    """Share of its pixels whose depth no source confirms."""
+    unknown: float  # share of its pixels whose depth no source confirms
     noise: float
     """Standard deviation of white noise as strong as that of its photo's grey levels, as taken."""
 
@@ -146,29 +130,17 @@ class Segment:
 
 
 def segments_of(depth_maps: Sequence[DepthMap], points: np.ndarray) -> list[Segment]:
-    """Return the plain segments of all photos.
-
-    Parameters
-    ----------
-    depth_maps : sequence of DepthMap
-    points : (n, 3) float64
-        Sparse points, scene frame.
-    """
-    return [
-        segment
-        for view, depth_map in enumerate(depth_maps)
-        for segment in _segments(depth_map, view, points)
-    ]
+    """Return the plain segments of all photos, of sparse points (n, 3) in the scene frame."""
+    found: list[Segment] = []
+    for view, depth_map in enumerate(depth_maps):
+        found += _segments(depth_map, view, points)
+    return found
 
 
 def numbered(segments: Sequence[Segment], shape: tuple[int, ...]) -> np.ndarray:
     """Return (n, h, w) int32 numbers of the segments of each photo from 1, 0 elsewhere.
 
-    Parameters
-    ----------
-    segments : sequence of Segment
-    shape : (3,) int
-        Number of photos, height and width of the largest.
+    The shape is the number of photos, height and width of the largest.
     """
     numbers = np.zeros(shape, np.int32)
     count = np.zeros(len(numbers), np.int32)
@@ -179,14 +151,10 @@ def numbered(segments: Sequence[Segment], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def plain_pixels(depth_map: DepthMap) -> tuple[np.ndarray, float]:
-    """Return the plain pixels of a photo and the noise of its grey levels.
+    """Return the plain pixels of a photo, (h, w) bool, and the noise of its grey levels.
 
-    Returns
-    -------
-    plain : (h, w) bool
-        No step of grey levels to a neighbour, and no mask excludes the pixel.
-    noise : float
-        Standard deviation of white noise as strong.
+    Plain pixels have no step of grey levels to a neighbour, and no mask excludes them; the noise is
+    the standard deviation of white noise as strong.
     """
     color = depth_map.color.astype(np.float32)
     shown = True if depth_map.mask is None else depth_map.mask
@@ -244,19 +212,13 @@ def _segments(depth_map: DepthMap, view: int, points: np.ndarray) -> list[Segmen
         rows, columns, weight = rows[chosen], columns[chosen], weight[chosen]
         own = numbers[sparse_at[:, 1], sparse_at[:, 0]] == number
         row, column = np.nonzero(inside)
-        found.append(
-            Segment(
-                view,
-                row + corner[1],
-                column + corner[0],
-                np.concatenate([np.stack([columns, rows], 1), sparse_px[own]]),
-                np.concatenate([inverse[rows, columns], sparse_inverse[own]]),
-                np.concatenate([weight, np.full(int(own.sum()), SPARSE_WEIGHT)]),
-                bool(sizes[number] >= LARGE_SHARE * plain.size),
-                1.0 - len(inner_row) / len(row),
-                noise,
-            )
-        )
+        places = np.concatenate([np.stack([columns, rows], 1), sparse_px[own]])
+        known = np.concatenate([inverse[rows, columns], sparse_inverse[own]])
+        weights = np.concatenate([weight, np.full(int(own.sum()), SPARSE_WEIGHT)])
+        large = bool(sizes[number] >= LARGE_SHARE * plain.size)
+        unknown = 1.0 - len(inner_row) / len(row)
+        row, column = row + corner[1], column + corner[0]
+        found.append(Segment(view, row, column, places, known, weights, large, unknown, noise))
     return found
 
 
@@ -287,19 +249,13 @@ class Plane:
     center: np.ndarray  # (3,) of the points
     points: np.ndarray  # (n, 3)
     weights: np.ndarray  # (n,) over squared depth, so that residuals count relative to it
-    support: float
-    """Sum of the weights of the known depths of segments."""
-    views: frozenset[int]
-    """Depth maps whose segments speak for it."""
-    distance: float
-    """Of the points from a camera that sees them."""
+    support: float  # sum of the weights of the known depths of segments
+    views: frozenset[int]  # depth maps whose segments speak for it
+    distance: float  # of the points from a camera that sees them
 
     def moved(self, normal: np.ndarray, offset: float) -> Plane:
         """Return the same evidence for another place."""
-        return Plane(
-            normal, offset, self.center, self.points, self.weights, self.support, self.views,
-            self.distance,
-        )  # fmt: skip
+        return replace(self, normal=normal, offset=offset)
 
 
 def image_plane(plane: Plane, camera: Camera) -> np.ndarray:
@@ -322,9 +278,7 @@ def lifted_pixels(camera: Camera, pixels: np.ndarray, inverse_depths: np.ndarray
     return (local - camera.cam_from_world[:, 3]) @ camera.rotation
 
 
-def fit_plane(
-    points: np.ndarray, weights: np.ndarray
-) -> tuple[np.ndarray, float, np.ndarray]:  # fmt: skip
+def fit_plane(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
     """Return the normal, the offset and the centre of the plane of least squares."""
     center = np.average(points, axis=0, weights=weights)
     scaled = (points - center) * np.sqrt(weights)[:, None]
@@ -339,19 +293,13 @@ def refined(plane: Plane) -> Plane:
         residual = np.abs(plane.points @ normal - offset) * np.sqrt(plane.weights)
         weights = plane.weights / (1.0 + (residual / scale) ** 2) ** 2
         normal, offset, center = fit_plane(plane.points, weights)
-    return Plane(
-        normal, offset, center, plane.points, plane.weights, plane.support, plane.views,
-        plane.distance,
-    )  # fmt: skip
+    return replace(plane, normal=normal, offset=offset, center=center)
 
 
 def pooled(planes: Sequence[Plane], *, fit: bool = True) -> list[Plane]:
     """Return the planes with those that are the same as one; the best supported first.
 
-    Parameters
-    ----------
-    fit : bool
-        Fit each to the points of all that were put together.
+    With ``fit`` each is fitted to the points of all that were put together.
     """
     ordered = sorted(planes, key=lambda p: -p.support)
     normals, centers = np.zeros((len(ordered), 3)), np.zeros((len(ordered), 3))
@@ -378,16 +326,12 @@ def _joined(group: Sequence[Plane]) -> Plane:
     first = group[0]
     if len(group) == 1:
         return first
-    return Plane(
-        first.normal,
-        first.offset,
-        first.center,
-        np.concatenate([plane.points for plane in group]),
-        np.concatenate([plane.weights for plane in group]),
-        sum(plane.support for plane in group),
-        frozenset().union(*(plane.views for plane in group)),
-        first.distance,
-    )
+    return replace(
+        first, points=np.concatenate([plane.points for plane in group]),
+        weights=np.concatenate([plane.weights for plane in group]),
+        support=sum(plane.support for plane in group),
+        views=frozenset().union(*(plane.views for plane in group)),
+    )  # fmt: skip
 
 
 # -- Planes that the known depths of one plain segment propose ------------------------------------
@@ -411,8 +355,7 @@ FULL_SPREAD, LEAST_SPREAD = 0.5, 0.25
 a proposal counts fully, and which it needs: depths along a single edge, as where a wall meets the
 floor, fit every plane through that edge."""
 
-SAME_INLIERS = 0.7
-"""Share of inliers in common with a better proposal from which one is left out."""
+SAME_INLIERS = 0.7  # share of inliers in common with a better proposal from which one is left out
 
 
 def proposed_planes(
@@ -468,17 +411,9 @@ def spreads(
 ) -> np.ndarray:  # fmt: skip
     """Return (t,) how widely sets of known depths spread across their line.
 
-    Parameters
-    ----------
-    inliers : (t, b) array
-        1 or true where a known depth of the segment belongs to a set.
-    extent : (2, 2) array, optional
-        Covariance of the pixels to compare with, those of the segment by default.
-
-    Returns
-    -------
-    (t,) float64
-        Standard deviation along the shorter axis of each set, over that of the pixels along it.
+    That is the standard deviation along the shorter axis of each set, over that of the pixels along
+    it. ``inliers`` (t, b) are 1 or true where a known depth of the segment belongs to a set;
+    ``extent`` (2, 2) is the covariance of the pixels, by default those of the segment.
     """
     extent = segment.extent if extent is None else extent
     x, y = (segment.places - segment.places.mean(0)).T

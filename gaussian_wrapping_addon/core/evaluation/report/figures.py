@@ -46,16 +46,10 @@ def measured(value: Any) -> float | None:
 
 
 def number(value: Any, unit: str = "", *, digits: int | None = None) -> str:
-    """Return a number with its unit, or :data:`NOT_MEASURED`.
+    """Return a finite number with its unit, or :data:`NOT_MEASURED`.
 
-    Parameters
-    ----------
-    value : any
-        Value of a report; only finite numbers count as measured.
-    unit : str
-    digits : int, optional
-        Digits after the decimal point; by default, integers are written in full and other
-        numbers with four significant digits.
+    It has so many digits after the decimal point; by default, integers are written in full and
+    other numbers with four significant digits.
     """
     found = measured(value)
     if found is None:
@@ -131,18 +125,11 @@ def bar(share: float) -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], align: str) -> list[str]:
-    """Return the lines of a Markdown table.
+    """Return the lines of a Markdown table; ``align`` has an ``l`` or ``r`` for each column.
 
-    Parameters
-    ----------
-    header : sequence of str
-    rows : sequence of sequences of str
-        Cells as Markdown; text from outside must already be :func:`escaped`.
-    align : str
-        One of ``l`` and ``r`` for each column.
+    Cells are Markdown: text from outside must already be :func:`escaped`.
     """
-    marks = {"l": "---", "r": "---:"}
-    lines = [header, [marks[a] for a in align], *rows]
+    lines = [header, ["---:" if a == "r" else "---" for a in align], *rows]
     for row in lines:
         if len(row) != len(align):
             raise ValueError(f"a row of {len(row)} cells in a table of {len(align)} columns")
@@ -154,63 +141,36 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], align: str) -> l
 
 # Lists of records that have tables or pictures of their own.
 _SHOWN_ELSEWHERE = {
-    "decisions",
-    "history",
-    "pictures",
-    "warnings",
-    "packages",
-    "stages",
-    "notes",
-    "blocks",
-}
+    "decisions", "history", "pictures", "warnings", "packages", "stages", "notes", "blocks",
+}  # fmt: skip
 
-_UNITS = {
-    "psnr": "dB",
-    "held_out_psnr": "dB",
-    "ssim": "1 is identical",
-    "held_out_ssim": "1 is identical",
-    "lpips": "0 is identical",
-    "held_out_lpips": "0 is identical",
-    "seconds_training": "s",
-    "wall_seconds": "s",
-    "mesh_seconds": "s",
-    "volume": "cubic scene units",
-    "area": "square scene units",
-    "candidate_area": "square scene units",
-    "cap_area": "square scene units",
-    "processor_seconds": "s of all cores",
-    "mean_edge": "scene units",
-    "edge_length": "world units",
-    "edge_length_scene": "scene units",
-    "edge_length_world": "world units, 0 is automatic",
-    "texels_per_unit": "texels per world unit",
-    "texel_size": "world units",
-    "views_per_seen_texel": "photos",
-    "utilisation": "of 1",
-    "coverage": "of 1",
-    "covered": "of 1",
-    "uncovered": "of 1",
-    "whole_psnr": "dB",
-    "exposure_spread": "of 1, standard deviation",
-    "brightness_spread_within_photos": "of 1, standard deviation",
-    "stretch_mean": "1 is even",
-    "stretch_p95": "1 is even",
-    "seed": "number",
-    "version": "number",
-    "sh_degree": "degree",
-    "extra_iterations": "count",
-    "pixels_per_iteration": "px",
-    "multi_view_pixels": "px",
-    "multi_view_every": "iterations",
-    "region_weight": "weight",
-    "overlap_price": "weight",
-    "seconds_low": "s",
-    "seconds_high": "s",
-    "speed": "times the reference machine",
-    "video_fps": "1/s",
-    "euler": "number",
-    "genus": "number",
-}
+_NAMES = {
+    "dB": ("psnr", "held_out_psnr", "whole_psnr"),
+    "1 is identical": ("ssim", "held_out_ssim"),
+    "0 is identical": ("lpips", "held_out_lpips"),
+    "s": ("seconds_training", "wall_seconds", "mesh_seconds", "seconds_low", "seconds_high"),
+    "cubic scene units": ("volume",),
+    "square scene units": ("area", "candidate_area", "cap_area"),
+    "s of all cores": ("processor_seconds",),
+    "scene units": ("mean_edge", "edge_length_scene"),
+    "world units": ("edge_length", "texel_size"),
+    "world units, 0 is automatic": ("edge_length_world",),
+    "texels per world unit": ("texels_per_unit",),
+    "photos": ("views_per_seen_texel",),
+    "of 1": ("utilisation", "coverage", "covered", "uncovered"),
+    "of 1, standard deviation": ("exposure_spread", "brightness_spread_within_photos"),
+    "1 is even": ("stretch_mean", "stretch_p95"),
+    "number": ("seed", "version", "euler", "genus"),
+    "degree": ("sh_degree",),
+    "count": ("extra_iterations",),
+    "px": ("pixels_per_iteration", "multi_view_pixels"),
+    "iterations": ("multi_view_every",),
+    "weight": ("region_weight", "overlap_price"),
+    "times the reference machine": ("speed",),
+    "1/s": ("video_fps",),
+}  # fmt: skip
+"""Names of figures by their unit."""
+_UNITS = {name: unit for unit, names in _NAMES.items() for name in names}
 _WORLD_UNITS = {
     "area": "square world units",
     "size": "world units",
@@ -230,42 +190,29 @@ _ENDINGS = (
     ("_until", "of 1 (of all iterations)"),
     ("_s", "s"),
 )
-_COUNTS = frozenset(
-    (
-        "atlases", "bad_indices", "boundary_edges", "candidates",
-        "cap_faces_left_out", "cap_points",
-        "charts", "components", "cores", "degenerate_faces", "degenerate_faces_left",
-        "dense_faces", "dense_high", "dense_low", "dense_vertices", "densify_every",
-        "dropped_candidates",
-        "faces", "faces_before_clean_up", "faces_without_texel", "field_cameras",
-        "field_evaluations",
-        "frames", "gaussians", "gaussians_in_region", "holdout_every", "images_in_model",
-        "inconsistent_edges", "interior_samples", "iterations", "jump_points", "left_out", "lods",
-        "max_atlases", "max_gaussians", "most_parts",
-        "nonmanifold_edges", "nonmanifold_vertices", "not_finite_vertices",
-        "open_at_region", "open_edges", "pairs_contradicting_cameras", "pairs_matched",
-        "pairs_verified", "part_count", "photos", "photos_joined", "photos_masked",
-        "photos_masked_as_turning", "photos_placed",
-        "photos_undistorted", "photos_used", "photos_with_focal_length", "pivots",
-        "pivots_each", "pivots_high", "pivots_low",
-        "points", "points_high", "points_in_model", "points_low",
-        "projection_evaluations", "rays", "relabelled_tetrahedra", "removed_cavities",
-        "removed_open_pieces",
-        "removed_solids", "sightings", "small_handles_closed", "small_handles_left",
-        "smooth_steps", "split_edges", "split_vertices",
-        "surface_points", "target_faces", "tetrahedra", "tetrahedra_high",
-        "tetrahedra_low", "texels_filled",
-        "texels_overlapping", "texels_seen", "texels_seen_at_outlines_only",
-        "texels_seen_badly", "texels_used",
-        "processes", "threads", "tile_processes", "turntable_photos", "undecided_tetrahedra",
-        "unseen_evaluations",
-        "unused_vertices",
-        "vertices", "video_frames", "video_frames_blurred", "video_frames_damaged",
-        "video_frames_kept", "video_frames_read", "video_frames_still",
-        "vertices_at_end_of_sight", "vertices_moved_apart",
-        "vertices_on_region_boundary", "vertices_on_surface", "views", "wrap_rounds",
-    )
-)  # fmt: skip
+_COUNTS = frozenset((
+    "atlases", "bad_indices", "boundary_edges", "candidates", "cap_faces_left_out", "cap_points",
+    "charts", "components", "cores", "degenerate_faces", "degenerate_faces_left", "dense_faces",
+    "dense_high", "dense_low", "dense_vertices", "densify_every", "dropped_candidates", "faces",
+    "faces_before_clean_up", "faces_without_texel", "field_cameras", "field_evaluations", "frames",
+    "gaussians", "gaussians_in_region", "holdout_every", "images_in_model", "inconsistent_edges",
+    "interior_samples", "iterations", "jump_points", "left_out", "lods", "max_atlases",
+    "max_gaussians", "most_parts", "nonmanifold_edges", "nonmanifold_vertices",
+    "not_finite_vertices", "open_at_region", "open_edges", "pairs_contradicting_cameras",
+    "pairs_matched", "pairs_verified", "part_count", "photos", "photos_joined", "photos_masked",
+    "photos_masked_as_turning", "photos_placed", "photos_undistorted", "photos_used",
+    "photos_with_focal_length", "pivots", "pivots_each", "pivots_high", "pivots_low", "points",
+    "points_high", "points_in_model", "points_low", "processes", "projection_evaluations", "rays",
+    "relabelled_tetrahedra", "removed_cavities", "removed_open_pieces", "removed_solids",
+    "sightings", "small_handles_closed", "small_handles_left", "smooth_steps", "split_edges",
+    "split_vertices", "surface_points", "target_faces", "tetrahedra", "tetrahedra_high",
+    "tetrahedra_low", "texels_filled", "texels_overlapping", "texels_seen",
+    "texels_seen_at_outlines_only", "texels_seen_badly", "texels_used", "threads", "tile_processes",
+    "turntable_photos", "undecided_tetrahedra", "unseen_evaluations", "unused_vertices", "vertices",
+    "vertices_at_end_of_sight", "vertices_moved_apart", "vertices_on_region_boundary",
+    "vertices_on_surface", "video_frames", "video_frames_blurred", "video_frames_damaged",
+    "video_frames_kept", "video_frames_read", "video_frames_still", "views", "wrap_rounds",
+))  # fmt: skip
 _STARTS = (("level_error_", "of vacancy"), ("lambda_", "weight"))
 
 
@@ -335,15 +282,9 @@ def _text(value: Any) -> str:
 # -- Warnings of a report: those of the stages, and those derived from its figures ----------------
 
 
-FEW_HELD_OUT = 3
-"""The mean over fewer photos is not reliable."""
-
-LOW_COVERAGE = 0.5
-"""Below half, most of the texture is filled in and not photographed."""
-
-GAP_DB = 20.0 * math.log10(2.0)
-"""Held-out photos have more than twice the error of training photos."""
-
+FEW_HELD_OUT = 3  # the mean over fewer photos is not reliable
+LOW_COVERAGE = 0.5  # below half, most of the texture is filled in and not photographed
+GAP_DB = 20.0 * math.log10(2.0)  # held-out photos have more than twice the error of training photos
 TEXELLESS_SHARE = 0.005
 """Share of the area in faces smaller than a texel that is worth a warning: scattered slivers take
 the colour of their neighbours."""
@@ -351,18 +292,15 @@ the colour of their neighbours."""
 MAX_RESIDUAL = 0.25
 """``|v - 0.5|`` beyond which a vertex is nearer to "empty" or "solid" than to the surface."""
 
-REPROJECTION_PX = 2.0
-"""Half of the 4 px at which structure from motion rejects a point."""
+REPROJECTION_PX = 2.0  # half of the 4 px at which structure from motion rejects a point
 
 
 @dataclass(frozen=True)
 class StageWarning:
     """One warning of one stage."""
 
-    stage: str
-    """``cameras``, ``training``, ``mesh NAME`` or ``texture NAME``."""
-    code: str
-    """Stable identifier; empty for texts of version 0.1.0."""
+    stage: str  # ``cameras``, ``training``, ``mesh NAME`` or ``texture NAME``
+    code: str  # Stable identifier; empty for texts of version 0.1.0.
     text: str
     hint: str = ""
     """What the user can do; empty if no remedy is known."""
@@ -373,37 +311,23 @@ class StageWarning:
 
 
 def collect_warnings(report: dict[str, Any]) -> list[StageWarning]:
-    """Return the warnings of every stage, in the order of the stages.
-
-    Parameters
-    ----------
-    report : dict
-        Content of ``report.json`` of any version; entries may be missing.
-    """
+    """Return the warnings of every stage, in order, of a report of any version."""
     cameras, training = part(report, "cameras"), part(report, "training")
-    found = _of_stage(
-        "cameras",
-        read_warnings(cameras.get("warnings")),
-        _camera_warnings(part(cameras, "facts")),
-    )
-    found += _of_stage(
-        "training", read_warnings(training.get("warnings")), _training_warnings(training)
-    )
+    by_stage: list[tuple[str, Sequence[Any], Iterable[ReportWarning]]] = [
+        ("cameras", [cameras.get("warnings")], _camera_warnings(part(cameras, "facts"))),
+        ("training", [training.get("warnings")], _training_warnings(training)),
+    ]
     for name, region in part(report, "regions").items():
         provenance, texture = part(region, "provenance"), part(region, "texture")
-        found += _of_stage(
-            f"mesh {name}",
-            read_warnings(provenance.get("warnings")),
-            read_warnings(provenance.get("notes")),
-            _mesh_warnings(part(region, "statistics"), provenance),
-            _check_warnings(part(region, "check")),
-        )
-        found += _of_stage(
-            f"texture {name}",
-            read_warnings(texture.get("warnings")),
-            read_warnings(part(region).get("warnings")),
-            _texture_warnings(texture),
-        )
+        stored = [provenance.get("warnings"), provenance.get("notes")]
+        by_stage.append((f"mesh {name}", stored, _mesh_warnings(part(region), provenance)))
+        stored = [texture.get("warnings"), part(region).get("warnings")]
+        by_stage.append((f"texture {name}", stored, _texture_warnings(texture)))
+    found = [
+        StageWarning(stage, warning.code, warning.text, warning.hint)
+        for stage, stored, derived in by_stage
+        for warning in (*(w for values in stored for w in read_warnings(values)), *derived)
+    ]
     return list(dict.fromkeys(found))
 
 
@@ -416,40 +340,29 @@ def warning_lines(report: dict[str, Any]) -> list[str]:
     return lines or ["No stage reported a warning."]
 
 
-def _of_stage(stage: str, *lists: Iterable[ReportWarning]) -> list[StageWarning]:
-    return [StageWarning(stage, w.code, w.text, w.hint) for each in lists for w in each]
-
-
-def _camera_warnings(facts: dict[str, Any]) -> list[ReportWarning]:
+def _camera_warnings(facts: dict[str, Any]) -> Iterator[ReportWarning]:
     error_px = measured(facts.get("mean_reprojection_error_px"))
-    if error_px is None or error_px <= REPROJECTION_PX:
-        return []
-    text = (
-        f"The mean reprojection error of the cameras is {number(error_px, 'px', digits=2)}; "
-        f"above {REPROJECTION_PX:g} px details blur."
-    )
-    return [
-        ReportWarning(
-            "reprojection-error", text, "Use one lens without zooming, and keep the scene still."
+    if error_px is not None and error_px > REPROJECTION_PX:
+        text = (
+            f"The mean reprojection error of the cameras is {number(error_px, 'px', digits=2)}; "
+            f"above {REPROJECTION_PX:g} px details blur."
         )
-    ]
+        step = "Use one lens without zooming, and keep the scene still."
+        yield ReportWarning("reprojection-error", text, step)
 
 
-def _training_warnings(training: dict[str, Any]) -> list[ReportWarning]:
+def _training_warnings(training: dict[str, Any]) -> Iterator[ReportWarning]:
     if not isinstance(training.get("held_out"), list):
-        return []
+        return
     count = len(training["held_out"])
     if count == 0:
         text = "No photo was held out: the accuracy of new views was not measured."
-        return [
-            ReportWarning("no-held-out-photos", text, "Take more photos, or allow held-out photos.")
-        ]
-    found = []
+        step = "Take more photos, or allow held-out photos."
+        yield ReportWarning("no-held-out-photos", text, step)
+        return
     if count < FEW_HELD_OUT:
         text = f"Only {plural(count, 'photo')} held out: too few for a reliable mean."
-        found.append(
-            ReportWarning("few-held-out-photos", text, "Take more photos from all around.")
-        )
+        yield ReportWarning("few-held-out-photos", text, "Take more photos from all around.")
     history = items(training.get("history"))
     reached = measured(part(history[-1]).get("psnr")) if history else None
     new = measured(training.get("held_out_psnr"))
@@ -459,82 +372,59 @@ def _training_warnings(training: dict[str, Any]) -> list[ReportWarning]:
             f"({new:.1f} dB against {reached:.1f} dB)."
         )
         step = "Take more photos between the viewpoints; check for motion and changes of exposure."
-        found.append(ReportWarning("new-views-worse", text, step))
-    return found
+        yield ReportWarning("new-views-worse", text, step)
 
 
-def _mesh_warnings(statistics: dict[str, Any], provenance: dict[str, Any]) -> list[ReportWarning]:
-    found = []
-    is_open_by_request = provenance.get("boundary") == "open"
-    if statistics.get("closed") is False and not is_open_by_request:
+def _mesh_warnings(region: dict[str, Any], provenance: dict[str, Any]) -> Iterator[ReportWarning]:
+    statistics = part(region, "statistics")
+    if statistics.get("closed") is False and provenance.get("boundary") != "open":
         edges = plural(statistics.get("boundary_edges"), "open edge")
         text = f"The mesh is not closed ({edges}); volumes and 3D printing need a closed mesh."
         step = "Fill the holes in Blender; send the job folder's log.txt with a bug report."
-        found.append(ReportWarning("not-closed", text, step))
+        yield ReportWarning("not-closed", text, step)
     residual_p99 = measured(provenance.get("level_error_p99"))
     # Smoothing and decimation move vertices off the surface on request.
     moved = "faces_before_clean_up" in provenance or measured(provenance.get("smooth_steps"))
     if residual_p99 is not None and residual_p99 > MAX_RESIDUAL and not moved:
         text = "1 % of the vertices or more do not lie on the reconstructed surface."
-        found.append(
-            ReportWarning(
-                "off-the-surface", text, "Mesh with more points, or choose a smaller region."
-            )
-        )
-    left = measured(provenance.get("degenerate_faces_left"))
-    if left:
+        step = "Mesh with more points, or choose a smaller region."
+        yield ReportWarning("off-the-surface", text, step)
+    if left := measured(provenance.get("degenerate_faces_left")):
         text = f"{plural(int(left), 'face')} with zero area could not be removed."
-        found.append(
-            ReportWarning(
-                "degenerate-faces", text, "Blender: Mesh > Clean Up > Degenerate Dissolve."
-            )
+        step = "Blender: Mesh > Clean Up > Degenerate Dissolve."
+        yield ReportWarning("degenerate-faces", text, step)
+    defects = [d for d in items(part(region, "check").get("defects")) if isinstance(d, str)]
+    if defects:
+        text = f"The check of the final mesh found defects ({'; '.join(defects)})."
+        step = (
+            "Mesh with another number of points; send the job folder's log.txt with a bug report."
         )
-    return found
+        yield ReportWarning("mesh-defects", text, step)
 
 
-def _check_warnings(check: dict[str, Any]) -> list[ReportWarning]:
-    defects = [defect for defect in items(check.get("defects")) if isinstance(defect, str)]
-    if not defects:
-        return []
-    text = f"The check of the final mesh found defects ({'; '.join(defects)})."
-    step = "Mesh with another number of points; send the job folder's log.txt with a bug report."
-    return [ReportWarning("mesh-defects", text, step)]
-
-
-def _texture_warnings(texture: dict[str, Any]) -> list[ReportWarning]:
-    found = []
+def _texture_warnings(texture: dict[str, Any]) -> Iterator[ReportWarning]:
     coverage = measured(texture.get("coverage"))
     if coverage == 0.0:
         text = "No photo sees the mesh: its texture is plain grey."
-        found.append(
-            ReportWarning("no-photo-sees-the-mesh", text, "Check the region and the cameras.")
-        )
+        yield ReportWarning("no-photo-sees-the-mesh", text, "Check the region and the cameras.")
     elif coverage is not None and coverage < LOW_COVERAGE:
         text = (
             f"Only {percent(coverage)} of the texture is seen by photos; the rest is filled in "
             "from its surroundings."
         )
         step = "Choose a tighter region, or photograph the missing sides."
-        found.append(ReportWarning("little-seen", text, step))
+        yield ReportWarning("little-seen", text, step)
     reason = texture.get("unwrap_fallback_reason")
     if isinstance(reason, str) and reason:
         text = f"The mesh was unwrapped by box projection: {reason}"
-        found.append(
-            ReportWarning(
-                "unwrapped-simply",
-                text,
-                "Box projection makes more seams; a smaller mesh may unwrap normally.",
-            )
-        )
+        step = "Box projection makes more seams; a smaller mesh may unwrap normally."
+        yield ReportWarning("unwrapped-simply", text, step)
     lost = measured(texture.get("faces_without_texel"))
     share = measured(texture.get("area_without_texel_share"))
     if lost and (share is None or share > TEXELLESS_SHARE):
         text = f"{plural(int(lost), 'face')} smaller than a texel: no texture colour of their own."
-        found.append(
-            ReportWarning("faces-without-texel", text, "Choose a larger texture or a coarser mesh.")
-        )
-    overlaps = measured(texture.get("texels_overlapping"))
-    if overlaps:
+        step = "Choose a larger texture or a coarser mesh."
+        yield ReportWarning("faces-without-texel", text, step)
+    if overlaps := measured(texture.get("texels_overlapping")):
         text = f"{plural(int(overlaps), 'texel')} belong to two faces."
-        found.append(ReportWarning("texels-overlap", text, "Choose a larger texture."))
-    return found
+        yield ReportWarning("texels-overlap", text, "Choose a larger texture.")

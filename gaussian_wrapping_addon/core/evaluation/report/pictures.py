@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import html
 import io
 import math
 from collections.abc import Sequence
@@ -22,187 +20,91 @@ from ...render.view_renderer import ViewRenderer
 from ...scene.scene import PhotoSource, evenly_spaced
 from .figures import items, measured, part
 
-# -- Plots with linear or logarithmic axes as SVG, without a plotting library ---------------------
+# -- The learning curve as SVG, without a plotting library ----------------------------------------
 
 
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#8b4513")
-"""Distinguishable by colour-blind readers (Okabe and Ito)."""
+_COLORS = ("#0072b2", "#d55e00")  # distinguishable by colour-blind readers (Okabe and Ito)
 _WIDTH, _HEIGHT = 460, 360
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 34, 46
-_LINEAR_TICKS = 6
-_MARGIN = 0.06
-"""Margin around the points of a linear axis, as a share of their spread."""
+_TICKS = 6
+_MARGIN = 0.06  # margin around the points of an axis, as a share of their spread
+MAX_DOTS = 20  # curves with more points are drawn as a line without dots
+
+_Points = list[tuple[float, float]]
 
 
-@dataclasses.dataclass(frozen=True)
-class Series:
-    """A named series of points, joined by a line in the order given."""
-
-    name: str
-    points: Sequence[tuple[float, float]]
-    line: bool = True
-    labels: Sequence[str] = ()
-    """Labels beside the points; none, or one for each point."""
-    dots: bool = True
-
-
-@dataclasses.dataclass(frozen=True)
-class Panel:
-    """One diagram."""
-
-    title: str
-    x_label: str
-    y_label: str
-    series: Sequence[Series]
-    legend_low: bool = False
-    """Legend at the lower left instead of the upper left."""
-    x_log: bool = True
-    y_log: bool = True
-
-
-@dataclasses.dataclass(frozen=True)
-class _Axis:
-    """Maps values onto [0, 1]."""
-
-    low: float
-    high: float
-    log: bool
-    ticks: tuple[float, ...]
-
-    def share(self, value: float) -> float:
-        attributes = math.log10(value) if self.log else value
-        return (attributes - self.low) / (self.high - self.low)
-
-
-def _axis(values: Sequence[float], log: bool) -> _Axis:
-    if log:
-        low = math.floor(math.log10(min(values)))
-        high = max(math.ceil(math.log10(max(values))), low + 1)
-        return _Axis(low, high, True, tuple(10.0**e for e in range(low, high + 1)))
+def _axis(values: Sequence[float]) -> tuple[float, float, list[float]]:
+    """Return the ends of an axis and its ticks."""
     spread = max(values) - min(values) or abs(values[0]) or 1.0
     begin, end = min(values) - _MARGIN * spread, max(values) + _MARGIN * spread
-    rough = (end - begin) / _LINEAR_TICKS
+    rough = (end - begin) / _TICKS
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * k for k in (1, 2, 5, 10) if power * k >= rough)
     first, last = math.ceil(begin / step), math.floor(end / step)
-    return _Axis(begin, end, False, tuple(step * k for k in range(first, last + 1)))
-
-
-def _tick(value: float, log: bool) -> str:
-    if log and not 1e-3 <= value <= 1e6:
-        return f"1e{round(math.log10(value))}"
-    return f"{value:.6g}"
-
-
-def _shown(panel: Panel) -> list[tuple[float, float]]:
-    """Return the points within the domain of the axes."""
-    return [p for series in panel.series for p in series.points if _fits(panel, p)]
-
-
-def _fits(panel: Panel, point: tuple[float, float]) -> bool:
-    finite = math.isfinite(point[0]) and math.isfinite(point[1])
-    return finite and (not panel.x_log or point[0] > 0) and (not panel.y_log or point[1] > 0)
+    return begin, end, [step * k for k in range(first, last + 1)]
 
 
 def _text(x: float, y: float, content: str, anchor: str = "middle", extra: str = "") -> str:
-    attributes = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{extra}'
-    return f"<text {attributes}>{html.escape(content)}</text>"
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{extra}>{content}</text>'
 
 
 def _dot(x: float, y: float, color: str) -> str:
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{color}"/>'
 
 
-def _panel(panel: Panel, left: int, top: int) -> list[str]:
-    points = _shown(panel)
-    inner_w, inner_h = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
-    x0, y0 = left + _LEFT, top + _TOP
-    middle_x, middle_y = x0 + inner_w / 2, y0 + inner_h / 2
+def _diagram(title: str, y_label: str, curves: dict[str, _Points], left: int) -> list[str]:
+    """Return a diagram over the iterations, of curves by their names."""
+    width, height = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
+    x0, y0 = left + _LEFT, _TOP
+    middle_x, middle_y = x0 + width / 2, y0 + height / 2
     turned = f' transform="rotate(-90 {left + 14} {middle_y:.1f})"'
     parts = [
-        f'<rect x="{x0}" y="{y0}" width="{inner_w}" height="{inner_h}" fill="none" stroke="#888"/>',
-        _text(middle_x, top + 20, panel.title, extra=' font-weight="bold"'),
-        _text(middle_x, top + _HEIGHT - 8, panel.x_label),
-        _text(left + 14, middle_y, panel.y_label, extra=turned),
+        f'<rect x="{x0}" y="{y0}" width="{width}" height="{height}" fill="none" stroke="#888"/>',
+        _text(middle_x, 20, title, extra=' font-weight="bold"'),
+        _text(middle_x, _HEIGHT - 8, "iteration"),
+        _text(left + 14, middle_y, y_label, extra=turned),
     ]
-    if not points:
-        return [*parts, _text(middle_x, middle_y, "no data")]
-    across = _axis([p[0] for p in points], panel.x_log)
-    up = _axis([p[1] for p in points], panel.y_log)
+    points = [point for curve in curves.values() for point in curve]
+    (x_low, x_high, x_ticks), (y_low, y_high, y_ticks) = (
+        _axis([p[k] for p in points]) for k in (0, 1)
+    )
 
-    def at(point: tuple[float, float]) -> tuple[float, float]:
-        return x0 + inner_w * across.share(point[0]), y0 + inner_h * (1.0 - up.share(point[1]))
+    def across(value: float) -> float:
+        return x0 + width * ((value - x_low) / (x_high - x_low))
 
-    for value in across.ticks:
-        x = x0 + inner_w * across.share(value)
-        parts.append(f'<path d="M{x:.1f} {y0}V{y0 + inner_h}" stroke="#ddd" stroke-width="0.7"/>')
-        parts.append(_text(x, y0 + inner_h + 15, _tick(value, panel.x_log)))
-    for value in up.ticks:
-        y = y0 + inner_h * (1.0 - up.share(value))
-        parts.append(f'<path d="M{x0} {y:.1f}h{inner_w}" stroke="#ddd" stroke-width="0.7"/>')
-        parts.append(_text(x0 - 5, y + 4, _tick(value, panel.y_log), "end"))
-    for number, series in enumerate(panel.series):
-        color = _COLORS[number % len(_COLORS)]
-        kept = [i for i, p in enumerate(series.points) if _fits(panel, p)]
-        positions = [at(series.points[i]) for i in kept]
-        if series.line and len(positions) > 1:
-            path = " ".join(f"{x:.1f},{y:.1f}" for x, y in positions)
+    def up(value: float) -> float:
+        return y0 + height * (1.0 - (value - y_low) / (y_high - y_low))
+
+    for value in x_ticks:
+        x = across(value)
+        parts.append(f'<path d="M{x:.1f} {y0}V{y0 + height}" stroke="#ddd" stroke-width="0.7"/>')
+        parts.append(_text(x, y0 + height + 15, f"{value:.6g}"))
+    for value in y_ticks:
+        y = up(value)
+        parts.append(f'<path d="M{x0} {y:.1f}h{width}" stroke="#ddd" stroke-width="0.7"/>')
+        parts.append(_text(x0 - 5, y + 4, f"{value:.6g}", "end"))
+    for number, (name, curve) in enumerate(curves.items()):
+        color, places = _COLORS[number], [(across(x), up(y)) for x, y in curve]
+        if len(places) > 1:
+            path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
             parts.append(
                 f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="1.5"/>'
             )
-        if series.dots:
-            parts += [
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{color}"/>' for x, y in positions
-            ]
-        if series.labels:
-            parts += [
-                _text(x + 5, y - 5, series.labels[i], "start", f' fill="{color}"')
-                for i, (x, y) in zip(kept, positions, strict=True)
-            ]
+        if len(places) <= MAX_DOTS:
+            parts += [_dot(x, y, color) for x, y in places]
         y = y0 + 14 + 15 * number
-        if panel.legend_low:
-            y += inner_h - 15 * len(panel.series) - 8
-        parts.append(_dot(x0 + 10, y - 4, color))
-        parts.append(_text(x0 + 18, y, series.name, "start"))
+        parts += [_dot(x0 + 10, y - 4, color), _text(x0 + 18, y, name, "start")]
     return parts
-
-
-def write_svg(panels: Sequence[Panel], path: Path, *, columns: int = 3) -> None:
-    """Write panels side by side, in rows of ``columns``.
-
-    Points that are not finite, or not positive on a logarithmic axis, are left out.
-    """
-    rows = -(-len(panels) // columns)
-    width, height = _WIDTH * min(columns, len(panels)), _HEIGHT * rows
-    lines = [
-        (
-            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
-            f'viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="11">'
-        ),
-        f'<rect width="{width}" height="{height}" fill="white"/>',
-    ]
-    for number, panel in enumerate(panels):
-        row, column = divmod(number, columns)
-        lines += _panel(panel, column * _WIDTH, row * _HEIGHT)
-    write_bytes(path, ("\n".join([*lines, "</svg>"]) + "\n").encode())
 
 
 # -- Pictures of a report: held-out photos beside their renderings, and the learning curve --------
 
 
-MAX_PICTURES = 4
-"""Number of held-out photos shown: the worst, the best, and some between."""
-
-STRIP_PX = 1500
-"""Maximum width of a strip of three images."""
-
-ERROR_GAIN = 4.0
-"""Factor applied to the errors: the scale ends at a quarter of full brightness."""
-
+MAX_PICTURES = 4  # number of held-out photos shown: the worst, the best, and some between
+STRIP_PX = 1500  # Maximum width of a strip of three images; a wider one is scaled down.
+ERROR_GAIN = 4.0  # factor applied to the errors: the scale ends at a quarter of full brightness
 GAP_PX = 6
 CAPTION_PX = 24
-MAX_DOTS = 20
-"""Curves with more points are drawn as a line without dots."""
 JPEG_QUALITY = 88
 _PAPER = (32, 32, 34)
 _INK = (232, 232, 232)
@@ -224,13 +126,8 @@ def error_map(
 ) -> np.ndarray:
     """Return the absolute error (mean of the channels, times :data:`ERROR_GAIN`) as heat colours.
 
-    Parameters
-    ----------
-    photo : (h, w, 3) uint8
-    rendering : (h, w, 3)
-        Floats, white is 1; clipped to [0, 1].
-    mask : (h, w) bool, optional
-        Pixels that count; others are black.
+    The photo is (h, w, 3) uint8, the rendering floats whose white is 1, clipped to [0, 1]; pixels
+    outside of the mask (h, w) bool are black.
     """
     error = np.abs(np.clip(rendering, 0.0, 1.0) - photo / 255.0).mean(-1)  # (h, w)
     if mask is not None:
@@ -238,17 +135,10 @@ def error_map(
     return heat_colors(ERROR_GAIN * error)
 
 
-def strip(images: Sequence[tuple[str, np.ndarray]], *, width_px: int = STRIP_PX) -> bytes:
-    """Return images of one size side by side, each under its caption, as JPEG.
-
-    Parameters
-    ----------
-    images : sequence of (caption, (h, w, 3) uint8)
-    width_px : int
-        Maximum width; a wider strip is scaled down.
-    """
+def strip(images: Sequence[tuple[str, np.ndarray]]) -> bytes:
+    """Return (h, w, 3) uint8 images of one size side by side, each under its caption, as JPEG."""
     height, width = images[0][1].shape[:2]
-    room = (width_px - GAP_PX * (len(images) - 1)) // len(images)
+    room = (STRIP_PX - GAP_PX * (len(images) - 1)) // len(images)
     scale = min(1.0, room / width)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     total = size[0] * len(images) + GAP_PX * (len(images) - 1)
@@ -266,34 +156,26 @@ def strip(images: Sequence[tuple[str, np.ndarray]], *, width_px: int = STRIP_PX)
     return stream.getvalue()
 
 
-def worst_to_best(figures: Sequence[float], count: int = MAX_PICTURES) -> list[int]:
+def worst_to_best(figures: Sequence[float]) -> list[int]:
     """Return indices of figures to show: the lowest, the highest, evenly spaced ones between."""
     ranked = sorted(range(len(figures)), key=lambda i: (figures[i], i))
-    return evenly_spaced(ranked, count)
+    return evenly_spaced(ranked, MAX_PICTURES)
 
 
 def write_held_out(
-    gaussians: OrientedGaussians,
-    photos: PhotoSource,
-    views: Sequence[tuple[int, str, float]],
-    folder: Path,
-    *,
-    threads: int,
-    renderer: Renderer | None = None,
-) -> list[dict[str, Any]]:
+    gaussians: OrientedGaussians, photos: PhotoSource, views: Sequence[tuple[int, str, float]],
+    folder: Path, *, threads: int, renderer: Renderer | None = None,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Render held-out views as the trainer does, and write photo, rendering and error.
 
     Parameters
     ----------
-    gaussians : OrientedGaussians
-        Trained.
     photos : PhotoStore
-        The photos used for training; their finest size is shown.
+        Their finest size is shown.
     views : sequence of (index, name, psnr)
         All measured views; the pictures are chosen by :func:`worst_to_best`.
     folder : Path
         Where ``held-out-0.jpg`` and so on are written.
-    threads : int
     renderer : Renderer, optional
         By default that of the processor.
 
@@ -310,13 +192,11 @@ def write_held_out(
         image = renderer.render(raw, photos.camera(index, 1), options).color
         rendering = np.clip(image, 0.0, 1.0)
         photo, mask = photos.photo(index, 1), photos.mask(index, 1)
+        error = f"Error x {ERROR_GAIN:g} (white: {1 / ERROR_GAIN:.0%} or more)"
         columns = [
             ("Photo", photo),
             (f"Gaussians, {psnr:.1f} dB", np.rint(255.0 * rendering).astype(np.uint8)),
-            (
-                f"Error x {ERROR_GAIN:g} (white: {1 / ERROR_GAIN:.0%} or more)",
-                error_map(photo, rendering, mask),
-            ),
+            (error, error_map(photo, rendering, mask)),
         ]
         file = f"held-out-{number}.jpg"
         write_bytes(folder / file, strip(columns))
@@ -327,13 +207,9 @@ def write_held_out(
 def write_learning_curve(training: dict[str, Any], path: Path) -> bool:
     """Plot PSNR and number of Gaussians over the iterations; return ``False`` if there is no curve.
 
-    Parameters
-    ----------
-    training : dict
-        Of a report: ``history`` (a list of ``iteration``, ``psnr`` of the photos trained on, dB,
-        and ``gaussians``), and ``iterations`` and ``held_out_psnr`` if measured.
-    path : Path
-        An SVG file.
+    The training's figures are those of a report: ``history`` (a list of ``iteration``, ``psnr`` of
+    the photos trained on, dB, and ``gaussians``), and ``iterations`` and ``held_out_psnr`` if
+    measured. The file is an SVG.
     """
     quality, count = [], []
     for entry in map(part, items(training.get("history"))):
@@ -344,15 +220,21 @@ def write_learning_curve(training: dict[str, Any], path: Path) -> bool:
             count.append((iteration, gaussians / 1000.0))
     if len(quality) < 2:
         return False
-    dots = len(quality) <= MAX_DOTS
-    curves = [Series("training photos (running mean)", quality, dots=dots)]
+    curves = {"training photos (running mean)": quality}
     end, held_out = measured(training.get("iterations")), measured(training.get("held_out_psnr"))
     if end is not None and held_out is not None:
-        curves.append(Series("held-out photos (mean, at the end)", [(end, held_out)], line=False))
-    growth = [Series("Gaussians", count, dots=dots)]
-    panels = [
-        Panel("Image quality", "iteration", "PSNR (dB)", curves, False, False, False),
-        Panel("Model size", "iteration", "Gaussians (thousands)", growth, False, False, False),
+        curves["held-out photos (mean, at the end)"] = [(end, held_out)]
+    size = f'width="{2 * _WIDTH}" height="{_HEIGHT}"'
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size} viewBox="0 0 {2 * _WIDTH} {_HEIGHT}" '
+        'font-family="sans-serif" font-size="11">'
+    )
+    lines = [
+        head,
+        f'<rect {size} fill="white"/>',
+        *_diagram("Image quality", "PSNR (dB)", curves, 0),
+        *_diagram("Model size", "Gaussians (thousands)", {"Gaussians": count}, _WIDTH),
+        "</svg>",
     ]
-    write_svg(panels, path)
+    write_bytes(path, ("\n".join(lines) + "\n").encode())
     return True

@@ -31,23 +31,12 @@ from .figures import (
 def sizes_in_world(
     vertices: np.ndarray, faces: np.ndarray, world_from_scene: Similarity, texels: int
 ) -> dict[str, Any]:
-    """Return lengths of a mesh in world units, as plain JSON values.
+    """Return lengths of a mesh in world units, as plain JSON values; none without faces.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-        Scene frame.
-    faces : (f, 3) int
-    world_from_scene : Similarity
-    texels : int
-        Number of texels on the surface; with 0, the texel density is left out.
-
-    Returns
-    -------
-    dict
-        ``size`` (of the axis-aligned box of the used vertices), ``diagonal``, ``area``,
-        ``edge_mean``, ``edge_median`` (each edge once for each of its faces),
-        ``texels_per_unit`` and ``texel_size`` (side of a square texel). Empty without faces.
+    Vertices (v, 3) float64 are in the scene frame; without ``texels`` on the surface, their density
+    is left out. The values are ``size`` (of the axis-aligned box of the used vertices),
+    ``diagonal``, ``area``, ``edge_mean``, ``edge_median`` (each edge once for each of its faces),
+    ``texels_per_unit`` and ``texel_size`` (side of a square texel).
     """
     if len(faces) == 0:
         return {}
@@ -108,33 +97,20 @@ def closedness(statistics: dict[str, Any], provenance: dict[str, Any]) -> str:
 def region_lines(name: str, region: dict[str, Any], picture: Picture) -> list[str]:
     """Return the Markdown lines of a region's section, without its heading.
 
-    Parameters
-    ----------
-    name : str
-        Name of the region and of its folder in the result folder.
-    region : dict
-        Its figures; missing ones are reported as not measured.
-    picture : callable
-        See :data:`Picture`.
+    The region's name is that of its folder; missing figures are reported as not measured.
     """
+    rendering = part(region, "mesh_rendering")
     return [
-        region_summary(name, region),
-        "",
+        region_summary(name, region), "",
         *picture(f"{name}/preview.png", "Left: part of a photo. Right: the textured mesh."),
-        "### Mesh",
-        "",
-        *_mesh(region),
-        "",
-        "### Texture",
-        "",
-        *_texture(region),
-        "",
-        "### Textured mesh compared with photos",
-        "",
-        *_rendering(part(region, "mesh_rendering")),
-        "",
-        *_comparisons(name, region, picture),
-    ]
+        "### Mesh", "", *_mesh(region), "",
+        "### Texture", "", *_texture(region), "",
+        "### Textured mesh compared with photos", "", *_rendering(rendering), "",
+        *_comparisons(name, rendering, picture),
+    ]  # fmt: skip
+
+
+_RESIDUALS = {"median": "median", "mean": "mean", "99th percentile": "p99", "largest": "max"}
 
 
 def _mesh(region: dict[str, Any]) -> list[str]:
@@ -158,36 +134,29 @@ def _mesh(region: dict[str, Any]) -> list[str]:
         ("Surface area", number(world.get("area"), "square world units")),
         ("Edge length, mean", number(world.get("edge_mean"), "world units")),
         ("Edge length, median", number(world.get("edge_median"), "world units")),
-        ("Residual, median", _residual(provenance, "median")),
-        ("Residual, mean", _residual(provenance, "mean")),
-        ("Residual, 99th percentile", _residual(provenance, "p99")),
-        ("Residual, largest", _residual(provenance, "max")),
+        *(
+            (f"Residual, {words}", number(provenance.get(f"level_error_{which}"), "of vacancy"))
+            for words, which in _RESIDUALS.items()
+        ),
         *_simplification_rows(provenance),
         ("Time", duration(seconds.get("mesh"))),
         *_estimate_rows(part(region, "estimate")),
     ]
-    lines = table(("mesh", "figure"), rows, "lr")
+    text = (
+        "The residual is |v - 0.5|, where the vacancy v is 0 inside objects and 1 in free "
+        "space; the surface lies at 0.5. It measures how well the mesh follows the Gaussians, "
+        "not how well the Gaussians follow the real object."
+    )
     vertices = measured(statistics.get("vertices"))
     on_surface = measured(provenance.get("vertices_on_surface"))
-    lines += [
-        "",
-        (
-            "The residual is |v - 0.5|, where the vacancy v is 0 inside objects and 1 in free "
-            "space; the surface lies at 0.5. It measures how well the mesh follows the Gaussians, "
-            "not how well the Gaussians follow the real object."
-        ),
-    ]
     if vertices and on_surface is not None:
-        capped = measured(provenance.get("vertices_on_region_boundary")) or 0.0
-        lines[-1] += f" It is measured at the {percent(on_surface / vertices)} of the vertices"
-        lines[-1] += " that should lie on the surface."
-        if capped:
+        text += f" It is measured at the {percent(on_surface / vertices)} of the vertices"
+        text += " that should lie on the surface."
+        if capped := measured(provenance.get("vertices_on_region_boundary")):
             does = "end" if provenance.get("boundary") == "open" else "close"
-            lines[-1] += (
-                f" {percent(capped / vertices)} of the vertices {does} the mesh at the boundary of "
-                "the region."
-            )
-    return lines
+            text += f" {percent(capped / vertices)} of the vertices {does} the mesh at the boundary"
+            text += " of the region."
+    return [*table(("mesh", "figure"), rows, "lr"), "", text]
 
 
 def _check_text(check: dict[str, Any]) -> str:
@@ -264,12 +233,9 @@ def _estimate_rows(estimate: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _residual(provenance: dict[str, Any], which: str) -> str:
-    return number(provenance.get(f"level_error_{which}"), "of vacancy")
-
-
 def _texture(region: dict[str, Any]) -> list[str]:
     texture, world = part(region, "texture"), part(region, "world")
+    blended = texture.get("views_per_seen_texel")
     side = number(texture.get("size_px"))
     if side != NOT_MEASURED:
         side = f"{side} x {side} texels"
@@ -284,14 +250,8 @@ def _texture(region: dict[str, Any]) -> list[str]:
         ("One texel", number(world.get("texel_size"), "world units")),
         ("Coverage: seen by photos", percent(texture.get("coverage"))),
         ("Surface area seen by photos", percent(texture.get("area_seen_share"))),
-        (
-            "Area of faces smaller than a texel",
-            percent(texture.get("area_without_texel_share")),
-        ),
-        (
-            "Photos blended per seen texel",
-            number(texture.get("views_per_seen_texel"), "photos", digits=1),
-        ),
+        ("Area of faces smaller than a texel", percent(texture.get("area_without_texel_share"))),
+        ("Photos blended per seen texel", number(blended, "photos", digits=1)),
         ("Charts", plural(texture.get("charts"), "chart")),
         ("Share of the image covered by charts", percent(texture.get("utilisation"))),
         ("Stretch, mean over the surface (1 is uniform)", number(texture.get("stretch_mean"))),
@@ -304,8 +264,8 @@ def _texture(region: dict[str, Any]) -> list[str]:
 def _rendering(rendering: dict[str, Any]) -> list[str]:
     views = [part(view) for view in items(rendering.get("views"))]
     if measured(rendering.get("psnr")) is None and not views:
-        lines = [f"How well the textured mesh reproduces photos was {NOT_MEASURED}."]
-        return lines + note_lines(rendering)
+        unknown = f"How well the textured mesh reproduces photos was {NOT_MEASURED}."
+        return [unknown, *note_lines(rendering)]
     perceptual = any(measured(view.get("lpips")) is not None for view in views)
     counted = any(measured(view.get("uncovered")) is not None for view in (*views, rendering))
     where = {
@@ -323,12 +283,9 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
     if counted:
         where += " The last PSNR counts every pixel, black where no face covers it."
     intro = ("The textured mesh, unlit, rendered from the cameras of the photos.", where, trained)
-    lines = [" ".join(filter(None, intro)), ""]
-    lines += table(
-        header + ["LPIPS (0 is identical)"] * perceptual,
-        rows,
-        "lrrr" + "rr" * counted + "r" * perceptual,
-    )
+    header += ["LPIPS (0 is identical)"] * perceptual
+    align = "lrrr" + "rr" * counted + "r" * perceptual
+    lines = [" ".join(filter(None, intro)), "", *table(header, rows, align)]
     left_out = measured(rendering.get("left_out"))
     if left_out:
         lines += ["", f"{plural(int(left_out), 'photo')} could not be compared: no valid pixel."]
@@ -337,12 +294,8 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
 
 def _view_row(name: str, view: dict[str, Any], counted: bool, perceptual: bool) -> list[str]:
     covered = "" if "views" in view and "covered" not in view else percent(view.get("covered"))
-    row = [
-        name,
-        number(view.get("psnr"), "dB", digits=2),
-        number(view.get("ssim"), digits=4),
-        covered,
-    ]
+    psnr, ssim = number(view.get("psnr"), "dB", digits=2), number(view.get("ssim"), digits=4)
+    row = [name, psnr, ssim, covered]
     if counted:
         row += [percent(view.get("uncovered")), number(view.get("whole_psnr"), "dB", digits=2)]
     return [*row, number(view.get("lpips"), digits=4)] if perceptual else row
@@ -362,13 +315,10 @@ def note_lines(figures: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _comparisons(name: str, region: dict[str, Any], picture: Picture) -> list[str]:
-    rendering = part(region, "mesh_rendering")
+def _comparisons(name: str, rendering: dict[str, Any], picture: Picture) -> list[str]:
     shown = {view.get("picture"): view for view in map(part, items(rendering.get("views")))}
     lines = []
-    for file in items(rendering.get("pictures")):
-        if not isinstance(file, str):
-            continue
+    for file in (f for f in items(rendering.get("pictures")) if isinstance(f, str)):
         caption = "Left: the photo. Right: the textured mesh."
         if file in shown:
             psnr = number(shown[file].get("psnr"), "dB", digits=1)

@@ -60,43 +60,27 @@ _DECIDED_BY = {"auto": "the photos", "on": "you (on)", "off": "you (off)"}
 def selection_lines(training: dict[str, Any]) -> list[str]:
     """Return the Markdown lines of the section with its heading; none if nothing was selected.
 
-    Parameters
-    ----------
-    training : dict
-        The report's training figures; its entry ``decisions`` holds what
-        :meth:`~.model_selection.ModelSelection.to_json` wrote. Unknown entries of newer versions
-        are shown unchanged.
+    The entry ``decisions`` of the training's figures holds what
+    :meth:`~.model_selection.ModelSelection.to_json` wrote. Unknown entries of newer versions are
+    shown unchanged.
     """
-    decisions = [part(entry) for entry in items(training.get("decisions"))]
-    decisions = [entry for entry in decisions if entry.get("name")]
-    if not decisions:
-        return []
-    rows = [
-        (_title(entry), escaped_or(entry.get("chosen")), _decided_by(entry)) for entry in decisions
-    ]
-    lines = [
-        "## Model selection",
-        "",
-        (
-            "A larger model than the scene needs costs time and can lower the quality. Each part "
-            "is therefore chosen from the photos, unless you set it."
-        ),
-        "",
-        *table(("part", "used", "chosen by"), rows, "lll"),
-        "",
-    ]
-    for entry in decisions:
-        lines += [f"- **{_title(entry)}: {escaped_or(entry.get('chosen'))}.** {_evidence(entry)}"]
+    rows, lines = [], []
+    for entry in map(part, items(training.get("decisions"))):
+        if not entry.get("name"):
+            continue
+        title = _TITLES.get(str(entry["name"]), escaped(entry["name"]))
+        chosen, setting = escaped_or(entry.get("chosen")), entry.get("setting")
+        rows.append((title, chosen, _DECIDED_BY.get(str(setting), escaped_or(setting))))
+        lines += [f"- **{title}: {chosen}.** {_evidence(entry)}"]
         lines += [f"    - *To change this:* {_override(entry)}."]
-    return lines
-
-
-def _title(entry: dict[str, Any]) -> str:
-    return _TITLES.get(str(entry["name"]), escaped(entry["name"]))
-
-
-def _decided_by(entry: dict[str, Any]) -> str:
-    return _DECIDED_BY.get(str(entry.get("setting")), escaped_or(entry.get("setting")))
+    if not rows:
+        return []
+    text = (
+        "A larger model than the scene needs costs time and can lower the quality. Each part "
+        "is therefore chosen from the photos, unless you set it."
+    )
+    chosen_by = table(("part", "used", "chosen by"), rows, "lll")
+    return ["## Model selection", "", text, "", *chosen_by, "", *lines]
 
 
 def _evidence(entry: dict[str, Any]) -> str:
@@ -122,29 +106,21 @@ def blocks_lines(training: dict[str, Any]) -> list[str]:
     blocks = [part(block) for block in items(training.get("blocks"))]
     if not blocks:
         return []
+    counts = ("photos", "gaussians", "still", "iterations")
     rows = [
         (
-            str(index),
-            number(block.get("photos")),
-            number(block.get("gaussians")),
-            number(block.get("still")),
-            number(block.get("iterations")),
-            duration(block.get("seconds")),
-            bytes_text(block.get("peak_memory_bytes")),
+            str(index), *(number(block.get(name)) for name in counts),
+            duration(block.get("seconds")), bytes_text(block.get("peak_memory_bytes")),
         )
         for index, block in enumerate(blocks)
-    ]
+    ]  # fmt: skip
     header = ("block", "photos", "Gaussians", "around it", "iterations", "time", "peak memory")
-    return [
-        "",
-        (
-            f"Trained in {len(blocks)} blocks, after a coarse training of the whole scene "
-            f"({duration(training.get('seconds_coarse'))}), and joined. Photos and Gaussians of "
-            "the margins count in several blocks; time and memory are those of its process so far."
-        ),
-        "",
-        *table(header, rows, "rrrrrrr"),
-    ]
+    text = (
+        f"Trained in {len(blocks)} blocks, after a coarse training of the whole scene "
+        f"({duration(training.get('seconds_coarse'))}), and joined. Photos and Gaussians of "
+        "the margins count in several blocks; time and memory are those of its process so far."
+    )
+    return ["", text, "", *table(header, rows, "rrrrrrr")]
 
 
 # -- Report section: estimated and actual time and memory of the training -------------------------
@@ -158,14 +134,12 @@ def estimate_lines(training: dict[str, Any]) -> list[str]:
     if low is None or high is None or took is None:
         return []
     where = "within it" if low <= took <= high else ("below it" if took < low else "above it")
-    return [
-        "",
-        (
-            f"Estimated before the start: {duration(low)} to {duration(high)}, "
-            f"{bytes_text(expected.get('memory_bytes'))} of memory. It took {duration(took)}, "
-            f"{where}.{_photos(part(expected, 'photos'))}"
-        ),
-    ]
+    text = (
+        f"Estimated before the start: {duration(low)} to {duration(high)}, "
+        f"{bytes_text(expected.get('memory_bytes'))} of memory. It took {duration(took)}, "
+        f"{where}.{_photos(part(expected, 'photos'))}"
+    )
+    return ["", text]
 
 
 def _photos(photos: dict[str, Any]) -> str:
@@ -233,58 +207,30 @@ _FACTS = {
 
 
 def report_markdown(report: dict[str, Any], result: Path, earlier: Path | None = None) -> str:
-    """Return the text of ``report.md``.
+    """Return the text of ``report.md``, of a report of any version.
 
-    Parameters
-    ----------
-    report : dict
-        Content of ``report.json`` of any version; missing entries are reported as not measured.
-    result : Path
-        The result folder; a picture is linked only if its file exists.
-    earlier : Path or None
-        A result folder into which ``result`` will be merged: entries that ``result`` lacks are
-        looked up there.
+    Missing entries are reported as not measured; a picture of the result folder is linked only if
+    its file exists. What the folder lacks is looked up in ``earlier``, the result folder into
+    which it will be merged.
     """
-    picture = _pictures_of(result, earlier)
+    picture, training = _pictures_of(result, earlier), part(report, "training")
     lines = [
-        f"# Report: {escaped_or(report.get('source'), 'job')}",
-        "",
+        f"# Report: {escaped_or(report.get('source'), 'job')}", "",
         *picture("preview.png", "Left: part of a photo. Right: the textured mesh."),
-        *_summary(report),
-        "",
-        "## Time and memory",
-        "",
-        *_time(report),
-        "",
-        "## Photos and cameras",
-        "",
-        *_cameras(part(report, "cameras")),
-        "",
-        "## Training",
-        "",
-        *_training(part(report, "training"), picture),
-        "",
-        *selection_lines(part(report, "training")),
-    ]
+        *_summary(report), "",
+        "## Time and memory", "", *_time(report), "",
+        "## Photos and cameras", "", *_cameras(part(report, "cameras")), "",
+        "## Training", "", *_training(training, picture), "",
+        *selection_lines(training),
+    ]  # fmt: skip
     for name, region in part(report, "regions").items():
         lines += ["", f"## Region {escaped(name)}", "", *region_lines(name, region, picture)]
     lines += ["", "## Warnings", "", *warning_lines(report)]
     lines += ["", "## Machine, versions, seed", "", *_machine(report)]
-    lines += [
-        "",
-        "<details>",
-        "<summary>All figures</summary>",
-        "",
-        *table(("figure", "value", "unit"), figure_rows(report), "lrl"),
-        "",
-        "</details>",
-    ]
-    return "\n".join(_collapse_blank_lines(lines)) + "\n"
-
-
-def _collapse_blank_lines(lines: list[str]) -> list[str]:
-    """Collapse runs of empty lines into one."""
-    return [t for i, t in enumerate(lines) if t or i == 0 or lines[i - 1]]
+    figures = table(("figure", "value", "unit"), figure_rows(report), "lrl")
+    lines += ["", "<details>", "<summary>All figures</summary>", "", *figures, "", "</details>"]
+    # Runs of empty lines become one.
+    return "\n".join(t for i, t in enumerate(lines) if t or i == 0 or lines[i - 1]) + "\n"
 
 
 def _pictures_of(result: Path, earlier: Path | None) -> Picture:
@@ -312,12 +258,10 @@ def _summary(report: dict[str, Any]) -> list[str]:
     lines.append(f"- **Accuracy.** {_accuracy_sentence(training)}{_mesh_accuracy_sentence(report)}")
     lines.append(f"- **Texture coverage.** {_coverage_sentence(report)}")
     warnings = collect_warnings(report)
-    if warnings:
-        lines.append(f"- **Warnings** ({plural(len(warnings), 'warning')}):")
-        lines += [f"    - {escaped(w.text)}" for w in warnings]
-    else:
-        lines.append("- **Warnings.** No stage reported a warning.")
-    return lines
+    if not warnings:
+        return [*lines, "- **Warnings.** No stage reported a warning."]
+    lines.append(f"- **Warnings** ({plural(len(warnings), 'warning')}):")
+    return lines + [f"    - {escaped(w.text)}" for w in warnings]
 
 
 def _duration_sentence(report: dict[str, Any]) -> str:
@@ -367,7 +311,11 @@ def _mesh_accuracy_sentence(report: dict[str, Any]) -> str:
                 # The Gaussians are measured over whole photos: the two values are not comparable.
                 covered = percent(rendering.get("covered"))
                 views += f", over the pixels the mesh covers: {covered} of the photo"
-            views += _uncovered_clause(rendering)
+            views += _left_out(
+                rendering,
+                "; no face covers {share} of the photo, and with these pixels counted as black it "
+                "is {whole:.1f} dB",
+            )
             note = rendering.get("note")
             if isinstance(note, str) and note.strip():
                 views += f"; {escaped(note.strip().rstrip('.'))}"
@@ -375,15 +323,15 @@ def _mesh_accuracy_sentence(report: dict[str, Any]) -> str:
     return text
 
 
-def _uncovered_clause(rendering: dict[str, Any]) -> str:
-    """Return what the PSNR leaves out; nothing for reports of versions that did not measure it."""
-    uncovered, whole = measured(rendering.get("uncovered")), measured(rendering.get("whole_psnr"))
-    if uncovered is None or whole is None:
+def _left_out(rendering: dict[str, Any], text: str) -> str:
+    """Return what the PSNR leaves out; nothing for reports of versions that did not measure it.
+
+    ``text`` has the places ``{share}`` and ``{whole}``, the PSNR with uncovered pixels black.
+    """
+    share, whole = measured(rendering.get("uncovered")), measured(rendering.get("whole_psnr"))
+    if share is None or whole is None:
         return ""
-    return (
-        f"; no face covers {percent(uncovered)} of the photo, and with these pixels counted as "
-        f"black it is {whole:.1f} dB"
-    )
+    return text.format(share=percent(share), whole=whole)
 
 
 def _coverage_sentence(report: dict[str, Any]) -> str:
@@ -480,21 +428,28 @@ def _cameras(cameras: dict[str, Any]) -> list[str]:
         rows.append((name, text))
     units = part(facts, "georeference")
     rows += _unit_rows(units)
-    lines = table(("photos and cameras", "figure"), rows, "lr")
     if units.get("applied") is True:
-        lines += ["", "One world unit is one metre."]
+        text = "One world unit is one metre."
     elif facts.get("kind") in ("photos", "video"):
-        lines += [
-            "",
-            (
-                "The cameras were solved from the photos alone, which do not determine the "
-                "scale: one world unit is an arbitrary length. To measure in metres, scale the "
-                "mesh by a known length."
-            ),
-        ]
+        text = (
+            "The cameras were solved from the photos alone, which do not determine the "
+            "scale: one world unit is an arbitrary length. To measure in metres, scale the "
+            "mesh by a known length."
+        )
     else:
-        lines += ["", "One world unit is the unit of the given camera poses."]
-    return lines
+        text = "One world unit is the unit of the given camera poses."
+    return [*table(("photos and cameras", "figure"), rows, "lr"), "", text]
+
+
+_HELD_OUT = (
+    "Held-out photos are not used for training; they measure the accuracy of new views. "
+    "A PSNR higher by 6 dB means half the error."
+)
+_PICTURES = (
+    "Left: the photo. Middle: the Gaussians rendered from the same camera. Right: the "
+    "error; black is none, violet about 6 %, red 12 %, orange 19 %, and white 25 % of "
+    "full brightness or more. The worst photo comes first."
+)
 
 
 def _training(training: dict[str, Any], picture: Picture) -> list[str]:
@@ -510,21 +465,14 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
     if not held_out:
         why = "No photo was held out: " if training.get("held_out") == [] else ""
         return [*lines, f"{why}PSNR and SSIM of new views were {NOT_MEASURED}."]
-    lines += [
-        (
-            "Held-out photos are not used for training; they measure the accuracy of new views. "
-            "A PSNR higher by 6 dB means half the error."
-        ),
-        "",
-    ]
+    lines += [_HELD_OUT, ""]
     perceptual = any(measured(figure.get("lpips")) is not None for figure in held_out)
     rows = [_held_out_row(escaped_or(f.get("name")), f, perceptual) for f in held_out]
     mean = {key: training.get(f"held_out_{key}") for key in ("psnr", "ssim", "lpips")}
     rows.append(_held_out_row("**mean**", mean, perceptual))
     header = ["held-out photo", "PSNR", "typical error", "SSIM (1 is identical)"]
-    lines += table(
-        header + ["LPIPS (0 is identical)"] * perceptual, rows, "lrrr" + "r" * perceptual
-    )
+    header += ["LPIPS (0 is identical)"] * perceptual
+    lines += table(header, rows, "lrrr" + "r" * perceptual)
     if not perceptual:
         unknown = ["", f"LPIPS (perceptual distance) was {NOT_MEASURED}."]
         lines += note_lines({"lpips_note": training.get("lpips_note")}) or unknown
@@ -535,16 +483,7 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
         shown += picture(f"{REPORT_FOLDER}/{entry.get('file')}", caption)
     if not shown:
         return [*lines, "", "There are no pictures of the held-out photos."]
-    lines += [
-        "",
-        (
-            "Left: the photo. Middle: the Gaussians rendered from the same camera. Right: the "
-            "error; black is none, violet about 6 %, red 12 %, orange 19 %, and white 25 % of "
-            "full brightness or more. The worst photo comes first."
-        ),
-        "",
-    ]
-    return lines + shown
+    return [*lines, "", _PICTURES, "", *shown]
 
 
 def _held_out_row(name: str, figure: dict[str, Any], perceptual: bool) -> list[str]:
@@ -592,17 +531,12 @@ def _device(report: dict[str, Any]) -> list[str]:
 
 
 def write_report(
-    result: Path,
-    summary: dict[str, Any],
-    regions: dict[str, Any],
-    earlier: Path | None = None,
+    result: Path, summary: dict[str, Any], regions: dict[str, Any], earlier: Path | None = None
 ) -> None:
     """Write both files into the result folder; the pictures must already be there.
 
     Parameters
     ----------
-    result : Path
-        The result folder.
     summary : dict
         Figures of the whole job: machine, stages, cameras, training.
     regions : dict
@@ -625,30 +559,21 @@ def headline(report: dict[str, Any]) -> list[str]:
     gaussians = number(training.get("gaussians"), "Gaussians")
     lines = [f"time: {duration(report.get('wall_seconds'))}, {gaussians}"]
     psnr, held_out = measured(training.get("held_out_psnr")), items(training.get("held_out"))
-    if psnr is not None and held_out:
-        count = plural(len(held_out), "photo")
-        lines.append(f"held-out photos: PSNR {psnr:.2f} dB ({count})")
-    else:
-        lines.append("held-out photos: not measured")
+    known = psnr is not None and bool(held_out)
+    text = f"PSNR {psnr:.2f} dB ({plural(len(held_out), 'photo')})" if known else NOT_MEASURED
+    lines.append(f"held-out photos: {text}")
     for name, region in part(report, "regions").items():
         statistics = part(region, "statistics")
         line = f"region {name}: {number(statistics.get('faces'), 'faces')}, "
         line += f"{closedness(statistics, part(region, 'provenance'))}, "
         line += f"{percent(part(region, 'texture').get('coverage'))} of the texture seen by photos"
-        rendered = measured(part(region, "mesh_rendering").get("psnr"))
+        rendering = part(region, "mesh_rendering")
+        rendered = measured(rendering.get("psnr"))
         if rendered is not None:
             line += f", textured mesh PSNR {rendered:.2f} dB"
-            line += _uncovered(part(region, "mesh_rendering"))
+            where = " where it covers the photos" if rendering.get("pixels") == "covered" else ""
+            line += _left_out(
+                rendering, where + " ({share} of them uncovered; {whole:.2f} dB with these black)"
+            )
         lines.append(line)
-    warnings = collect_warnings(report)
-    lines += [f"warning ({warning.stage}): {warning.text}" for warning in warnings]
-    return lines
-
-
-def _uncovered(rendering: dict[str, Any]) -> str:
-    """Return over which pixels the PSNR is, and what it leaves out, where that was measured."""
-    share, whole = measured(rendering.get("uncovered")), measured(rendering.get("whole_psnr"))
-    if share is None or whole is None:
-        return ""
-    where = " where it covers the photos" if rendering.get("pixels") == "covered" else ""
-    return f"{where} ({percent(share)} of them uncovered; {whole:.2f} dB with these black)"
+    return lines + [f"warning ({one.stage}): {one.text}" for one in collect_warnings(report)]

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import UsageError
-from ..field.vacancy import VacancyField
-from ..gaussians.model import OrientedGaussians
-from ..mesh.depth_buffer import depth_buffer
-from ..parallel import default_threads
-from ..render.render import render
-from ..render.types import RenderOptions
-from ..scene.camera import Camera
+from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
+from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.render.render import render
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.scene.camera import Camera
 
 PROBE_REACH = 2.0
 """Vacancy is sampled along each normal over this many largest thresholds to both sides."""
