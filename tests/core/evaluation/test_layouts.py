@@ -431,10 +431,19 @@ def volume(axis: str) -> PolygonVolume:
     return PolygonVolume(corners, axis, -1.0, 2.0)
 
 
+def stored(axis: str) -> dict:
+    crop = volume(axis)
+    return {
+        "class_name": "SelectionPolygonVolume", "version_major": 1, "version_minor": 0,
+        "axis_max": crop.axis_max, "axis_min": crop.axis_min, "orthogonal_axis": axis,
+        "bounding_polygon": crop.polygon.tolist(),
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize("axis", "XYZ")
 def test_a_concave_polygon_along_every_axis(axis: str, tmp_path: Path) -> None:
     path = tmp_path / "crop.json"
-    path.write_text(json.dumps(volume(axis).to_json()))
+    path.write_text(json.dumps(stored(axis)))
     crop = read_polygon_volume(path)
     u, v, w = PLANES[axis]
     points = np.random.default_rng(0).uniform(-2, 4, (20_000, 3))
@@ -469,7 +478,7 @@ def test_borders_belong_to_one_side() -> None:
 )
 def test_bad_files_are_refused_by_place(change: dict, place: str, tmp_path: Path) -> None:
     path = tmp_path / "crop.json"
-    path.write_text(json.dumps({**volume("Z").to_json(), **change}))
+    path.write_text(json.dumps({**stored("Z"), **change}))
     with pytest.raises(ParseError, match=place):
         read_polygon_volume(path)
 

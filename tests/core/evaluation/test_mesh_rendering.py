@@ -92,9 +92,9 @@ def test_a_ball_is_rendered_as_an_exact_ray_caster_sees_it(masked: bool) -> None
     masks = [inside_of_ball(camera) for camera in cameras]
     found = render_views(ball, cameras, photos, masks=masks if masked else None)
     assert len(found.views) == 4
-    assert found.psnr > 54.0
+    assert found.mean("psnr") > 54.0
     assert min(view.scores.psnr for view in found.views) > 52.0
-    assert found.ssim > 0.999
+    assert found.mean("ssim") > 0.999
     for view, mask in zip(found.views, masks, strict=True):
         share = 1.0 if masked else mask.mean()
         assert view.covered == pytest.approx(share, rel=0.01)
@@ -109,9 +109,9 @@ def test_a_shifted_mesh_is_worse_the_farther_it_is() -> None:
             render_views(moved(ball, (0, 0, z)), cameras, photos, masks=given)
             for z in (0.0, 0.02, 0.1)
         ]
-        assert figures[0].psnr > figures[1].psnr + 8.0
-        assert figures[1].psnr > figures[2].psnr + 8.0
-        assert figures[0].ssim > figures[1].ssim > figures[2].ssim
+        assert figures[0].mean("psnr") > figures[1].mean("psnr") + 8.0
+        assert figures[1].mean("psnr") > figures[2].mean("psnr") + 8.0
+        assert figures[0].mean("ssim") > figures[1].mean("ssim") > figures[2].mean("ssim")
 
 
 def test_a_hole_counts_under_a_mask_and_not_over_covered_pixels() -> None:
@@ -119,16 +119,20 @@ def test_a_hole_counts_under_a_mask_and_not_over_covered_pixels() -> None:
     mask = np.zeros((90, 120), bool)
     mask[5:85, 20:100] = True
     whole = render_views(textured, cameras, photos, masks=[mask])
-    assert (whole.psnr, whole.ssim, whole.covered) == (PSNR_CAP_DB, 1.0, 1.0)
+    assert (whole.mean("psnr"), whole.mean("ssim"), whole.mean("covered")) == (
+        PSNR_CAP_DB,
+        1.0,
+        1.0,
+    )
     half = half_of(textured)
     covered = render_views(half, cameras, photos)
-    assert (covered.psnr, covered.pixels) == (PSNR_CAP_DB, "covered")
-    assert covered.covered == pytest.approx(80 * 40 / (120 * 90))
+    assert (covered.mean("psnr"), covered.pixels) == (PSNR_CAP_DB, "covered")
+    assert covered.mean("covered") == pytest.approx(80 * 40 / (120 * 90))
     found = render_views(half, cameras, photos, masks=[mask])
     squares = (np.array(FLAT) - BACKGROUND) ** 2 / 255.0**2
-    assert found.psnr == pytest.approx(-10 * math.log10(0.5 * squares.mean()), abs=1e-9)
-    assert found.ssim < 0.9
-    assert (found.covered, found.pixels) == (pytest.approx(0.5), "mask")
+    assert found.mean("psnr") == pytest.approx(-10 * math.log10(0.5 * squares.mean()), abs=1e-9)
+    assert found.mean("ssim") < 0.9
+    assert (found.mean("covered"), found.pixels) == (pytest.approx(0.5), "mask")
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -138,14 +142,17 @@ def test_uncovered_pixels_are_counted_and_black_in_a_second_figure(masked: bool)
     masks = [np.ones((90, 120), bool)] if masked else None
     found = render_views(half_of(textured), cameras, photos, masks=masks)
     share = 1 - 80 * 40 / (90 * 120)
-    assert found.uncovered == pytest.approx(share)
-    assert found.covered == pytest.approx(1 - share)
+    assert found.mean("uncovered") == pytest.approx(share)
+    assert found.mean("covered") == pytest.approx(1 - share)
     error = (photos[0] / 255.0) ** 2
     error[5:85, 20:60] = 0.0
-    assert found.whole_psnr == pytest.approx(-10 * math.log10(error.mean()), abs=1e-4)
+    assert found.mean("whole_psnr") == pytest.approx(-10 * math.log10(error.mean()), abs=1e-4)
     values = found.to_json()
-    assert (values["uncovered"], values["whole_psnr"]) == (found.uncovered, found.whole_psnr)
-    assert values["views"][0]["uncovered"] == found.uncovered
+    assert (values["uncovered"], values["whole_psnr"]) == (
+        found.mean("uncovered"),
+        found.mean("whole_psnr"),
+    )
+    assert values["views"][0]["uncovered"] == found.mean("uncovered")
 
 
 def test_pixels_that_may_not_count_do_not() -> None:
@@ -158,10 +165,10 @@ def test_pixels_that_may_not_count_do_not() -> None:
     mask[5:85, 20:100] = True
     for masks, share in ((None, 80 * 30 / (90 * 50)), ([mask], 1.0)):
         found = render_views(textured, cameras, [spoilt], masks=masks, counted=[counted])
-        assert found.psnr == PSNR_CAP_DB
-        assert found.covered == pytest.approx(share)
-        assert render_views(textured, cameras, [spoilt], masks=masks).psnr < 20.0
-    assert render_views(textured, cameras, photos, counted=[None]).psnr == PSNR_CAP_DB
+        assert found.mean("psnr") == PSNR_CAP_DB
+        assert found.mean("covered") == pytest.approx(share)
+        assert render_views(textured, cameras, [spoilt], masks=masks).mean("psnr") < 20.0
+    assert render_views(textured, cameras, photos, counted=[None]).mean("psnr") == PSNR_CAP_DB
 
 
 def test_json_is_finite_and_means_are_over_the_photos() -> None:
@@ -195,7 +202,7 @@ def test_views_without_a_pixel_to_judge_are_left_out_and_counted() -> None:
     assert np.array_equal(image, TexturedRenderer(textured).render(cameras[0]).image)
     # Under a mask, a mesh out of sight is as wrong as can be, not left out.
     mask = np.ones((90, 120), bool)
-    assert render_views(textured, [away], photos, masks=[mask]).covered == 0.0
+    assert render_views(textured, [away], photos, masks=[mask]).mean("covered") == 0.0
     nothing = render_views(textured, cameras, photos, masks=[np.zeros((90, 120), bool)])
     values = nothing.to_json()
     assert (values["left_out"], values["views"]) == (1, [])
@@ -218,7 +225,7 @@ def test_lpips_is_measured_where_it_is_given() -> None:
     assert "lpips_note" not in values
     small = cameras[0].resized(16, 12)
     tiny = render_views(textured, [small], [np.zeros((12, 16, 3), np.uint8)], lpips=metric)
-    assert tiny.lpips is None
+    assert tiny.mean("lpips") is None
     assert "too small" in tiny.to_json()["lpips_note"]
 
 

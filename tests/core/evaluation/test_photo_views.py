@@ -172,7 +172,7 @@ def test_the_view_that_shows_the_front_large_and_whole_is_chosen() -> None:
 def test_the_file_holds_photo_and_mesh_side_by_side(tmp_path: Path) -> None:
     photos = photograph(CAMERAS, [(wall_hit, wall_color)])
     path = tmp_path / "preview.png"
-    write_preview(gradient_wall(), scene_of(photos), photos, path, view=0)
+    write_preview(gradient_wall(), scene_of(photos), photos, path)
     picture = np.asarray(Image.open(path)).astype(int)
     width = (picture.shape[1] - GAP_PX) // 2
     left, right = picture[:, :width], picture[:, width + GAP_PX :]

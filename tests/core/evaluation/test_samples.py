@@ -233,36 +233,28 @@ def test_distances_are_exactly_the_same_at_huge_coordinates() -> None:
 def test_thinning_takes_the_mean_of_each_cell() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (500, 3))
-    normals = rng.normal(size=(500, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     voxel = 0.4
     cells: dict[tuple[int, ...], list[int]] = {}
     for row, point in enumerate(points):
         cell = np.floor((point - points.min(0) + voxel / 2) / voxel).astype(int)
         cells.setdefault(tuple(cell.tolist()), []).append(row)
     expected = np.array([points[rows].mean(0) for _, rows in sorted(cells.items())])
-    turned = np.array([normals[rows].mean(0) for _, rows in sorted(cells.items())])
-    thin = voxel_downsample(SurfaceSamples(points, normals), voxel)
-    assert np.allclose(thin.points, expected, atol=1e-14)
-    assert np.allclose(
-        thin.normals, turned / np.linalg.norm(turned, axis=1, keepdims=True), atol=1e-12
-    )
-    order = rng.permutation(500)
-    again = voxel_downsample(SurfaceSamples(points[order], normals[order]), voxel)
-    assert np.allclose(again.points, thin.points, atol=1e-14)
-    far = voxel_downsample(SurfaceSamples(points + OFFSET, normals), voxel)
-    assert len(far.points) == len(thin.points)
-    assert np.abs(far.points - OFFSET - thin.points).max() < 2e-9
+    thin = voxel_downsample(points, voxel)
+    assert np.allclose(thin, expected, atol=1e-14)
+    assert np.allclose(voxel_downsample(points[rng.permutation(500)], voxel), thin, atol=1e-14)
+    far = voxel_downsample(points + OFFSET, voxel)
+    assert len(far) == len(thin)
+    assert np.abs(far - OFFSET - thin).max() < 2e-9
 
 
 def test_the_chosen_sample_is_the_nearest_to_the_mean_of_its_cell() -> None:
     rng = np.random.default_rng(2)
     points = np.repeat(rng.uniform(-1, 1, (300, 3)), 2, 0)  # each twice: ties
     samples = SurfaceSamples(points, np.arange(1800.0).reshape(600, 3))
-    means, chosen = voxel_downsample(samples, 0.5), choose_per_cell(samples, 0.5)
+    means, chosen = voxel_downsample(points, 0.5), choose_per_cell(samples, 0.5)
     assert len(chosen) == len(means) < 200
     cell = np.floor((points - points.min(0)) / 0.5 + 0.5)
-    for mean, point, normal in zip(means.points, chosen.points, chosen.normals, strict=True):
+    for mean, point, normal in zip(means, chosen.points, chosen.normals, strict=True):
         row = int(normal[0]) // 3
         assert (points[row] == point).all()
         assert row % 2 == 0
@@ -273,13 +265,9 @@ def test_the_chosen_sample_is_the_nearest_to_the_mean_of_its_cell() -> None:
 
 
 def test_thinning_at_the_ends_of_its_range() -> None:
-    nothing = SurfaceSamples.empty()
-    assert len(voxel_downsample(nothing, 1.0)) == 0
-    opposite = SurfaceSamples(np.zeros((2, 3)), np.array([[0, 0, 1.0], [0, 0, -1.0]]))
-    thin = voxel_downsample(opposite, 1.0)
-    assert thin.points.tolist() == [[0, 0, 0]]
-    assert thin.normals.tolist() == [[0, 0, 0]]
-    apart = SurfaceSamples(np.array([[0.0, 0, 0], [1, 1, 1]]), np.zeros((2, 3)))
+    assert len(voxel_downsample(np.zeros((0, 3)), 1.0)) == 0
+    assert voxel_downsample(np.zeros((2, 3)), 1.0).tolist() == [[0, 0, 0]]
+    apart = np.array([[0.0, 0, 0], [1, 1, 1]])
     assert len(voxel_downsample(apart, 1e-3)) == 2
     for voxel in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(UsageError):

@@ -7,6 +7,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,6 @@ from gaussian_wrapping_addon.core.errors import DatasetError, MeshingError, Pars
 from gaussian_wrapping_addon.core.evaluation import surface_scores
 from gaussian_wrapping_addon.core.evaluation.surface_scores import (
     PROTOCOLS,
-    RegionCrop,
     SurfaceSamples,
     SurfaceScore,
     Truth,
@@ -199,12 +199,18 @@ def test_a_scan_of_many_pixels_takes_larger_steps(monkeypatch: pytest.MonkeyPatc
     mesh, cameras = ball(3), CAMERAS[:4]
     truth = truth_of(mesh, 2000)
     rays = sum(camera.width * camera.height for camera in cameras)
-    monkeypatch.setattr(surface_scores, "SCAN_RAYS", rays / 4)
-    automatic, coarse, fine = (
-        score_protocols(*mesh, truth, cameras, [0.01], protocols=["scan"], **options)["scan"]
-        for options in ({}, {"step_px": 2.0}, {"step_px": 1.0})
-    )
-    assert automatic == coarse != fine
+    steps: list[float] = []
+    scan = surface_scores.scan_virtually
+
+    def scanned(*args: Any, step_px: float, **options: Any) -> SurfaceSamples:
+        steps.append(step_px)
+        return scan(*args, step_px=step_px, **options)
+
+    monkeypatch.setattr(surface_scores, "scan_virtually", scanned)
+    for limit in (rays, rays / 4):
+        monkeypatch.setattr(surface_scores, "SCAN_RAYS", limit)
+        score_protocols(*mesh, truth, cameras, [0.01], protocols=["scan"])
+    assert steps == [1.0, 2.0]
 
 
 def test_a_scan_asks_only_for_what_cameras_see() -> None:
@@ -219,18 +225,9 @@ def test_a_scan_asks_only_for_what_cameras_see() -> None:
     assert scores["uniform"].recall[0] == pytest.approx((~hidden).mean(), abs=1e-12)
     assert scores["uniform"].visible_recall == (1.0,)
     assert scores["uniform"].visible_count == (~hidden).sum()
-    one_camera = score_surface(samples, outer, truth, [0.06], min_cameras=1)
-    assert one_camera.visible_recall == one_camera.recall
-    with pytest.raises(UsageError, match="seen by 6 cameras"):
-        score_protocols(*outer, truth, CAMERAS, [0.06], protocols=["scan"], min_cameras=6)
-
-
-def test_visibility_may_be_given_as_yes_and_no() -> None:
-    mesh = ball(3)
-    shown = np.arange(2000) < 500
-    score = uniform(halves(mesh)[0], truth_of(mesh, 2000, seen=shown), 0.05, count=500)
-    assert score.visible_count == 500
-    assert score.visible_recall != score.recall
+    unseen = Truth(samples, *solid, seen=np.ones(10_000, np.int32))
+    with pytest.raises(UsageError, match="seen by 2 cameras"):
+        score_protocols(*outer, unseen, CAMERAS, [0.06], protocols=["scan"])
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -297,7 +294,7 @@ def test_a_missing_wire_costs_thin_recall() -> None:
 def test_the_crop_chooses_what_is_judged_not_what_it_is_measured_against() -> None:
     mesh = ball(4)
     upper, lower = halves(mesh)
-    crop = RegionCrop(Region.box("top", [-2, -2, 0.3], [2, 2, 2]))
+    crop = Region.box("top", [-2, -2, 0.3], [2, 2, 2])
     cropped = dataclasses.replace(truth_of(mesh), crop=crop)
     score = uniform(joined(upper, (lower[0] * 1.4, lower[1])), cropped, 1e-9)
     assert score.precision == score.recall == (1.0,)
@@ -314,7 +311,7 @@ def test_the_crop_chooses_what_is_judged_not_what_it_is_measured_against() -> No
     part = score_surface(guess, None, Truth(cloud, crop=crop), [0.1])
     assert part.predicted_count == whole.predicted_count < 4000
     assert part.accuracy_mean == whole.accuracy_mean
-    outside = dataclasses.replace(cropped, crop=RegionCrop(Region.box("off", [5] * 3, [6] * 3)))
+    outside = dataclasses.replace(cropped, crop=Region.box("off", [5] * 3, [6] * 3))
     with pytest.raises(UsageError, match="inside the crop"):
         uniform(mesh, outside, 0.01)
 
@@ -326,7 +323,7 @@ def test_the_crop_chooses_what_is_judged_not_what_it_is_measured_against() -> No
     ids=["no faces", "no area", "outside of the crop"],
 )
 def test_nothing_scores_nothing_and_never_nan(protocol: str, mesh: Mesh) -> None:
-    crop = RegionCrop(Region.box("around", [0.5] * 3, [2] * 3))
+    crop = Region.box("around", [0.5] * 3, [2] * 3)
     labels = {"thin": np.ones(500, bool), "seen": np.full(500, 2, np.int32), "crop": crop}
     truth = truth_of(ball(3), 500, **labels)
     score = score_protocols(
@@ -463,7 +460,6 @@ def test_a_folder_is_read_as_written(tmp_path: Path) -> None:
     assert truth.seen is not None
     assert (truth.judged() == (values["points"][:, 2] >= 0)).all()
     assert (truth.visible() == (values["seen"] >= 2)).all()
-    assert (truth.visible(1) == (values["seen"] >= 1)).all()
     part = truth.kept(truth.thin)
     assert len(part.samples) == values["thin"].sum()
     assert part.seen is not None

@@ -34,12 +34,11 @@ from tests.core.render.query_scenes import (
     Oracle,
     assert_depths,
     random_positions,
+    reference_depth_at,
     scene,
 )
 from tests.core.render.scenes import front_camera, isotropic, look_at, one_gaussian
 from tests.core.render.test_properties import cameras, steady, wild_gaussians
-
-from .query_scenes import reference_depth_at
 
 
 @pytest.mark.parametrize("name", SCENES)

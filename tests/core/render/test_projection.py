@@ -15,6 +15,7 @@ import torch
 from gaussian_wrapping_addon.core.compiled import kernel
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.parallel import ArrayStore
 from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     RawGradients,

@@ -25,13 +25,12 @@ from gaussian_wrapping_addon.core.render.tile_kernels import mask_kernel
 from gaussian_wrapping_addon.core.render.tiles import (
     TileBinning,
     TileLists,
-    bin_gaussians,
     order_by_keys,
     radix_order,
 )
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from tests.core.render.query_scenes import scene
-from tests.core.render.scenes import look_at, random_gaussians
+from tests.core.render.scenes import bin_gaussians, look_at, random_gaussians
 
 OPTIONS = RenderOptions(threads=1)
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 import trimesh
 
+from benchmarks.field_errors import depth_errors, vacancy_errors
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.evaluation.field_errors import depth_errors, vacancy_errors
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.scene.camera import Camera
