@@ -42,11 +42,12 @@ class GWRAP_PT_report(InTab, bpy.types.Panel):
         table(layout, report.rows)
         if report.device_reason:
             wrapped_label(layout, report.device_reason, characters_of(context))
-        for title, icon, rows in (
+        sections: list[tuple[str, Any, Any]] = [
             (tr("Time of the Stages"), "TIME", report.stages),
             (tr("Model Selection"), "OPTIONS", report.decisions),
             *((region.name, "MESH_DATA", region.rows) for region in report.regions),
-        ):
+        ]
+        for title, icon, rows in sections:
             if rows:
                 box = layout.box()
                 box.label(text=title, icon=icon, translate=False)

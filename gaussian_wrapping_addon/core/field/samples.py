@@ -144,7 +144,7 @@ def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
         slots, cells, entries = slots + capacity, cells + len(unique_keys), entries + len(keys)
     return BoxGrid(
         origin, level_size, np.asarray(table_begin, np.int64), np.asarray(table_mask, np.int64),
-        *map(np.concatenate, (slot_key_parts, slot_cell_parts, begin_parts, owner_parts)),
+        *(np.concatenate(p) for p in (slot_key_parts, slot_cell_parts, begin_parts, owner_parts)),
     )  # fmt: skip
 
 

@@ -335,7 +335,7 @@ def write_textured(
         name: [atlas_file(name, number, udims) for number in range(len(several))]
         for name, several in images.items()
     }
-    arrays = {
+    arrays: dict[str, np.ndarray] = {
         "vertices": np.asarray(mesh.vertices, np.float64),
         "faces": np.asarray(mesh.faces, np.int32),
         "corner_uvs": np.asarray(corner_uvs, np.float32),
