@@ -40,11 +40,17 @@ Result = TypeVar("Result")
 class Task(Generic[Result]):
     """One call of a :class:`Lane` and its outcome.
 
-    ``call``: runs in the lane's thread.
-    ``then``: receives the result on the main thread. Without it, the caller polls :meth:`finished`
-    and reads :meth:`result`.
-    ``failed``: receives the exception if ``call`` raised one; by default it is logged.
-    ``end``: called by :meth:`cancel` to end what the call waits for; must not block.
+    Parameters
+    ----------
+    call : callable
+        Runs in the lane's thread.
+    then : callable, optional
+        Receives the result on the main thread. Without it, the caller polls :meth:`finished` and
+        reads :meth:`result`.
+    failed : callable, optional
+        Receives the exception if ``call`` raised one; by default it is logged.
+    end : callable, optional
+        Called by :meth:`cancel` to end what the call waits for; must not block.
     """
 
     def __init__(

@@ -154,10 +154,19 @@ _MEND = (
 def quads_of(name: str, triangles: Triangulation, quads: int) -> Triangulation:
     """Return about so many quads along a mesh, as triangles that are parts of them.
 
-    ``name``: of the object, for errors.
-    ``triangles``: finite.
-    ``quads``: QuadriFlow makes up to a quarter fewer, or a few more.
-    Raises UsageError: QuadriFlow refuses the mesh, fails or is cancelled.
+    Parameters
+    ----------
+    name : str
+        Of the object, for errors.
+    triangles : Triangulation
+        Finite.
+    quads : int
+        QuadriFlow makes up to a quarter fewer, or a few more.
+
+    Raises
+    ------
+    UsageError
+        QuadriFlow refuses the mesh, fails or is cancelled.
     """
     vertices, faces = _joined(triangles)
     edges = edge_lengths(vertices, faces)
@@ -368,11 +377,19 @@ def apply_bake(
     Polygons that new UVs cut are divided; all others stay. A bake with fewer faces or with quads
     becomes a new object under the frame, and the dense one is hidden.
 
-    ``frame``: frame of the result whose photos were baked.
-    ``target_uid``: session uid of the object that was handed over; otherwise it is found by its
-    tag.
-    Raises UsageError: the object is gone, or its faces have changed since; nothing has been
-    changed.
+    Parameters
+    ----------
+    scene : Scene
+    frame : Object
+        Frame of the result whose photos were baked.
+    baked : BakedFiles
+    target_uid : int, optional
+        Session uid of the object that was handed over; otherwise it is found by its tag.
+
+    Raises
+    ------
+    UsageError
+        The object is gone, or its faces have changed since; nothing has been changed.
     """
     thing = _target(scene, baked.name, target_uid)
     if not baked.has_own_faces or baked.polygons is not None:

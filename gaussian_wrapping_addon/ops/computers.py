@@ -154,8 +154,12 @@ def folder_of_jobs(scene: bpy.types.Scene) -> Path:
 def outcome_of(messages: list[dict[str, Any]], last_words: str) -> Outcome:
     """Return what the panel shows of what the process has written.
 
-    ``messages``: ``{"worker": {...}}`` for each worker, ``{"error", "hint"}``.
-    ``last_words``: the last line of its standard error.
+    Parameters
+    ----------
+    messages : list of dict
+        ``{"worker": {...}}`` for each worker, ``{"error", "hint"}``.
+    last_words : str
+        The last line of its standard error.
     """
     workers = [m["worker"] for m in messages if isinstance(m.get("worker"), dict)]
     errors = [m for m in messages if m.get("error")]

@@ -79,9 +79,12 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
 def rows_of(messages: list[dict[str, Any]], last_words: str = "") -> list[dict[str, str]]:
     """Return the rows for the panel of what the worker wrote.
 
-    ``messages``: ``{"finding": {"severity", "message", "hint"}}``, or ``{"error", "hint",
-    "extras"}``.
-    ``last_words``: the last line of the worker's standard error, shown if there is nothing else.
+    Parameters
+    ----------
+    messages : list of dict
+        ``{"finding": {"severity", "message", "hint"}}``, or ``{"error", "hint", "extras"}``.
+    last_words : str
+        The last line of the worker's standard error, shown if there is nothing else.
     """
     rows = []
     for values in messages:
@@ -145,9 +148,17 @@ def start_check(
 ) -> None:
     """Begin to check a scene's input.
 
-    ``choice``: if there are no errors, request an estimate of the training from this worker.
-    ``python``: as for :func:`check_now`.
-    Raises UsageError: no input is chosen.
+    Parameters
+    ----------
+    choice : WorkerChoice, optional
+        If there are no errors, request an estimate of the training from this worker.
+    python : str
+        As for :func:`check_now`.
+
+    Raises
+    ------
+    UsageError
+        No input is chosen.
     """
     from ..core.loading.check import Finding
 

@@ -52,11 +52,17 @@ _UNSAFE = re.compile(r"[^\w.-]+")
 class MaterialCopies:
     """Copies of the materials of one exported mesh; :meth:`remove` takes them out again.
 
-    ``stem``: name of the exported file without its suffix; prefix of the image names.
-    ``folder``: where images are written to.
-    ``unlit``: what becomes of our unlit materials: ``"keep"`` (glTF has them), ``"emission"`` or
-    ``"lit"``, for formats without unlit materials, which would drop the texture.
-    ``fold_specular``: whether the format describes reflectance by the index of refraction alone.
+    Parameters
+    ----------
+    stem : str
+        Name of the exported file without its suffix; prefix of the image names.
+    folder : Path
+        Where images are written to.
+    unlit : str
+        What becomes of our unlit materials: ``"keep"`` (glTF has them), ``"emission"`` or
+        ``"lit"``, for formats without unlit materials, which would drop the texture.
+    fold_specular : bool
+        Whether the format describes reflectance by the index of refraction alone.
     """
 
     def __init__(self, stem: str, folder: Path, *, unlit: str, fold_specular: bool = False) -> None:
@@ -490,10 +496,25 @@ def export_result(
 ) -> list[Path]:
     """Write meshes of a result; the open file is closed without saving.
 
-    ``requests``: one for each format. ``regions``: names; empty for all. ``levels``: whether levels
-    of detail are written too. ``shading``: ``"unlit"``, or lit.
-    Raises UsageError: Blender has a window, or there is no such region; what :func:`export_objects`
-    raises; DatasetError, ParseError: the folder contains no valid result.
+    Parameters
+    ----------
+    result : Path
+        The result folder.
+    requests : list of ObjectExport
+        One for each format.
+    regions : tuple of str
+        Names; empty for all.
+    levels : bool
+        Whether levels of detail are written too.
+    shading : str
+        ``"unlit"``, or lit.
+
+    Raises
+    ------
+    UsageError
+        Blender has a window, or there is no such region; what :func:`export_objects` raises.
+    DatasetError, ParseError
+        The folder contains no valid result.
     """
     start_empty("Exporting a result")
     imported = import_result(result, bpy.context.scene)

@@ -395,8 +395,12 @@ def watch(
 ) -> None:
     """Show a job in a scene and follow it to its end.
 
-    ``imports``: whether its result is wanted in the scene.
-    ``target_uid``: session uid of the object that photos are baked onto.
+    Parameters
+    ----------
+    imports : bool
+        Whether its result is wanted in the scene.
+    target_uid : int, optional
+        Session uid of the object that photos are baked onto.
     """
     addon.remember(folder)
     job = WatchedJob(client, client.poll(), scene.session_uid, imports, target_uid=target_uid)

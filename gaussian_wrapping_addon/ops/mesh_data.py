@@ -34,9 +34,16 @@ def evaluated(thing: bpy.types.Object) -> bpy.types.Object:
 def values_of(elements: Any, name: str, width: int, dtype: type) -> np.ndarray:
     """Return a property of all elements of a collection.
 
-    ``elements``: of n elements.
-    ``width``: numbers of the property per element.
-    Returns ``values``, (n * width,) ndarray.
+    Parameters
+    ----------
+    elements : bpy_prop_collection
+        Of n elements.
+    width : int
+        Numbers of the property per element.
+
+    Returns
+    -------
+    values : (n * width,) ndarray
     """
     values: np.ndarray = np.empty(width * len(elements), dtype)
     elements.foreach_get(name, values)
@@ -52,11 +59,13 @@ def build_mesh(
 ) -> bpy.types.Mesh:
     """Build mesh data from arrays: smooth shaded, one UV layer, a material slot for each face.
 
-    ``vertices``: (v, 3) ndarray.
-    ``faces``: (f, 3) ndarray of int32. Valid (``result_files.sound_faces``): Blender's own check
-    takes longer than all the rest.
-    ``corner_uvs``: (f, 3, 2) ndarray of float32.
-    ``face_material``: (f,) ndarray of int.
+    Parameters
+    ----------
+    vertices : (v, 3) ndarray
+    faces : (f, 3) ndarray of int32
+        Valid (``result_files.sound_faces``): Blender's own check takes longer than all the rest.
+    corner_uvs : (f, 3, 2) ndarray of float32
+    face_material : (f,) ndarray of int, optional
     """
     starts = np.arange(0, 3 * len(faces), 3)
     mesh = build_polygons(name, vertices, faces.ravel(), starts, corner_uvs.reshape(-1, 2))
@@ -75,11 +84,14 @@ def build_polygons(
 ) -> bpy.types.Mesh:
     """Build mesh data from arrays: smooth shaded, with one UV layer or none.
 
-    ``vertices``: (v, 3) ndarray.
-    ``corners``: (c,) ndarray of int. Vertices of the polygons, one after another; valid as those of
-    :func:`build_mesh`.
-    ``starts``: (p,) ndarray of int. First corner of each polygon, ascending from 0.
-    ``uvs``: (c, 2) ndarray.
+    Parameters
+    ----------
+    vertices : (v, 3) ndarray
+    corners : (c,) ndarray of int
+        Vertices of the polygons, one after another; valid as those of :func:`build_mesh`.
+    starts : (p,) ndarray of int
+        First corner of each polygon, ascending from 0.
+    uvs : (c, 2) ndarray, optional
     """
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(vertices))

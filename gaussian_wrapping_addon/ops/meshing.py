@@ -113,9 +113,17 @@ def start(
 ) -> None:
     """Begin estimates for regions of one result; those of other regions stay.
 
-    ``folder``: the job folder of the finished training. ``python``: from the preferences.
-    Raises WrapError: a region, its resolution or the interpreter cannot be used; no estimate is
-    started.
+    Parameters
+    ----------
+    folder : Path
+        The job folder of the finished training.
+    python : str
+        From the preferences.
+
+    Raises
+    ------
+    WrapError
+        A region, its resolution or the interpreter cannot be used; no estimate is started.
     """
     interpreter = worker_python(python)
     requests = {

@@ -38,11 +38,21 @@ Triangles = list[tuple[int, int, int]]
 def convex_hull(points: np.ndarray, name: str) -> tuple[np.ndarray, Triangles]:
     """Return the convex hull of points.
 
-    ``points``: (n, 3) float64.
-    ``name``: of the object, for messages.
-    Returns ``vertices``, (k, 3) float64; ``triangles``.
-    Raises UsageError: the points enclose no volume, are not finite, or too many of them may be
-    corners.
+    Parameters
+    ----------
+    points : (n, 3) float64
+    name : str
+        Of the object, for messages.
+
+    Returns
+    -------
+    vertices : (k, 3) float64
+    triangles : list of index triples
+
+    Raises
+    ------
+    UsageError
+        The points enclose no volume, are not finite, or too many of them may be corners.
     """
     if len(points) < 4:
         raise UsageError(f"Region {name} has {len(points)} vertices.", "Use a box or a solid.")

@@ -272,9 +272,15 @@ def update_levels(
     Levels are replaced when the region's mesh has changed: they are made from it. The region's own
     object is level 0; it moves into the levels' collection, unless the user has put it elsewhere.
 
-    ``mesh``: the region's mesh object, up to date; its parent is that of the levels.
-    ``levels``: all levels of the result; those of other regions are left alone.
-    ``collection``: the result's collection, parent of that of the levels.
+    Parameters
+    ----------
+    region : RegionResult
+    mesh : Object
+        The region's mesh object, up to date; its parent is that of the levels.
+    levels : list of Object
+        All levels of the result; those of other regions are left alone.
+    collection : Collection
+        The result's collection, parent of that of the levels.
     """
     old = [t for t in levels if t.get(addon.REGION) == region.name]
     if old and all(c.get(addon.STAMP) == region.stamp for c in old):
@@ -353,11 +359,21 @@ def import_result(
     what is missing is added, and everything else, such as the transforms, modifiers and materials
     of the user, stays.
 
-    ``folder``: ``DIR/result`` (docs/architecture.md).
-    ``scene``: where new objects are linked.
-    ``files``: the content of the folder if it has been read already.
-    Raises DatasetError, ParseError: the folder contains no valid result; nothing has been changed;
-    UsageError: a mesh that has changed is in Edit Mode in another scene; nothing has been changed.
+    Parameters
+    ----------
+    folder : Path
+        ``DIR/result`` (docs/architecture.md).
+    scene : Scene
+        Where new objects are linked.
+    files : ResultFiles, optional
+        The content of the folder if it has been read already.
+
+    Raises
+    ------
+    DatasetError, ParseError
+        The folder contains no valid result; nothing has been changed.
+    UsageError
+        A mesh that has changed is in Edit Mode in another scene; nothing has been changed.
     """
     files = files or read_result(folder)
     frame = _find_frame(files, scene)

@@ -99,11 +99,18 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
 def estimate_of(messages: list[dict[str, Any]], last_words: str = "") -> Estimate:
     """Convert the child's output into lines for the panel.
 
-    ``messages``: ``{"line": text}`` for each line and ``{"warning": text}`` for each warning, or
-    ``{"error": text, "hint": text}``.
-    ``last_words``: the last line of the child's standard error, reported if there is no other
-    output.
-    Raises WorkerError: there is no output.
+    Parameters
+    ----------
+    messages : list of dict
+        ``{"line": text}`` for each line and ``{"warning": text}`` for each warning, or
+        ``{"error": text, "hint": text}``.
+    last_words : str
+        The last line of the child's standard error, reported if there is no other output.
+
+    Raises
+    ------
+    WorkerError
+        There is no output.
     """
     for values in messages:
         if values.get("error"):

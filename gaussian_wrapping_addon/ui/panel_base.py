@@ -271,9 +271,14 @@ _logger = logging.getLogger(__name__)
 class ViewDrawing:
     """What draws into each 3D view with shown overlays.
 
-    ``what``: what is drawn, for the log.
-    ``draw``: draws into the view of a context.
-    ``forget``: gives up shaders and batches; they are made again next time.
+    Parameters
+    ----------
+    what : str
+        What is drawn, for the log.
+    draw : callable
+        Draws into the view of a context.
+    forget : callable
+        Gives up shaders and batches; they are made again next time.
     """
 
     def __init__(

@@ -93,10 +93,11 @@ class GWRAP_PT_region(TabPanel, bpy.types.Panel):
         checked = [region for region in regions if properties_of(region).checked]
         if checked:
             row = layout.row(align=True)
-            for operator, text, icon in (
+            buttons: tuple[tuple[str, str, Any], ...] = (
                 ("gwrap.estimate_regions", "Estimate {count} Checked", "TIME"),
                 ("gwrap.mesh_region", "Mesh {count} Checked", "MESH_DATA"),
-            ):
+            )
+            for operator, text, icon in buttons:
                 text = tr(text, count=len(checked))
                 button: Any = row.operator(operator, text=text, icon=icon)
                 button.checked = True

@@ -352,10 +352,20 @@ async def ask_workers(
 ) -> AsyncIterator[Judged]:  # fmt: skip
     """Have each worker run children at once, whatever it works on; yield what comes of them.
 
-    ``requests``: returns the requests for the worker of a number; the next one is made where one
-    had no answer.
-    ``judge``: receives the answers; ``limit_s``: time for each worker.
-    Raises WorkerError: no scheduler answers.
+    Parameters
+    ----------
+    requests : callable
+        Returns the requests for the worker of a number; the next one is made where one had no
+        answer.
+    judge : callable
+        Receives the answers.
+    limit_s : float
+        Time for each worker.
+
+    Raises
+    ------
+    WorkerError
+        No scheduler answers.
     """
     from distributed import Client
 

@@ -138,11 +138,23 @@ class JobClient:
     def start(
         cls, folder: Path, job: JobFile, *, python: str | None = None, keep_running: bool = False
     ) -> JobClient:
-        """Write the job into ``folder``, new, empty, or a job folder, and start its worker.
+        """Write the job into ``folder`` and start its worker.
 
-        ``python``: interpreter that has torch; ``None`` asks :func:`worker_python`.
-        ``keep_running``: whether the worker continues when this process ends.
-        Raises DeviceError: the job names a GPU that the driver does not find; nothing was written.
+        Parameters
+        ----------
+        folder : Path
+            New, empty, or a job folder.
+        job : JobFile
+            What to do.
+        python : str or None
+            Interpreter that has torch; ``None`` asks :func:`worker_python`.
+        keep_running : bool
+            Whether the worker continues when this process ends.
+
+        Raises
+        ------
+        DeviceError
+            The job names a GPU that the driver does not find; nothing was written.
         """
         _reject_absent_device(job)
         return cls._launch(prepare_job(folder, job), python, keep_running)

@@ -221,9 +221,18 @@ _PANORAMAS = f"The photos are 360 degree panoramas; each is cut into {len(VIEWS)
 def check_input(source: Path, *, worker: str = "", panoramas: str = "auto") -> list[Finding]:
     """Check an input without decoding photos or solving cameras.
 
-    ``worker``: the worker's Python, which opens videos; without, only their first bytes are looked
-    at. ``panoramas``: {"auto", "on", "off"}, whether photos without cameras are cut into views.
-    A finding that is an ``"error"`` means that loading would fail.
+    Parameters
+    ----------
+    source : Path
+    worker : str
+        The worker's Python, which opens videos; without, only their first bytes are looked at.
+    panoramas : {"auto", "on", "off"}
+        Whether photos without cameras are cut into views.
+
+    Returns
+    -------
+    list of Finding
+        An ``"error"`` means that loading would fail.
     """
     findings = Findings()
     try:

@@ -170,20 +170,40 @@ def load_scene(
 ) -> Scene:
     """Load photos and cameras, solving and undistorting where needed.
 
-    ``source``: folder of photos, COLMAP project (``images/`` and ``sparse/0``), ``transforms.json``
-        or a folder that contains it. Nothing is written there.
-    ``work_folder``: undistorted photos, masks and the solved cameras are written here.
-    ``threads``: 0 uses every core.
-    ``turntable``: {"auto", "on", "off"}, of photos without poses; see :func:`~.solver.solve_poses`.
-    ``equirectangular``: {"auto", "on", "off"}, whether photos without poses are panoramas, which
-        are cut into views; ``"auto"``: where all are exactly twice as wide as high and none says
-        another projection.
-    ``reading``: how mask files are understood.
-    ``units``: what is known about size and place. Where it is applied, the scene's world is metric.
-    ``in_order``: photos without poses follow each other by name, as frames of a video do.
-    The scene's ``warnings`` and ``facts`` list what was read, left out and solved.
-    Raises DatasetError, ParseError: the input cannot be used; names the problem and its location;
-    MissingExtraError: photos need a package that the worker lacks.
+    Parameters
+    ----------
+    source : Path
+        Folder of photos, COLMAP project (``images/`` and ``sparse/0``), ``transforms.json`` or a
+        folder that contains it. Nothing is written there.
+    work_folder : Path
+        Undistorted photos, masks and the solved cameras are written here.
+    progress : Progress
+    seed : int
+    threads : int
+        0 uses every core.
+    turntable : {"auto", "on", "off"}
+        Of photos without poses; see :func:`~.solver.solve_poses`.
+    equirectangular : {"auto", "on", "off"}
+        Whether photos without poses are panoramas, which are cut into views; ``"auto"``: where
+        all are exactly twice as wide as high and none says another projection.
+    reading : MaskReading
+        How mask files are understood.
+    units : UnitsRequest
+        What is known about size and place. Where it is applied, the scene's world is metric.
+    in_order : bool
+        Photos without poses follow each other by name, as frames of a video do.
+
+    Returns
+    -------
+    Scene
+        In the scene frame; ``warnings`` and ``facts`` list what was read, left out and solved.
+
+    Raises
+    ------
+    DatasetError, ParseError
+        The input cannot be used; names the problem and its location.
+    MissingExtraError
+        Photos need a package that the worker lacks.
     """
     source = real_path(source)
     work_folder = real_path(work_folder)

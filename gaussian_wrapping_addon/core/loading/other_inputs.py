@@ -196,9 +196,17 @@ class SplatExtent:
 def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
     """Return the robust centre and radius of the opaque Gaussians.
 
-    ``means``: (n, 3), finite. ``opacities``: (n,), effective opacities in [0, 1], used as weights.
-    Raises DatasetError: all Gaussians are transparent or coincide, or they are scattered without
-    bounds.
+    Parameters
+    ----------
+    means : (n, 3)
+        Finite.
+    opacities : (n,)
+        Effective opacities in [0, 1], used as weights.
+
+    Raises
+    ------
+    DatasetError
+        All Gaussians are transparent or coincide, or they are scattered without bounds.
     """
     opaque = opacities >= MIN_OPACITY
     if not opaque.any():

@@ -260,12 +260,25 @@ _SPREAD_STOPS = 2.5
 def photo_findings(source: Path, progress: Progress, *, threads: int = 0) -> list[Finding]:
     """Look at every photo of an input at a reduced size, and at what its cameras cover.
 
-    ``source``: as for :func:`~.check.check_input`, which has found no error. ``threads``: 0 uses
-    every core.
-    Returns blur, exposure, duplicates and coverage, with the photos' names; none of a video or
-    splat.
-    Raises MissingExtraError: photos need a package that the worker lacks; DatasetError, ParseError:
-    the input cannot be read.
+    Parameters
+    ----------
+    source : Path
+        As for :func:`~.check.check_input`, which has found no error.
+    progress : Progress
+    threads : int
+        0 uses every core.
+
+    Returns
+    -------
+    list of Finding
+        Blur, exposure, duplicates and coverage, with the photos' names; none of a video or splat.
+
+    Raises
+    ------
+    MissingExtraError
+        Photos need a package that the worker lacks.
+    DatasetError, ParseError
+        The input cannot be read.
     """
     kind = source_kind(real_path(source))
     if kind.kind in WITHOUT_PHOTOS:

@@ -99,11 +99,17 @@ def silhouettes(
     The share is the sum of the blending weights of the Gaussians inside: what stands in front of
     them takes its part of the light, and so does what they let through.
 
-    ``gaussians``: scene frame.
-    ``inside``: (n,) bool, Gaussians that belong to the object.
-    ``cameras``: scene frame; silhouettes have their size.
-    ``bounds``: (n, 3), corners of the regions, scene frame. What is nearer to a camera than half of
-        the way to them hides nothing: a short training leaves fog right before single cameras.
+    Parameters
+    ----------
+    gaussians : OrientedGaussians
+        Scene frame.
+    inside : (n,) bool
+        Gaussians that belong to the object.
+    cameras : sequence of Camera
+        Scene frame; silhouettes have their size.
+    bounds : (n, 3), optional
+        Corners of the regions, scene frame. What is nearer to a camera than half of the way to
+        them hides nothing: a short training leaves fog right before single cameras.
     """
     arrays = marked(gaussians, inside)
     for camera in cameras:

@@ -154,9 +154,17 @@ def publish(root: Path, made: Path, masks: MaskList) -> Path:
     A folder that a person may have edited is kept: masks of another origin are moved aside, to
     ``masks-KEY``, and come back from there; files without a list, to ``masks-kept``.
 
-    ``root``: the job folder. ``made``: where the files ``000000.png``, ... lie, in the order of
-    ``masks``.
-    Returns the folder of masks.
+    Parameters
+    ----------
+    root : Path
+        The job folder.
+    made : Path
+        Where the files ``000000.png``, ... lie, in the order of ``masks``.
+
+    Returns
+    -------
+    Path
+        The folder of masks.
     """
     folder = root / FOLDER
     there = read_list(folder)

@@ -35,9 +35,14 @@ pixel of it inexact, and what a mask cuts off is lost while what it leaves on is
 def cleaned(share: np.ndarray, size: tuple[int, int], grown_share: float = 0.0) -> np.ndarray:
     """Return the (h, w) bool mask of a photo, true where it shows the object.
 
-    ``share``: (h', w') float, in [0, 1]; of the whole photo, usually smaller than it.
-    ``size``: (int, int), width and height of the photo.
-    ``grown_share``: border kept around the object, as a share of the photo's long side.
+    Parameters
+    ----------
+    share : (h', w') float
+        In [0, 1]; of the whole photo, usually smaller than it.
+    size : (int, int)
+        Width and height of the photo.
+    grown_share : float
+        Border kept around the object, as a share of the photo's long side.
     """
     from PIL import Image
 
@@ -96,10 +101,23 @@ _FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 class SegmentationModel:
     """A model that is ready to run.
 
-    ``path``: the ONNX file. ``color_range``: one of ``RANGES``. ``threads``: 0 uses every core.
-    Raises WorkerError: onnxruntime is not installed; says how to install it; DatasetError: it is
-    not an ONNX file, or its inputs and outputs are not those of such a model; ResourceError: it is
-    too large.
+    Parameters
+    ----------
+    path : Path
+        The ONNX file.
+    color_range : str
+        One of ``RANGES``.
+    threads : int
+        0 uses every core.
+
+    Raises
+    ------
+    WorkerError
+        onnxruntime is not installed; says how to install it.
+    DatasetError
+        It is not an ONNX file, or its inputs and outputs are not those of such a model.
+    ResourceError
+        It is too large.
     """
 
     def __init__(self, path: Path, color_range: str, *, threads: int = 0) -> None:

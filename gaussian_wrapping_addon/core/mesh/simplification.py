@@ -162,10 +162,16 @@ def merge_vertices(
 ) -> Merged:  # fmt: skip
     """Select vertices as :func:`select_vertices`, also on a part of a mesh.
 
-    ``faces``: (f, 3) of a closed 2-manifold, at least all those at vertices that are not locked.
-    ``most``: highest cost of a merger.
-    ``locked``: (v,) bool vertices that stay, and that no other merges into.
-    ``quadrics``: (v, 11) float64 instead of those of the faces, in the same units.
+    Parameters
+    ----------
+    faces : (f, 3) int
+        Of a closed 2-manifold, at least all those at vertices that are not locked.
+    most : float
+        Highest cost of a merger.
+    locked : (v,) bool, optional
+        Vertices that stay, and that no other merges into.
+    quadrics : (v, 11) float64, optional
+        Instead of those of the faces, in the same units.
     """
     # Planes are weighted by twice the area of their face; corners have no weight.
     run = Simplification(

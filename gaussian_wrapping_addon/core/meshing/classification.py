@@ -34,11 +34,20 @@ def minimum_cut(
     problem", 1988). Nodes that can still reach remaining sink capacity are inside. Memory and, on
     meshes, time grow linearly with the nodes; millions are practical.
 
-    ``arcs``: (k, 4) neighbours, -1 for none; mutual, each at most once in a row.
-    ``capacity``: (k, 4) of each arc, >= 0 and below 2**30; the smaller of both directions counts.
-    ``unary``: (k,) term of each node; positive favours inside.
-    ``progress``: updated at each global relabelling, so that the computation can be cancelled.
-    Returns (k,) bool.
+    Parameters
+    ----------
+    arcs : (k, 4) int
+        Neighbours, -1 for none; mutual, each at most once in a row.
+    capacity : (k, 4) int
+        Capacity of each arc, >= 0 and below 2**30; the smaller of both directions counts.
+    unary : (k,) int
+        Unary term of each node; positive favours inside.
+    progress : Progress, optional
+        Updated at each global relabelling, so that the computation can be cancelled.
+
+    Returns
+    -------
+    (k,) bool
     """
     progress = progress or Progress()
     count = len(arcs)
@@ -255,12 +264,14 @@ def classify(
     surface, with well-shaped triangles. Labelled by interior samples, a cylinder would get the long
     edges of a convex hull.
 
-    ``points`` (n, 3) float64, ``tetrahedra`` (m, 4) int64, ``neighbours`` (m, 4) int64: from
-    :func:`tetrahedron_neighbours`.
-    ``outer``: (m,) bool: outside by definition (beyond the region), not sampled.
-    ``normals``, ``radii``: (k, 3) and (k,) float64 normals and local spacing at the first k points;
-    tetrahedra with other corners are ``outer``.
-    ``field``: VacancyField, or any object with ``vacancy(points)``.
+    Parameters
+    ----------
+    points : (n, 3) float64
+    tetrahedra : (m, 4) int64
+    neighbours : (m, 4) int64
+        Tetrahedron behind the face opposite each corner, -1 on the hull.
+    outer : (m,) bool
+        Outside by definition (beyond the region), not sampled.
     """
     count = len(tetrahedra)
     total, squares = np.zeros(count), np.zeros(count)

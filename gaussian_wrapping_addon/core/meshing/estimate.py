@@ -224,10 +224,15 @@ def estimate_mesh(
 ) -> MeshEstimate:  # fmt: skip
     """Estimate the cost of a mesh.
 
-    ``area``, ``cap_area``: from :func:`box_counting_area` and :func:`occupied_boundary_area`.
-    ``evaluation_s``: from :func:`evaluation_seconds`.
-    ``resolved``: (n,) float64 shortest edge that the photos resolve at samples of the surface,
-    which limits adaptive spacing; from :func:`.spacing.resolved_edges`.
+    Parameters
+    ----------
+    area, cap_area : float
+        From :func:`box_counting_area` and :func:`occupied_boundary_area`.
+    evaluation_s : float
+        From :func:`evaluation_seconds`.
+    resolved : (n,) float64, optional
+        Shortest edge that the photos resolve at samples of the surface, which limits adaptive
+        spacing; from :func:`.spacing.resolved_edges`.
     """
     by_edge = request.edge_length > 0
     if by_edge:
@@ -358,11 +363,25 @@ def estimate_pivot_mesh(
 ) -> PivotEstimate:  # fmt: skip
     """Estimate the cost of :func:`~.pivot_meshing.mesh_by_pivots`.
 
-    ``arrays``, ``region``: same frame. ``depth_samples``: how many the region has.
-    ``pivots``, ``box``: the settings ``pivots`` and ``pivot_box``.
-    ``alone``: whether nothing is triangulated but the pivots (``pivot_samples = "none"``).
-    ``evaluation_s``: from :func:`evaluation_seconds`.
-    Raises MeshingError: no Gaussian reaches the region.
+    Parameters
+    ----------
+    arrays, region
+        Same frame.
+    pivots : int
+        Number of pivots per Gaussian.
+    depth_samples : int
+        Number of depth samples in the region.
+    box : str
+        Of nine pivots, the setting ``pivot_box``.
+    alone : bool
+        Whether nothing is triangulated but the pivots (``pivot_samples = "none"``).
+    evaluation_s : float
+        Time of one evaluation of vacancy, from :func:`~.estimate.evaluation_seconds`.
+
+    Raises
+    ------
+    MeshingError
+        No Gaussian reaches the region.
     """
     rule = pivot_rule(pivots, box)
     if alone:

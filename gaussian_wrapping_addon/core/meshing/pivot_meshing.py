@@ -51,17 +51,34 @@ def mesh_by_pivots(
 
     The tetrahedra are clipped to the region's planes before the field is evaluated, so that the
     solid ends exactly on these planes, with sharp edges. No tetrahedron is dropped, hence the mesh
-    is closed and manifold, oriented outward (docs/method.md, section 6.5).
+    is closed and manifold (docs/method.md, section 6.5).
 
-    ``vacancy``: VacancyField, or any object with ``vacancy(points)`` and ``is_empty(points)``.
-    ``arrays``, ``region``: scene frame.
-    ``cameras``: the field's; their pixel footprints set the bracket tolerance.
-    ``settings``: ``pivots`` (per Gaussian), ``pivot_box``, ``pivot_samples``,
-    ``min_component_share`` and ``most_parts`` are used. An edge length or a number of points does
-    not apply; the provenance notes that.
-    ``depth_samples``: depth-map samples of the isosurface in the region (:mod:`.samples`); not used
-    with ``pivot_samples = "none"``.
-    Raises MeshingError: the region holds no surface, or no Gaussian reaches it.
+    Parameters
+    ----------
+    vacancy : VacancyField
+        Or any object with ``vacancy(points)`` and ``is_empty(points)``.
+    arrays : GaussianArrays
+        Scene frame.
+    cameras : sequence of Camera
+        The field's cameras; must not be empty. Their pixel footprints set the bracket tolerance.
+    region : Region
+        Scene frame.
+    settings : MeshingSettings
+        ``pivots`` (per Gaussian), ``pivot_box``, ``pivot_samples`` and ``min_component_share`` are
+        used. An edge length or a number of points does not apply; the provenance notes that.
+    depth_samples : DepthSamples, optional
+        Depth-map samples of the isosurface in the region (:mod:`.samples`); not used with
+        ``pivot_samples = "none"``.
+
+    Returns
+    -------
+    SurfaceMesh
+        Closed, 2-manifold, oriented outward.
+
+    Raises
+    ------
+    MeshingError
+        The region holds no surface, or no Gaussian reaches it.
     """
     if len(cameras) == 0:
         raise MeshingError("The scene has no cameras.", "Check the scene.")

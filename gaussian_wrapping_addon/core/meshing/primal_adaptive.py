@@ -58,20 +58,43 @@ def mesh_region(
 ) -> SurfaceMesh:  # fmt: skip
     """Mesh the surface ``vacancy = 0.5`` inside a region, closed by caps on the region's boundary.
 
-    The mesh is a closed 2-manifold, oriented outward; its ``provenance`` holds counts, and
-    ``|v - 0.5|`` at the vertices on the isosurface. With adaptive spacing a denser mesh is
-    extracted and simplified to the vertices that its shape needs (:mod:`.simplification`). The
-    vacancy decides about space that no camera sees. The same seed gives the same mesh, for any
-    number of threads.
+    With adaptive spacing a denser mesh is extracted and simplified to the vertices that its shape
+    needs (:mod:`.simplification`). The vacancy decides about space that no
+    camera sees. Without an edge length or a number of points the mesh has about 50 thousand faces.
 
-    ``arrays``, ``region``: scene frame. ``cameras``: the field's.
-    ``settings``: ``points``, ``spacing``, ``min_component_share`` and ``most_parts`` are used.
-    Smoothing, decimation and an open boundary are separate steps on the finished mesh.
-    ``edge_length_scene``: of a uniform mesh, in scene units; an adaptive mesh has half as many
-    vertices. With 0 ``settings.points`` applies; with neither there are about 50 thousand faces.
-    ``depth_samples``: depth-map samples of the isosurface in the region (:mod:`.samples`).
-    Raises MeshingError: the region holds no surface; UsageError, ResourceError: the request is
-    invalid, or needs more points than the limit.
+    Parameters
+    ----------
+    field : Field
+    arrays : GaussianArrays
+        Scene frame.
+    cameras : sequence of Camera
+        The field's cameras; must not be empty.
+    region : Region
+        Scene frame.
+    settings : MeshingSettings
+        ``points``, ``spacing`` and ``min_component_share`` are used; the edge length is passed in
+        scene units. Smoothing, decimation and an open boundary are separate steps on the finished
+        mesh; ``unseen`` concerns the field.
+    seed : int
+        The same seed gives the same mesh, for any number of threads.
+    edge_length_scene : float
+        Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices.
+        0 means that ``settings.points`` applies.
+    depth_samples : DepthSamples, optional
+        Depth-map samples of the isosurface in the region (:mod:`.samples`).
+
+    Returns
+    -------
+    SurfaceMesh
+        Closed, 2-manifold, oriented outward. ``provenance`` holds counts, and ``|v - 0.5|`` at the
+        vertices on the isosurface.
+
+    Raises
+    ------
+    MeshingError
+        The region holds no surface.
+    UsageError, ResourceError
+        The request is invalid, or needs more points than the limit.
     """
     if len(cameras) == 0:
         raise MeshingError("The scene has no cameras.", "Check the scene.")

@@ -50,11 +50,23 @@ def remove_degenerate(
     Every step keeps a closed 2-manifold closed and manifold; faces that no step can remove
     stay. Vertices are not moved, so the surface changes by about ``height``.
 
-    ``region``: keeps caps on the region's planes: no vertex is merged into one that lies on fewer
-    of these planes, and no edge of the region is flipped unless the third vertex lies on it, too.
-    ``fixed``: (v,) bool, for a part of a mesh: vertices that have faces elsewhere.
-    Returns faces (g, 3) over the same vertices, some of which may be unused, and the number of
-    degenerate ones that remain.
+    Parameters
+    ----------
+    vertices : (v, 3) float64
+    faces : (f, 3) int64
+        A closed 2-manifold.
+    region : Region, optional
+        Keeps caps on the region's planes: no vertex is merged into one that lies on fewer of these
+        planes, and no edge of the region is flipped unless the third vertex lies on it as well.
+    fixed : (v,) bool, optional
+        For a part of a mesh: vertices that have faces elsewhere.
+
+    Returns
+    -------
+    faces : (g, 3) int64
+        Over the same vertices, some of which may be unused.
+    left : int
+        Degenerate faces that remain.
     """
     narrow = narrow_faces(vertices, faces, height)
     planes = _plane_sets(vertices, faces, narrow, region)

@@ -194,9 +194,17 @@ def candidate_surface(
 ) -> CandidateSurface:  # fmt: skip
     """Extract the isosurface on the Delaunay edges of two pivots per Gaussian and depth sample.
 
-    ``tolerance``: length of the bracket on crossing edges; 0 stands for :data:`BRACKET_SHARE`.
-    ``depth_samples``: of the region: parts about as thin as a pixel are found only by these.
-    Raises MeshingError: no Gaussian reaches the region, or nothing in it is occupied by the solid.
+    Parameters
+    ----------
+    tolerance : float
+        Length of the bracket on crossing edges; 0 stands for :data:`BRACKET_SHARE`.
+    depth_samples : DepthSamples, optional
+        Of the region: parts about as thin as a pixel are found only by these.
+
+    Raises
+    ------
+    MeshingError
+        No Gaussian reaches the region, or nothing in it is occupied by the solid.
     """
     margin = MARGIN_SHARE * region.diagonal
     is_empty = _within_halo(is_empty, region)

@@ -202,9 +202,13 @@ def mask_candidates(name: str) -> list[str]:
 def find_mask(mask_roots: list[Path], name: str, beside: Sequence[Path] = ()) -> Path | None:
     """Return the mask of photo ``name``, or ``None``.
 
-    ``mask_roots``: folders of masks: ``x.jpg.png``, ``x.png``, the same name, or a name that says
-    so (``MASK_ENDINGS``). ``beside``: folders of photos: the mask lies beside the photo
-    (:func:`masks_among`).
+    Parameters
+    ----------
+    mask_roots : list of Path
+        Folders of masks: ``x.jpg.png``, ``x.png``, the same name, or a name that says so
+        (``MASK_ENDINGS``).
+    beside : sequence of Path
+        Folders of photos: the mask lies beside the photo (:func:`masks_among`).
     """
     for root in mask_roots:
         for candidate in mask_candidates(name):

@@ -70,11 +70,21 @@ def photo_header(path: Path) -> PhotoHeader:
 def read_photo(path: Path, *, upright: bool = True, enough_px: int = 0) -> DecodedPhoto:
     """Decode a photo.
 
-    ``upright``: apply the EXIF orientation. HEIF and RAW photos are upright always. ``enough_px``:
-    if given, a RAW photo is developed at half its size where the long side of that still has so
-    many pixels.
-    Raises DatasetError, which names the file: not an image, cut, too large; MissingExtraError: the
-    worker lacks the package for HEIF or RAW.
+    Parameters
+    ----------
+    path : Path
+    upright : bool
+        Apply the EXIF orientation. HEIF and RAW photos are upright always.
+    enough_px : int
+        If given, a RAW photo is developed at half its size where the long side of that still has
+        so many pixels.
+
+    Raises
+    ------
+    DatasetError
+        Names the file: not an image, cut, too large.
+    MissingExtraError
+        The worker lacks the package for HEIF or RAW.
     """
     header = photo_header(path)
     if photo_kind(path) == RAW:

@@ -75,8 +75,13 @@ class PhotoMemory:
 def photo_memory(photos: int, pixels: float, *, masked: bool, free_bytes: int) -> PhotoMemory:
     """Return what photos take that are read at three sizes, each half of the one before.
 
-    ``pixels``: of a photo at the largest of them. ``free_bytes``: free memory of the machine; 0 if
-    unknown.
+    Parameters
+    ----------
+    pixels : float
+        Of a photo at the largest of them.
+    masked : bool
+    free_bytes : int
+        Free memory of the machine; 0 if unknown.
     """
     all_bytes = round(photos * pixels * (4 if masked else 3) * (1 + 1 / 4 + 1 / 16))
     return PhotoMemory(photos, all_bytes, photo_budget_bytes(free_bytes))
@@ -301,9 +306,15 @@ class PhotoStore:
     so that the camera of a level is exactly the base camera with intrinsics divided by d.
     What comes out does not depend on the budget. Thread-safe.
 
-    ``max_image_px``: long side of the base level, pixels. ``memory_bytes``: limit of the arrays
-    kept (:class:`~.store.KeptPhotos`); by default a share of the memory that is free now
-    (:func:`~.store.photo_budget_bytes`). The photo and the mask used last are kept beyond it.
+    Parameters
+    ----------
+    scene : Scene
+    max_image_px : int
+        Long side of the base level, pixels.
+    memory_bytes : int, optional
+        Limit of the arrays kept (:class:`~.store.KeptPhotos`); by default a share of the
+        memory that is free now (:func:`~.store.photo_budget_bytes`). The photo and the mask
+        used last are kept beyond it.
     """
 
     def __init__(self, scene: Scene, max_image_px: int, *, memory_bytes: int | None = None) -> None:

@@ -191,8 +191,12 @@ def relative_sharpness(details: np.ndarray, times_s: np.ndarray, ways: np.ndarra
 
     The worst direction counts. Only frames with the same content are compared.
 
-    ``details``: (n, 2, 4) float64, of :func:`details`. ``times_s``, ``ways``: (n,) float64, time,
-    and way of the picture so far in its sides.
+    Parameters
+    ----------
+    details : (n, 2, 4) float64
+        Of :func:`details`.
+    times_s, ways : (n,) float64
+        Time, and way of the picture so far in its sides.
     """
     fine = details[:, 0]
     relative = np.zeros(len(fine))
@@ -276,8 +280,13 @@ class Choice:
 def choose_frames(measures: FrameMeasures, *, frames: int = 0, fps: float = 0.0) -> Choice:
     """Choose frames.
 
-    ``frames``: number of stretches of equal motion, so the most frames; 0: by the motion. ``fps``:
-    if not 0 and ``frames`` is: stretches of equal time instead, so many a second.
+    Parameters
+    ----------
+    measures : FrameMeasures
+    frames : int
+        Number of stretches of equal motion, so the most frames; 0: by the motion.
+    fps : float
+        If not 0 and ``frames`` is: stretches of equal time instead, so many a second.
     """
     ways, times_s = measures.ways, measures.times_s
     if not len(ways):
@@ -505,12 +514,22 @@ def extract_frames(
 ) -> VideoFrames:
     """Choose sharp frames of a video and write them as JPEG into ``work_folder/frames``.
 
-    ``video``: nothing is written beside it.
-    ``work_folder``: what an interrupted run has left there is removed.
-    ``frames``, ``fps``: as of :func:`~.video_frames.choose_frames`; 0 chooses by the motion.
-    ``threads``: of the decoder; 0 uses every core.
-    Raises DatasetError, ParseError: it is no video that can be read, or fewer than ``MIN_IMAGES``
-    frames can be used; Cancelled.
+    Parameters
+    ----------
+    video : Path
+        Nothing is written beside it.
+    work_folder : Path
+        What an interrupted run has left there is removed.
+    frames, fps : int, float
+        As of :func:`~.video_frames.choose_frames`; 0 chooses by the motion.
+    threads : int
+        Of the decoder; 0 uses every core.
+
+    Raises
+    ------
+    DatasetError, ParseError
+        It is no video that can be read, or fewer than ``MIN_IMAGES`` frames can be used.
+    Cancelled
     """
     target = work_folder / FRAMES_FOLDER
     task_folder = work_folder / "video"

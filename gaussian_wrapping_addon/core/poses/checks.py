@@ -91,9 +91,17 @@ def standing_groups(count: int, motions: Sequence[PairMotion]) -> list[list[int]
 
     Whether what moves turns as one body is left to :func:`are_turning`.
 
-    ``count``: number of photos. ``motions``: of all pairs that were matched, also of those without
-    a match.
-    Numbers ascend; photos of no such group are in none.
+    Parameters
+    ----------
+    count : int
+        Number of photos.
+    motions : sequence of PairMotion
+        Of all pairs that were matched, also of those without a match.
+
+    Returns
+    -------
+    list of list of int
+        Ascending numbers of photos; photos of no such group are in none.
     """
     still = [(motion.first, motion.second) for motion in motions if motion.is_still]
     if not still:
@@ -372,7 +380,12 @@ _logger = logging.getLogger(__name__)
 def with_findings(model: SourceModel, folder: Path, source_names: Mapping[str, str]) -> SourceModel:
     """Add facts and warnings to a solved model; warnings also go to the log.
 
-    ``folder``: the solver's. ``source_names``: photos by the solver's names.
+    Parameters
+    ----------
+    folder : Path
+        The solver's.
+    source_names : mapping of str to str
+        Photos by the solver's names.
     """
     found = read_json(folder / SOLUTION_NAME)
     warnings = findings(found, source_names)

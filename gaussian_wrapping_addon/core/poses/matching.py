@@ -145,12 +145,16 @@ def choose_pairs(
 ) -> Pairs:
     """Return the pairs of the first round.
 
-    ``count``: photos, sorted by name.
-    ``in_order``: they were taken one after the other, as of a video.
-    ``metres``: (count, count) array or None, distances by GPS, infinite where unknown. They may be
-        wrong: they add pairs only.
-    ``resemblance``: (count, count) array or None, the more alike, the larger; needed for more than
-        ``EXHAUSTIVE_LIMIT`` photos.
+    Parameters
+    ----------
+    count : int
+        Photos, sorted by name.
+    in_order : bool
+        They were taken one after the other, as of a video.
+    metres : (count, count) array or None
+        Distances by GPS, infinite where unknown. They may be wrong: they add pairs only.
+    resemblance : (count, count) array or None
+        The more alike, the larger; needed for more than ``EXHAUSTIVE_LIMIT`` photos.
     """
     if count <= EXHAUSTIVE_LIMIT:
         return all_pairs(count)
@@ -168,10 +172,14 @@ def second_round(
 ) -> Pairs:
     """Return more pairs for photos with few neighbours.
 
-    ``tried``: pairs of the first round.
-    ``verified``: matches of a pair that agree with one motion.
-    ``resemblance``: (count, count) array, decides between equals, and for photos without any
-        neighbour.
+    Parameters
+    ----------
+    tried : list of (int, int)
+        Pairs of the first round.
+    verified : mapping of (int, int) to int
+        Matches of a pair that agree with one motion.
+    resemblance : (count, count) array
+        Decides between equals, and for photos without any neighbour.
     """
     linked = np.zeros((count, count), bool)
     for (i, j), matches in verified.items():
@@ -338,9 +346,13 @@ def extract(
 def match_chosen(folder: Path, database: Path, task: dict[str, Any], names: list[str]) -> None:
     """Choose pairs, match them, and in large sets those of a second round; ``task`` gets both.
 
-    ``task``: ``seed``, ``threads``, ``in_order`` and ``positions``
-    (degrees of latitude and longitude of each photo, or None); gets ``pairs`` of names. ``names``:
-    all photos, sorted.
+    Parameters
+    ----------
+    task : dict
+        ``seed``, ``threads``, ``in_order`` and ``positions`` (degrees of latitude and longitude of
+        each photo, or None); gets ``pairs`` of names.
+    names : list of str
+        All photos, sorted.
     """
     count = len(names)
     if count <= EXHAUSTIVE_LIMIT:

@@ -59,10 +59,22 @@ def with_turntable(
 ) -> SourceModel:
     """Add what the solver found to a model that still has the solver's names.
 
-    ``folder``: the solver's. ``sizes``: width and height of the photos. ``target``: new folder for
-    the masks. ``wanted``: the user says that there is a turntable.
-    Its new facts are ``turntable_photos`` and, where masks were made,
-    ``photos_masked_as_turning``.
+    Parameters
+    ----------
+    folder : Path
+        The solver's.
+    sizes : mapping of str to (int, int)
+        Width and height of the photos.
+    target : Path
+        New folder for the masks.
+    wanted : bool
+        The user says that there is a turntable.
+
+    Returns
+    -------
+    SourceModel
+        With the facts ``turntable_photos`` and, where masks were made,
+        ``photos_masked_as_turning``.
     """
     from PIL import Image
 
@@ -152,21 +164,37 @@ def solve_poses(
 ) -> SourceModel:
     """Solve cameras and sparse points of photos without poses (structure from motion).
 
-    ``root``: folder that the photo names are relative to.
-    ``mask_roots``: folders of masks; features on black pixels are not used.
-    ``work_folder``: temporary files, ``cameras/`` (the COLMAP model) and ``turntable/`` (masks) are
-        written here.
-    ``turntable``: {"auto", "on", "off"}, whether the camera stood still while the object turned;
-        ``"auto"`` sees it by matches that stay in their place. Matches of the background are then
-        left out, and the background is masked, unless a photo has a mask.
-    ``reading``: how mask files are understood.
-    ``in_order``: photos sorted by name were taken one after the other, as of a video. Matters where
-        there are too many to match all pairs.
-    Photos that could not be registered are left out, with a warning. World is the solver's
-    own frame. Reproducible for the same seed with one thread; with more, the native matcher
-    differed once in about 60 runs.
-    Raises DatasetError: too few photos can be decoded, or fewer than ``MIN_IMAGES`` can be
-    registered.
+    Parameters
+    ----------
+    root : Path
+        Folder that the photo names are relative to.
+    photos : sequence of Path
+    mask_roots : list of Path
+        Folders of masks; features on black pixels are not used.
+    work_folder : Path
+        Temporary files, ``cameras/`` (the COLMAP model) and ``turntable/`` (masks) are written
+        here.
+    turntable : {"auto", "on", "off"}
+        Whether the camera stood still while the object turned; ``"auto"`` sees it by matches that
+        stay in their place. Matches of the background are then left out, and the background is
+        masked, unless a photo has a mask.
+    reading : MaskReading
+        How mask files are understood.
+    in_order : bool
+        Photos sorted by name were taken one after the other, as of a video. Matters where there are
+        too many to match all pairs.
+
+    Returns
+    -------
+    SourceModel
+        Photos that could not be registered are left out, with a warning. World is the solver's own
+        frame. Reproducible for the same seed with one thread; with more, the native matcher
+        differed once in about 60 runs.
+
+    Raises
+    ------
+    DatasetError
+        Too few photos can be decoded, or fewer than ``MIN_IMAGES`` can be registered.
     """
     folder = fresh_folder(work_folder)
     prepared: list[_SolverPhoto] = []

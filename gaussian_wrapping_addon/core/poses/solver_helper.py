@@ -69,9 +69,14 @@ def place_one_by_one(
 ) -> list[Any]:
     """Return the reconstructions of the incremental mapper, the largest first.
 
-    ``folder``: with ``images/``; ``models/`` is used for temporary files.
-    ``lenient``: accept fewer matches, and a first pair with less parallax.
-    ``known_lens``: neither the lenses nor the places of cameras in their rig are adjusted.
+    Parameters
+    ----------
+    folder : Path
+        With ``images/``; ``models/`` is used for temporary files.
+    lenient : bool
+        Accept fewer matches, and a first pair with less parallax.
+    known_lens : bool
+        Neither the lenses nor the places of cameras in their rig are adjusted.
     """
     pycolmap = import_pycolmap()
     options = mapping_options(seed)
@@ -253,12 +258,23 @@ def mended(
 ) -> tuple[Any, Verdict, bool]:
     """Solve again from the most alike pairs; keep the result if these contradict it far less.
 
-    ``database``: with the verified pairs, all of which judge every solution.
-    ``folder``: for temporary files.
-    ``solve``: returns the reconstruction of a database, or None.
-    ``model``, ``verdict``: the doubtful solution.
-    Returns model and verdict, those given where the other is not better, and whether they are the
-    other.
+    Parameters
+    ----------
+    database : Path
+        With the verified pairs, all of which judge every solution.
+    folder : Path
+        For temporary files.
+    solve : callable
+        Returns the reconstruction of a database, or None.
+    model, verdict
+        The doubtful solution.
+
+    Returns
+    -------
+    model, verdict
+        Those given where the other is not better.
+    is_mended : bool
+        They are the other.
     """
     emit(
         fraction=MATCH_END,

@@ -53,12 +53,20 @@ def masks_of_turning(
 ) -> list[np.ndarray]:
     """Return (h, w) bool masks, true where a photo shows the turning object.
 
-    ``count``: number of photos, all of one size and from one place. ``read``: the (h, w, 3) uint8
-    photo of a number. ``step``: told the share that is done.
+    Parameters
+    ----------
+    count : int
+        Number of photos, all of one size and from one place.
+    read : callable
+        The (h, w, 3) uint8 photo of a number.
+    step : callable
+        Told the share that is done.
 
+    Notes
+    -----
     The background of a pixel is the colour that most photos agree on (docs/method.md, section 12):
-    a median would show the object wherever it covers a pixel in more than half of them. Where few
-    agree, the object is always there.
+    a median would show the object wherever it covers a pixel in more than half of them. Where
+    few agree, the object is always there.
     """
     chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_BACKGROUND_PHOTOS)).astype(int))
     stack = []
@@ -203,8 +211,12 @@ pixel."""
 def turntable_groups(database: Path, task: Mapping[str, Any]) -> list[list[str]]:
     """Return names of photos from cameras that stand still before something that turns.
 
-    ``database``: with matches. ``task``: ``turntable`` ("auto", "on" or "off"), ``groups`` of one
-    lens and size, and ``pairs``.
+    Parameters
+    ----------
+    database : Path
+        With matches.
+    task : mapping
+        ``turntable`` ("auto", "on" or "off"), ``groups`` of one lens and size, and ``pairs``.
     """
     pycolmap = import_pycolmap()
     if task["turntable"] == "off":
@@ -234,7 +246,12 @@ def turning_masks(
 ) -> dict[str, np.ndarray]:
     """Return a (h, w) bool mask of what turns for each photo of the groups.
 
-    ``photos``: their folder. ``step``: told the share that is done.
+    Parameters
+    ----------
+    photos : Path
+        Their folder.
+    step : callable
+        Told the share that is done.
     """
     masks: dict[str, np.ndarray] = {}
     for number, group in enumerate(groups):

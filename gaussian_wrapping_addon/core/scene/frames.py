@@ -119,11 +119,23 @@ def find_scene_frame(
 ) -> SceneFrame:
     """Compute the scene frame of posed cameras.
 
-    ``rotations``: (n, 3, 3) float64, ``cam_from_world`` rotations, camera axes x right, y down, z
-        forward.
-    ``centers``: (n, 3) float64, camera centres, world frame; may be far from the origin.
-    ``z_up``: whether the world's z is known to point up.
-    Raises DatasetError: all cameras coincide, or too few remain.
+    Parameters
+    ----------
+    rotations : (n, 3, 3) float64
+        ``cam_from_world`` rotations, camera axes x right, y down, z forward.
+    centers : (n, 3) float64
+        Camera centres, world frame; may be far from the origin.
+    z_up : bool
+        Whether the world's z is known to point up.
+
+    Returns
+    -------
+    SceneFrame
+
+    Raises
+    ------
+    DatasetError
+        All cameras coincide, or too few remain.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         keep = near_cameras(centers)
@@ -176,10 +188,17 @@ def up_direction(rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray
     most nearly orthogonal to all of these is preferred; then the normal of a planar camera path.
     Both are used only if they are well determined and agree with the first guess.
 
-    ``rotations``: (n, 3, 3) float64, cam_from_world. ``offsets``: (n, 3) float64, camera centres
-    relative to their mean.
-    Returns ``up``: (3,) float64, unit length, world frame; ``rule``: ``"level cameras"``, ``"plane
-    camera path"`` or ``"mean camera up"``.
+    Parameters
+    ----------
+    rotations : (n, 3, 3) float64, cam_from_world
+    offsets : (n, 3) float64
+        Camera centres relative to their mean.
+
+    Returns
+    -------
+    up : (3,) float64, unit length, world frame
+    rule : str
+        ``"level cameras"``, ``"plane camera path"`` or ``"mean camera up"``.
     """
     guess = _robust_mean(-rotations[:, 1, :])  # (n, 3): y points down
     rights = rotations[:, 0, :]  # (n, 3)
@@ -285,11 +304,23 @@ def camera_up(rotations: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, s
     orientation): then up is the direction for which most cameras have a roll near a multiple of a
     quarter turn. Its sign is that of upright cameras, or else the side from which they look down.
 
-    ``rotations``: (n, 3, 3) float64, ``cam_from_world`` rotations, camera axes x right, y down, z
-    forward. ``centers``: (n, 3) float64, camera centres.
-    Returns ``up``: (3,) float64, unit length; ``rule``: a rule of ``up_direction``, or ``"cameras
-    turned by quarters"``.
-    Raises UsageError: there is no camera, or the cameras contradict each other.
+    Parameters
+    ----------
+    rotations : (n, 3, 3) float64
+        ``cam_from_world`` rotations, camera axes x right, y down, z forward.
+    centers : (n, 3) float64
+        Camera centres.
+
+    Returns
+    -------
+    up : (3,) float64, unit length
+    rule : str
+        A rule of ``up_direction``, or ``"cameras turned by quarters"``.
+
+    Raises
+    ------
+    UsageError
+        There is no camera, or the cameras contradict each other.
     """
     rotations = np.asarray(rotations, np.float64).reshape(-1, 3, 3)
     centers = np.asarray(centers, np.float64).reshape(-1, 3)
@@ -413,10 +444,18 @@ def find_ground_plane(
 ) -> Plane | None:
     """Find the level plane that contains most of the low, upward-facing surface.
 
-    ``centers``, ``normals``: (f, 3) float64, centres and outward unit normals of a mesh's faces.
-    ``areas``: (f,) float64.
-    ``up``: (3,) float64, unit vector, accurate to :data:`LEVEL_DEG`.
-    Returns None if no plane is distinct.
+    Parameters
+    ----------
+    centers, normals : (f, 3) float64
+        Centres and outward unit normals of a mesh's faces.
+    areas : (f,) float64
+    up : (3,) float64
+        Unit vector, accurate to :data:`LEVEL_DEG`.
+
+    Returns
+    -------
+    Plane or None
+        None if no plane is distinct.
     """
     good = np.isfinite(centers).all(1) & np.isfinite(normals).all(1) & (areas > 0.0)
     centers, normals, areas = centers[good], normals[good], areas[good]

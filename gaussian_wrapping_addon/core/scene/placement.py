@@ -46,9 +46,17 @@ def umeyama(source: np.ndarray, target: np.ndarray, *, with_scale: bool) -> Simi
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
     PAMI 1991. The rotation is proper even where a reflection would fit better.
 
-    ``source``, ``target``: (n, 3) float64, corresponding points, n >= 3, not collinear.
-    ``with_scale``: also fit the scale; otherwise it is 1.
-    Raises DatasetError: fewer than three pairs, values that are not finite, or collinear points.
+    Parameters
+    ----------
+    source, target : (n, 3) float64
+        Corresponding points, n >= 3, not collinear.
+    with_scale : bool
+        Also fit the scale; otherwise it is 1.
+
+    Raises
+    ------
+    DatasetError
+        Fewer than three pairs, values that are not finite, or collinear points.
     """
     return fit_similarity(*_pairs(source, target), with_scale)
 
@@ -104,10 +112,18 @@ def umeyama_ransac(
     one is refitted to its inliers until these no longer change. Drawing ends early once an
     outlier-free triple was drawn with a probability of ``RANSAC_CONFIDENCE``.
 
-    ``source``, ``target``: (n, 3) float64. ``threshold``: largest distance of an inlier, units of
-    the target. ``iterations``: maximum number of triples.
-    Raises DatasetError: degenerate pairs (see :func:`umeyama`), or no triple with at least three
-    inliers.
+    Parameters
+    ----------
+    source, target : (n, 3) float64
+    threshold : float
+        Largest distance of an inlier, units of the target.
+    iterations : int
+        Maximum number of triples.
+
+    Raises
+    ------
+    DatasetError
+        Degenerate pairs (see :func:`umeyama`), or no triple with at least three inliers.
     """
     source, target = _pairs(source, target)
     source_mean, target_mean = source.mean(0), target.mean(0)
@@ -205,9 +221,16 @@ def scale_step(points: np.ndarray, length: float) -> Similarity:
 
     A ground at z = 0 and a chosen origin stay where they are.
 
-    ``points``: (2, 3) float64. ``length``: true distance, in the unit of the placed scene.
-    Raises UsageError: there are not exactly two points, they coincide, or the length is not
-    positive.
+    Parameters
+    ----------
+    points : (2, 3) float64
+    length : float
+        True distance, in the unit of the placed scene.
+
+    Raises
+    ------
+    UsageError
+        There are not exactly two points, they coincide, or the length is not positive.
     """
     points = _finite(points)
     if len(points) != 2:
@@ -224,9 +247,17 @@ def scale_step(points: np.ndarray, length: float) -> Similarity:
 def plane_through(points: np.ndarray, above: np.ndarray) -> Plane:
     """Return the plane through three points, or the least-squares plane of more.
 
-    ``points``: (n, 3) float64. ``above``: (k, 3) float64, points above the plane, such as camera
-    centres. Without any, or with as many below as above, up is the side nearer to +Z.
-    Raises UsageError: fewer than three points, or all of them on one line.
+    Parameters
+    ----------
+    points : (n, 3) float64
+    above : (k, 3) float64
+        Points above the plane, such as camera centres. Without any, or with as many below as
+        above, up is the side nearer to +Z.
+
+    Raises
+    ------
+    UsageError
+        Fewer than three points, or all of them on one line.
     """
     points = _finite(points)
     if len(points) < 3:
@@ -280,9 +311,16 @@ def _least_turn(direction: np.ndarray) -> np.ndarray:
 def similarity_of_matrix(matrix: np.ndarray, name: str) -> Similarity:
     """Convert a (4, 4) matrix to a similarity.
 
-    ``matrix``: (4, 4) float64. ``name``: name of the object, for the message.
-    Raises UsageError: the matrix is not finite, is singular, mirrors, or scales its axes
-    differently.
+    Parameters
+    ----------
+    matrix : (4, 4) float64
+    name : str
+        Name of the object, for the message.
+
+    Raises
+    ------
+    UsageError
+        The matrix is not finite, is singular, mirrors, or scales its axes differently.
     """
     matrix = np.asarray(matrix, np.float64)
     linear = matrix[:3, :3]

@@ -55,10 +55,20 @@ def triangulate(
 ) -> TriangulatedPoint | None:
     """Find the point that most observations agree with, then minimise their squared distances.
 
-    ``pixels``: (n, 2) float64, where each camera shows the point.
-    ``threshold_px``: observations further away are wrong.
-    ``noise_px``: smallest error of an observation to reckon with.
-    Returns None if no two photos agree whose rays meet under :data:`MIN_ANGLE_DEG`.
+    Parameters
+    ----------
+    cameras : sequence of n Camera
+    pixels : (n, 2) float64
+        Where each camera shows the point.
+    threshold_px : float
+        Observations further away are wrong.
+    noise_px : float
+        Smallest error of an observation to reckon with.
+
+    Returns
+    -------
+    TriangulatedPoint or None
+        None if no two photos agree whose rays meet under :data:`MIN_ANGLE_DEG`.
     """
     pixels = np.asarray(pixels, np.float64).reshape(-1, 2)
     centers = np.array([c.center for c in cameras]).reshape(-1, 3)

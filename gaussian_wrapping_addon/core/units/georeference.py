@@ -244,12 +244,19 @@ def robust_similarity(
 ) -> RobustFit:
     """Fit a similarity to pairs of which up to a third are wrong.
 
-    ``source``, ``target``: (n, 3) float64.
-    ``largest_error``: error, units of the target, beyond which a pair is wrong in any case.
-    ``noise``: smallest standard deviation of a target coordinate to reckon with, units of the
-        target: residuals of few pairs may be small by chance.
-    Raises DatasetError: fewer than three pairs, all on one line or in one place, or no agreement of
-    two thirds.
+    Parameters
+    ----------
+    source, target : (n, 3) float64
+    largest_error : float
+        Error, units of the target, beyond which a pair is wrong in any case.
+    noise : float
+        Smallest standard deviation of a target coordinate to reckon with, units of the target:
+        residuals of few pairs may be small by chance.
+
+    Raises
+    ------
+    DatasetError
+        Fewer than three pairs, all on one line or in one place, or no agreement of two thirds.
     """
     needed = max(3, math.ceil(MIN_AGREEING_SHARE * len(source)))
     threshold, best = largest_error, None
@@ -485,11 +492,24 @@ def georeference(
 ) -> Georeference:
     """Fit the cameras' centres to the GPS positions of their photos.
 
-    ``cameras``: in any common frame ("world"). ``positions``: by the cameras' names; photos without
-    one are left out. ``needs``: what the positions have to determine.
-    The origin is the median of the positions.
-    Raises DatasetError: too few positions, or they do not determine scale and up direction; says
-    why.
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        In any common frame ("world").
+    positions : mapping
+        By the cameras' names; photos without one are left out.
+    needs : Needs
+        What the positions have to determine.
+
+    Returns
+    -------
+    Georeference
+        The origin is the median of the positions.
+
+    Raises
+    ------
+    DatasetError
+        Too few positions, or they do not determine scale and up direction; says why.
     """
     known = [c for c in cameras if c.name in positions]
     check_positions([positions[c.name] for c in known], len(cameras))

@@ -51,12 +51,18 @@ _MAX_MOVE_PX = 2.5
 def refined_corners(grey: np.ndarray, corners: np.ndarray, modules: int) -> np.ndarray | None:
     """Return the marker's corners as intersections of its edges.
 
-    ``grey``: (h, w) uint8.
-    ``corners``: (4, 2) float64, corners to a pixel or so, around the marker; the first pixel's
-        centre is (0.5, 0.5).
-    ``modules``: bits of the marker along a side, the black border included.
-    Returns (4, 2) float64; None if the marker is too small in the photo, or an edge is not
-    clear.
+    Parameters
+    ----------
+    grey : (h, w) uint8
+    corners : (4, 2) float64
+        Corners to a pixel or so, around the marker; the first pixel's centre is (0.5, 0.5).
+    modules : int
+        Bits of the marker along a side, the black border included.
+
+    Returns
+    -------
+    (4, 2) float64 or None
+        None if the marker is too small in the photo, or an edge is not clear.
     """
     corners = np.asarray(corners, np.float64)
     module = float(np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=1).min()) / modules
@@ -272,9 +278,17 @@ def scale_from_markers(
 ) -> MarkerScale:
     """Compare the triangulated sides of markers with their known side.
 
-    ``cameras``: pinhole cameras of the photos that the markers were found in. ``seen``: as
-    :func:`find_markers` returns.
-    Raises DatasetError: no marker was found, or none in two photos that show it well.
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Pinhole cameras of the photos that the markers were found in.
+    seen : dict
+        As :func:`find_markers` returns.
+
+    Raises
+    ------
+    DatasetError
+        No marker was found, or none in two photos that show it well.
     """
     hint = (
         f"Check the dictionary ({spec.dictionary}), that markers are sharp and at least 30 pixels "

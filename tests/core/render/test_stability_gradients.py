@@ -125,7 +125,7 @@ view = functools.partial(look_at, width=28, height=21, focal=32.0)
 
 
 # Name: Gaussians, camera, bounds of the gradient of images and of depth. The last column is loose
-# where float32 depths resolve sigma poorly, see test_stability_opacity_and_shape.py.
+# where float32 depths resolve sigma poorly, see test_stability_images.py.
 SCENES = {
     "generic": (lambda: generic(), view((2.2, 1.0, 0.8)), 5e-6, 5e-5),
     "from within": (lambda: generic(200, 1), view((0.1, 0.2, 0.0), (1.0, 0.3, 0.2)), 1e-5, 1e-4),

@@ -42,9 +42,21 @@ def run_in_worker(
 ) -> int:
     """Run a command in the worker's Python, log its output, and return its exit code.
 
-    ``request``: plain JSON values, for the child's ``module``; ``what``: its name in errors;
-    ``grace_s``: time in which it may end by itself when this is interrupted.
-    Raises WorkerError: it does not start, or ends without reporting an error.
+    Parameters
+    ----------
+    request : dict
+        What the child's module takes; plain JSON values.
+    python : str
+        The worker's interpreter.
+    module, what : str
+        The child's module, and its name in errors; all commands use the protocol above.
+    grace_s : float
+        Time in which it may end by itself when this is interrupted.
+
+    Raises
+    ------
+    WorkerError
+        It does not start, or ends without reporting an error.
     """
     text = json.dumps(request, allow_nan=False)
     with tempfile.TemporaryFile() as error_file:

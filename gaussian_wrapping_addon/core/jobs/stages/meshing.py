@@ -122,8 +122,14 @@ def requested_region(
     The world-frame region of a file is returned as read: transforming it to the scene frame and
     back would change its last digits each time.
 
-    ``request``: ``"auto"``, ``"all"`` or the path of a region file with the content ``body``.
-    ``arrays``: of the training; only the region ``"all"`` needs them.
+    Parameters
+    ----------
+    request : str
+        ``"auto"``, ``"all"`` or the path of a region file.
+    body : object
+        Content of that file.
+    arrays : GaussianArrays, optional
+        Of the training; only the region ``"all"`` needs them.
     """
     if request not in AUTOMATIC_REGIONS:
         world_region = scene_regions.parse_region(body, Path(request))
@@ -435,12 +441,28 @@ def run_mesh(
 ) -> Stage:  # fmt: skip
     """Mesh a region, or plan or join its tiles, or re-use its finished mesh stage.
 
-    ``request``: the region's entry in the job's settings; ``name`` is that of its folder.
-    ``device``: the job's; vacancy is evaluated and depth maps are rendered there. Everything else
-    gets arrays and CPU tensors.
-    ``load``: returns what :func:`load_region` does for a device; ``warnings``: of what was tried
-    before. Raises TilesPlanned: the planned tiles are to be made before this is called again;
-    MeshingError, ResourceError: the region holds no surface, or its mesh does not fit into memory.
+    Parameters
+    ----------
+    request : str
+        The region's entry in the job's settings.
+    name : str
+        Name of the region's folder.
+    device : DeviceChoice
+        The job's; vacancy is evaluated and depth maps are rendered there. Everything else gets
+        arrays and CPU tensors.
+    load : callable
+        Returns what :func:`load_region` does for a device.
+    tile_processes : int
+        How many processes made the tiles, for the report.
+    warnings : sequence of ReportWarning
+        Of what was tried before.
+
+    Raises
+    ------
+    TilesPlanned
+        The region is planned in tiles, which are to be made before this is called again.
+    MeshingError, ResourceError
+        The region holds no surface, or its mesh does not fit into memory.
     """
     meshing = job.meshing_of(request)
     key = mesh_key(job, request, name, trained.key)

@@ -456,10 +456,20 @@ def write_sidecar(
     path: Path, frame: FileFrame, world_from_scene: Similarity, blender_from_scene: Similarity, *,
     placed: bool, result: Path, contents: dict[str, Any],
 ) -> None:  # fmt: skip
-    """Write the sidecar of the exported file ``path``.
+    """Write the sidecar of ``path``.
 
-    ``placed``: whether the target of ``frame`` is the scene as placed, else the world of the input;
-    ``result``: the job's, may lack entries; ``contents``: region, level, shading, counts, textures.
+    Parameters
+    ----------
+    path : Path
+        The exported file.
+    frame : FileFrame
+        Frame of its coordinates.
+    placed : bool
+        Whether the target of ``frame`` is the scene as placed, else the world of the input.
+    result : Path
+        The result folder of the job; entries missing there are left out.
+    contents : dict
+        Content of the file: region, level, shading, number of vertices and faces, textures.
     """
     units = _units(result, frame, world_from_scene)
     in_metres = units is not None and units["applied"]

@@ -123,12 +123,22 @@ def run_stage(
     work: Callable[[Path, Progress], dict[str, Any]], *,
     whole: Callable[[Path], bool] = Path.is_dir,
 ) -> Stage:  # fmt: skip
-    """Run the stage ``stages/NAME-KEY``, or re-use its finished folder.
+    """Run a stage, or re-use its finished folder.
 
-    ``work``: works in the folder; returns the content of ``done.json``. The folder of an
-    interrupted run is passed as it is, so that training finds its checkpoints.
-    ``whole``: tells whether a finished folder still holds what later stages read; without, or
-    damaged, the stage is done again.
+    Parameters
+    ----------
+    stages : Path
+        Folder of all stages.
+    name, key : str
+        Together they form the folder's name.
+    progress : Progress
+        Progress of the stage.
+    work : callable
+        Works in the folder; returns the content of ``done.json``. The folder of an interrupted
+        run is passed as it is, so that training finds its checkpoints.
+    whole : callable
+        Tells whether a finished folder still holds what later stages read; without, or damaged,
+        the stage is done again.
     """
     folder = stages / f"{name}-{key}"
     done = read_done(folder)

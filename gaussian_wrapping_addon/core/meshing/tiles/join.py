@@ -49,9 +49,19 @@ class Joined(NamedTuple):
 class GrowingMesh:
     """Rows of vertices and faces; rows that become free are used again.
 
-    ``level``: highest cost of a merger; negative: nothing is merged.
-    ``least_height``: faces with a smaller height are removed.
-    ``vertices``: how many rows to begin with.
+    Parameters
+    ----------
+    region : Region
+    units : Units
+        Of costs.
+    level : float
+        Highest cost of a merger; negative: nothing is merged.
+    longest : float
+        Greatest length of a new edge.
+    least_height : float
+        Faces with a smaller height are removed.
+    vertices : int
+        How many rows to begin with.
     """
 
     def __init__(self, plan: TilePlan, *, level: float, least_height: float, vertices: int) -> None:
