@@ -135,7 +135,7 @@ def test_the_tests_that_execute_a_line_are_taken(tree: Path, tmp_path: Path) -> 
     data.write()
     found = mutations.sites(tree)
     measured = [mutations.Measured(tree, tmp_path / "covered")]
-    renamed = {"tests/old.py": "tests/test_shapes.py"}
+    renamed = {"tests/old.py": ["tests/none.py", "tests/test_shapes.py"]}
     select = mutations.Selection(tree, measured, renamed, {}, 9)
     key = next(key for key in found if key[0] == "check")
     assert select.tests(key, found[key]) == (["tests/test_shapes.py::test_check[1]"], "coverage")

@@ -12,10 +12,10 @@ moved. Messages, calls of loggers and annotations are left alone.
 
 The tests of a mutation are those that execute its line by coverage recorded with
 ``--cov-context=test`` in any tree that has the line, fastest first by ``--durations`` (a log of
-``pytest --durations=0``); ``--renamed`` tells where test files are now (JSON, old path to new one).
-Without coverage they are those whose files import or are named after its module. Coverage sees no
-lines of compiled functions: there the lines count that call them, through other compiled functions
-too. Tests that fail without the mutation are left out. Results are written after each mutation; the
+``pytest --durations=0``); ``--renamed`` tells where test files are in the other tree (JSON, a
+path to a list of paths). Without coverage they are those whose files import or are named after its
+module. Coverage sees no lines of compiled functions: there the lines count that call them, through
+other compiled functions too. Tests that fail without the mutation are left out. Results are written after each mutation; the
 same command continues where it was stopped.
 """
 
@@ -251,7 +251,7 @@ class Selection:
     """Which tests of a tree run for a mutation."""
 
     def __init__(
-        self, root: Path, measured: list[Measured], renamed: dict[str, str],
+        self, root: Path, measured: list[Measured], renamed: dict[str, list[str]],
         seconds: dict[str, float], most: int,
     ) -> None:  # fmt: skip
         self.root = root
@@ -270,11 +270,13 @@ class Selection:
         return self._by_name(site), "names"
 
     def _here(self, test: str) -> str | None:
-        """Return the name that a test has in this tree, None if it is gone."""
+        """Return the name that a test has in this tree, None if it has none."""
         file, _, name = test.partition("::")
-        file = file if file in self._tests else self._renamed.get(file, file)
         function = name.partition("[")[0].rpartition("::")[2]
-        return f"{file}::{name}" if f"def {function}(" in self._tests.get(file, "") else None
+        for path in (file, *self._renamed.get(file, [])):
+            if f"def {function}(" in self._tests.get(path, ""):
+                return f"{path}::{name}"
+        return None
 
     def _by_name(self, site: Site) -> list[str]:
         module = Path(site.path).stem
