@@ -15,8 +15,8 @@ The tests of a mutation are those that execute its line by coverage recorded wit
 ``pytest --durations=0``); ``--renamed`` tells where test files are in the other tree (JSON, a
 path to a list of paths). Without coverage they are those whose files import or are named after its
 module. Coverage sees no lines of compiled functions: there the lines count that call them, through
-other compiled functions too. Tests that fail without the mutation are left out. Results are written after each mutation; the
-same command continues where it was stopped.
+other compiled functions too. Tests that fail without the mutation are left out. Results are written
+after each mutation; the same command continues where it was stopped.
 """
 
 from __future__ import annotations
