@@ -39,6 +39,10 @@ MAX_ATLASES = 16
 MAX_AUTOMATIC_ATLASES = 4
 """Largest automatic number of textures per mesh, used if one of maximum size is not enough."""
 MIN_IMAGES = 3
+MAX_UNREADABLE_SHARE = 0.2
+"""Of an input's photos: with more that cannot be read, the input is refused, not thinned out."""
+MIN_PHOTO_SIDE_PX = 16
+"""Smallest side of a photo or a frame of a video that is used."""
 RENDER_BUDGET_BYTES = 512 * 1024 * 1024
 """Memory for lists and gradients of tile intersections in one rendering: with it, a million
 Gaussians train at 1600 x 1200 pixels within 4 GB."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Names of files, folders and formats that several layers share."""
+"""Names of files and folders, and the table of export formats, that several layers share."""
 
 from __future__ import annotations
 

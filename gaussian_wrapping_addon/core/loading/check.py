@@ -13,14 +13,14 @@ import numpy as np
 
 from ..errors import DatasetError, WorkerError, WrapError, known_error
 from ..files import real_path
-from ..limits import MIN_IMAGES, POINT_REACH, SCENE_RADIUS
+from ..limits import MAX_UNREADABLE_SHARE, MIN_IMAGES, MIN_PHOTO_SIDE_PX, POINT_REACH, SCENE_RADIUS
 from ..photos.finder import PhotoIndex, find_mask, list_photos, list_second_copies, photo_root
 from ..photos.formats import read_photo_header
 from ..photos.video import container_of, kind_warnings, probe_video
 from ..ply import vertex_layout
 from ..poses.panoramas import VIEWS, check_panorama
 from ..progress import LEFT_OUT_HINT, ReportWarning
-from ..readers.lenses import MIN_PHOTO_SIDE_PX, fit_lens
+from ..readers.lenses import fit_lens
 from ..readers.point_files import read_splat_header
 from ..readers.source_model import PosedPhoto, SourceModel, counts_stored_pixels
 from ..scene.camera import Similarity
@@ -29,155 +29,10 @@ from ..scene.scene import usable_points
 from .other_inputs import NO_PHOTOS_HINT, NO_PHOTOS_WARNING, shape_warning, takes_for_panoramas
 from .source_kind import SPLAT, VIDEO, SourceKind, read_poses, source_kind
 
-# -- Take over the sparse points of an input ------------------------------------------------------
-
-MIN_POINTS = 100
-"""Smallest number of points to start from."""
-_ONE_PLACE_REACH = 100.0 * SCENE_RADIUS
-"""Points farther than this are far away for the distances between the cameras."""
-_MIN_NEAR_SHARE = 0.1
-"""Where fewer of the sparse points are nearer, it is not the points that are far: the cameras
-hardly moved."""
-
-_COMMON_SAMPLE = 2000
-"""Points that are looked for in the photos, evenly chosen."""
-_FIELD_MARGIN = 1.5
-"""Width of a camera's field over that of its photo without distortion."""
-
-
-def nothing_in_common(model: SourceModel) -> ReportWarning | None:
-    """Return a warning if no sparse point lies in the photos of two cameras.
-
-    ``None`` as well where the input has too few points to tell.
-    """
-    if len(model.points) < MIN_POINTS or (_fields(model, _COMMON_SAMPLE).sum(0) >= 2).any():
-        return None
-    return ReportWarning(
-        "nothing-in-common",
-        "No sparse point lies in the photos of two cameras: they show nothing in common.",
-        "Check the poses, or take photos of the same thing from several places.",
-    )
-
-
-def _fields(model: SourceModel, sample: int) -> np.ndarray:
-    """Tell which photos have which sparse points in view, with a margin, (photos, points) bool.
-
-    Of the points, about ``sample`` are looked at, evenly chosen.
-    """
-    points = model.points[:: max(1, len(model.points) // sample)].astype(np.float64)
-    fields = np.zeros((len(model.photos), len(points)), bool)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for k, photo in enumerate(model.photos):
-            local = points @ photo.cam_from_world[:, :3].T + photo.cam_from_world[:, 3]  # (n, 3)
-            fields[k] = local[:, 2] > 0.0
-            if photo.lens is not None:
-                lens = photo.lens
-                (fx, fy), (cx, cy) = lens.focal, lens.principal_point
-                x = fx * local[:, 0] + (cx - 0.5 * lens.width) * local[:, 2]
-                y = fy * local[:, 1] + (cy - 0.5 * lens.height) * local[:, 2]
-                reach = 0.5 * _FIELD_MARGIN * local[:, 2]
-                fields[k] &= np.abs(x) <= lens.width * reach
-                fields[k] &= np.abs(y) <= lens.height * reach
-    return fields
-
-
-def points_in_scene(
-    points: np.ndarray,
-    colors: np.ndarray,
-    scene_from_world: Similarity,
-    warnings: list[ReportWarning],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Transform sparse points of an input to the scene frame's grid; leave out unusable ones.
-
-    ``points``, ``colors``: (n, 3) ndarrays, world frame; colours go along.
-    Raises DatasetError: the cameras hardly moved, for the distances of the points.
-    """
-    with np.errstate(over="ignore", invalid="ignore"):
-        points = snapped(scene_from_world.points(points.reshape(-1, 3)), POINT_STEP)
-        beyond = ~(np.linalg.norm(points, axis=1) <= _ONE_PLACE_REACH)
-    if len(points) >= MIN_POINTS and beyond.mean() > 1.0 - _MIN_NEAR_SHARE:
-        raise DatasetError(
-            f"{int(beyond.sum())} of {len(points)} sparse points are more than "
-            f"{_ONE_PLACE_REACH / SCENE_RADIUS:.0f} times as far away as the cameras are from each "
-            "other: all photos were taken from nearly one place, so that no depth can be measured.",
-            "Walk around the object while taking photos.",
-        )
-    near = usable_points(points)
-    if not near.all():
-        text = (
-            f"{int((~near).sum())} of {len(near)} sparse points were left out: they are not finite "
-            f"or farther away than {POINT_REACH / SCENE_RADIUS:.0f} scene radii."
-        )
-        warnings.append(ReportWarning("points-far-away", text, LEFT_OUT_HINT))
-    return points[near], colors[near]
-
-
-# -- What cameras cover: photos with few sparse points, and photos that show nothing of the others
-
-_WEAK_SHARE = 0.1
-"""Of the median number of sparse points in a photo: with fewer, its pose hangs on few matches."""
-_WEAK_POINTS = 30
-"""With fewer points than this, a pose is not sure (solvers ask for 15 to 30)."""
-_COMMON_POINTS = 20
-"""Points of a sample in the field of a photo and of two others, with fewer of which it shows
-something else."""
-_SAMPLE = 20000
-_MOST_NAMES = 5
-
-
-def coverage_warnings(model: SourceModel) -> list[ReportWarning]:
-    """Return warnings about photos that contribute little; none where points are too few to tell.
-
-    ``model``: poses and sparse points of an input, or solved ones.
-    """
-    if len(model.points) < MIN_POINTS or len(model.photos) < 3:
-        return []
-    found = []
-    names = [photo.name for photo in model.photos]
-    alone = [names[i] for i in looking_elsewhere(model)]
-    if alone:
-        text = f"{listed(alone)}: hardly any sparse point of other photos is in view."
-        hint = "Check their poses, remove them, or take photos in between."
-        found.append(ReportWarning("photos-elsewhere", text, hint))
-    weak = [names[i] for i in weakly_matched(model) if names[i] not in alone]
-    if weak:
-        text = f"{listed(weak)}: far fewer sparse points than in the other photos."
-        hint = "Take more photos with more overlap there, or remove these."
-        found.append(ReportWarning("photos-weak", text, hint))
-    return found
-
-
-def weakly_matched(model: SourceModel) -> list[int]:
-    """Return the photos in which few sparse points were found, where the input tells."""
-    counts = [photo.observed for photo in model.photos]
-    known = [count for count in counts if count is not None]
-    if len(known) < len(counts) or not any(known):
-        return []
-    limit = max(_WEAK_SHARE * float(np.median(known)), min(_WEAK_POINTS, float(np.median(known))))
-    return [i for i, count in enumerate(known) if count < limit]
-
-
-def looking_elsewhere(model: SourceModel) -> list[int]:
-    """Return the photos in whose field hardly any point lies that two other photos may see."""
-    fields = _fields(model, _SAMPLE)
-    shared = (fields & (fields.sum(0) >= 3)).sum(1)
-    limit = min(_COMMON_POINTS, 0.5 * float(np.median(shared)))
-    return [int(i) for i in np.flatnonzero(shared < limit)]
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return names for a message: the first few, and how many others."""
-    others = len(names) - _MOST_NAMES
-    if others <= 0:
-        return ", ".join(names)
-    return f"{', '.join(names[:_MOST_NAMES])} and {others} other{'s' * (others > 1)}"
-
-
 # -- Check an input quickly before any long work: needs numpy only, solves no poses ---------------
 
 Severity = Literal["error", "warning", "fact"]
 
-_MAX_UNREADABLE_SHARE = 0.2
 _MIN_GOOD_SIDE_PX = 200
 _SHORT_NAMES = {
     "photos": "cameras to be solved", SPLAT: "splat without photos", VIDEO: "cameras to be solved",
@@ -403,7 +258,7 @@ def _check_files(
         sizes[f"{width} x {height}"] += 1
         small += max(width, height) < _MIN_GOOD_SIDE_PX
     good = len(photos) - len(bad)
-    if bad and len(bad) > _MAX_UNREADABLE_SHARE * len(photos):
+    if bad and len(bad) > MAX_UNREADABLE_SHARE * len(photos):
         text = f"{len(bad)} of {len(photos)} photos cannot be read. First: {bad[0].message}"
         raise DatasetError(text, bad[0].hint)
     check_photo_count(good)
@@ -435,3 +290,147 @@ def check_photo_count(count: int, left_out: Sequence[ReportWarning] = ()) -> Non
         text = f"Only {count} {photos} usable; at least {MIN_IMAGES} are needed.{reasons}"
         hint = " ".join(hints) or "Add photos of the same thing from other places."
         raise DatasetError(text, hint)
+
+
+# -- Take over the sparse points of an input ------------------------------------------------------
+
+MIN_POINTS = 100
+"""Smallest number of points to start from."""
+_ONE_PLACE_REACH = 100.0 * SCENE_RADIUS
+"""Points farther than this are far away for the distances between the cameras."""
+_MIN_NEAR_SHARE = 0.1
+"""Where fewer of the sparse points are nearer, it is not the points that are far: the cameras
+hardly moved."""
+
+_COMMON_SAMPLE = 2000
+"""Points that are looked for in the photos, evenly chosen."""
+_FIELD_MARGIN = 1.5
+"""Width of a camera's field over that of its photo without distortion."""
+
+
+def nothing_in_common(model: SourceModel) -> ReportWarning | None:
+    """Return a warning if no sparse point lies in the photos of two cameras.
+
+    ``None`` as well where the input has too few points to tell.
+    """
+    if len(model.points) < MIN_POINTS or (_fields(model, _COMMON_SAMPLE).sum(0) >= 2).any():
+        return None
+    return ReportWarning(
+        "nothing-in-common",
+        "No sparse point lies in the photos of two cameras: they show nothing in common.",
+        "Check the poses, or take photos of the same thing from several places.",
+    )
+
+
+def _fields(model: SourceModel, sample: int) -> np.ndarray:
+    """Tell which photos have which sparse points in view, with a margin, (photos, points) bool.
+
+    Of the points, about ``sample`` are looked at, evenly chosen.
+    """
+    points = model.points[:: max(1, len(model.points) // sample)].astype(np.float64)
+    fields = np.zeros((len(model.photos), len(points)), bool)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k, photo in enumerate(model.photos):
+            local = points @ photo.cam_from_world[:, :3].T + photo.cam_from_world[:, 3]  # (n, 3)
+            fields[k] = local[:, 2] > 0.0
+            if photo.lens is not None:
+                lens = photo.lens
+                (fx, fy), (cx, cy) = lens.focal, lens.principal_point
+                x = fx * local[:, 0] + (cx - 0.5 * lens.width) * local[:, 2]
+                y = fy * local[:, 1] + (cy - 0.5 * lens.height) * local[:, 2]
+                reach = 0.5 * _FIELD_MARGIN * local[:, 2]
+                fields[k] &= np.abs(x) <= lens.width * reach
+                fields[k] &= np.abs(y) <= lens.height * reach
+    return fields
+
+
+def points_in_scene(
+    points: np.ndarray,
+    colors: np.ndarray,
+    scene_from_world: Similarity,
+    warnings: list[ReportWarning],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Transform sparse points of an input to the scene frame's grid; leave out unusable ones.
+
+    ``points``, ``colors``: (n, 3) ndarrays, world frame; colours go along.
+    Raises DatasetError: the cameras hardly moved, for the distances of the points.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        points = snapped(scene_from_world.points(points.reshape(-1, 3)), POINT_STEP)
+        beyond = ~(np.linalg.norm(points, axis=1) <= _ONE_PLACE_REACH)
+    if len(points) >= MIN_POINTS and beyond.mean() > 1.0 - _MIN_NEAR_SHARE:
+        raise DatasetError(
+            f"{int(beyond.sum())} of {len(points)} sparse points are more than "
+            f"{_ONE_PLACE_REACH / SCENE_RADIUS:.0f} times as far away as the cameras are from each "
+            "other: all photos were taken from nearly one place, so that no depth can be measured.",
+            "Walk around the object while taking photos.",
+        )
+    near = usable_points(points)
+    if not near.all():
+        text = (
+            f"{int((~near).sum())} of {len(near)} sparse points were left out: they are not finite "
+            f"or farther away than {POINT_REACH / SCENE_RADIUS:.0f} scene radii."
+        )
+        warnings.append(ReportWarning("points-far-away", text, LEFT_OUT_HINT))
+    return points[near], colors[near]
+
+
+# -- What cameras cover: photos with few sparse points, and photos that show nothing of the others
+
+_WEAK_SHARE = 0.1
+"""Of the median number of sparse points in a photo: with fewer, its pose hangs on few matches."""
+_WEAK_POINTS = 30
+"""With fewer points than this, a pose is not sure (solvers ask for 15 to 30)."""
+_COMMON_POINTS = 20
+"""Points of a sample in the field of a photo and of two others, with fewer of which it shows
+something else."""
+_SAMPLE = 20000
+_MOST_NAMES = 5
+
+
+def coverage_warnings(model: SourceModel) -> list[ReportWarning]:
+    """Return warnings about photos that contribute little; none where points are too few to tell.
+
+    ``model``: poses and sparse points of an input, or solved ones.
+    """
+    if len(model.points) < MIN_POINTS or len(model.photos) < 3:
+        return []
+    found = []
+    names = [photo.name for photo in model.photos]
+    alone = [names[i] for i in looking_elsewhere(model)]
+    if alone:
+        text = f"{listed(alone)}: hardly any sparse point of other photos is in view."
+        hint = "Check their poses, remove them, or take photos in between."
+        found.append(ReportWarning("photos-elsewhere", text, hint))
+    weak = [names[i] for i in weakly_matched(model) if names[i] not in alone]
+    if weak:
+        text = f"{listed(weak)}: far fewer sparse points than in the other photos."
+        hint = "Take more photos with more overlap there, or remove these."
+        found.append(ReportWarning("photos-weak", text, hint))
+    return found
+
+
+def weakly_matched(model: SourceModel) -> list[int]:
+    """Return the photos in which few sparse points were found, where the input tells."""
+    counts = [photo.observed for photo in model.photos]
+    known = [count for count in counts if count is not None]
+    if len(known) < len(counts) or not any(known):
+        return []
+    limit = max(_WEAK_SHARE * float(np.median(known)), min(_WEAK_POINTS, float(np.median(known))))
+    return [i for i, count in enumerate(known) if count < limit]
+
+
+def looking_elsewhere(model: SourceModel) -> list[int]:
+    """Return the photos in whose field hardly any point lies that two other photos may see."""
+    fields = _fields(model, _SAMPLE)
+    shared = (fields & (fields.sum(0) >= 3)).sum(1)
+    limit = min(_COMMON_POINTS, 0.5 * float(np.median(shared)))
+    return [int(i) for i in np.flatnonzero(shared < limit)]
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names for a message: the first few, and how many others."""
+    others = len(names) - _MOST_NAMES
+    if others <= 0:
+        return ", ".join(names)
+    return f"{', '.join(names[:_MOST_NAMES])} and {others} other{'s' * (others > 1)}"

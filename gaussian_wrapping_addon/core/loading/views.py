@@ -14,6 +14,7 @@ import numpy as np
 
 from ..errors import DatasetError
 from ..files import real_path
+from ..limits import MIN_PHOTO_SIDE_PX
 from ..parallel import default_threads
 from ..photos.finder import PhotoIndex, find_mask, resolve_photo
 from ..photos.formats import PhotoHeader, require_extras
@@ -30,7 +31,7 @@ from ..photos.photo_file import (
 )
 from ..poses.solver import check_unreadable_share
 from ..progress import UNREADABLE_HINT, Progress, ReportWarning
-from ..readers.lenses import MIN_PHOTO_SIDE_PX, fit_lens, pinhole_of, same_proportions, sampling_map
+from ..readers.lenses import fit_lens, pinhole_of, same_proportions, sampling_map
 from ..readers.source_model import LensCamera, PosedPhoto, SourceModel, counts_stored_pixels
 from ..resampling import sample_bicubic
 from .source_kind import SourceKind

@@ -202,7 +202,6 @@ def kind_warnings(video: Path, is_hdr: bool, is_interlaced: bool) -> list[Report
 
 MAX_DECODE_ERRORS = 1000
 """Packets that cannot be decoded until the rest of the file is given up."""
-MIN_SIDE_PX = 16
 HD_HEIGHT_PX = 720
 """From this height on, colours without a label are those of HD television (BT.709)."""
 PQ, HLG = 16, 18
@@ -299,7 +298,7 @@ def _check_limits(name: str, facts: VideoFacts) -> None:
             f"{limits.MAX_IMAGE_PIXELS // 10**6} million are read.",
             "Export it smaller.",
         )
-    if min(width, height) < MIN_SIDE_PX:
+    if min(width, height) < limits.MIN_PHOTO_SIDE_PX:
         raise DatasetError(f"{name} has {width} x {height} pixels.", "Use a larger video.")
     if facts.duration_s > limits.MAX_VIDEO_S or facts.frames > limits.MAX_VIDEO_FRAMES:
         raise DatasetError(
@@ -368,14 +367,16 @@ def frames_of(video: OpenVideo) -> Iterator[DecodedFrame]:
 def grey_of(frame: VideoFrame, long_side_px: int) -> np.ndarray:
     """Return the brightness of a frame, not turned, at most ``long_side_px``, (h, w) float32."""
     factor = min(1.0, long_side_px / max(frame.width, frame.height))
-    width, height = (max(MIN_SIDE_PX, round(side * factor)) for side in (frame.width, frame.height))
+    width, height = (
+        max(limits.MIN_PHOTO_SIDE_PX, round(side * factor)) for side in (frame.width, frame.height)
+    )
     small = frame.reformat(width, height, "gray", interpolation="AREA")
     return _plane(small, 1)[..., 0].astype(np.float32)
 
 
 def upright_color(frame: VideoFrame, pixel_ratio: float = 1.0) -> np.ndarray:
     """Return a frame as players show it: turned, with square pixels, (h, w, 3) uint8."""
-    width = max(MIN_SIDE_PX, round(frame.width * pixel_ratio))
+    width = max(limits.MIN_PHOTO_SIDE_PX, round(frame.width * pixel_ratio))
     colorspace = int(frame.colorspace)
     if colorspace == _UNLABELLED:
         colorspace = _BT709 if frame.height >= HD_HEIGHT_PX else _BT601
@@ -387,7 +388,7 @@ def upright_color(frame: VideoFrame, pixel_ratio: float = 1.0) -> np.ndarray:
 
 def upright_size(frame: VideoFrame, pixel_ratio: float) -> tuple[int, int]:
     """Return width and height of :func:`upright_color`."""
-    width = max(MIN_SIDE_PX, round(frame.width * pixel_ratio))
+    width = max(limits.MIN_PHOTO_SIDE_PX, round(frame.width * pixel_ratio))
     return (frame.height, width) if _display_matrix(frame)[1] else (width, frame.height)
 
 

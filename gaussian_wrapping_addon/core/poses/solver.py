@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import DatasetError
 from ..files import read_json, write_json
-from ..limits import HELPER_DEADLINE_S, MIN_IMAGES
+from ..limits import HELPER_DEADLINE_S, MAX_UNREADABLE_SHARE, MIN_IMAGES
 from ..machine import helper_memory_limit_bytes
 from ..parallel import default_threads
 from ..photos.exif import GpsPosition, LensExif, read_gps_exif, read_lens_exif
@@ -121,8 +121,6 @@ def with_turntable(
 
 MAX_SIFT_PX = 1600
 """Long side of the photos that features are extracted from."""
-MAX_UNREADABLE_SHARE = 0.2
-"""Largest share of photos that cannot be decoded; with more, loading fails."""
 TURNTABLE_FOLDER = "turntable"
 """Masks of what turns, of the photos' full size."""
 _HELPER = "poses.solver_helper"

@@ -113,8 +113,6 @@ class SkewedBrown:
 
 # -- Fit the cameras of an input to the sizes of its photos; needs their headers only -------------
 
-MIN_PHOTO_SIDE_PX = 16
-
 
 def fit_lens(
     posed: PosedPhoto, header: PhotoHeader, file_name: str, *, prefers_stored: bool

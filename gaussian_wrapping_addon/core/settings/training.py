@@ -25,8 +25,8 @@ from .declaration import (
 
 # -- Weights, schedule and limits of the method ---------------------------------------------------
 #
-# Each has an option of the command line; the preset ``"paper"`` sets all of them to the published
-# values (docs/method.md, section 4.5).
+# ``--set NAME=VALUE`` changes each, the panel none; the preset ``"paper"`` sets all of them to the
+# published values (docs/method.md, section 4.5).
 
 
 _WEIGHT = Range(0.0, 1000.0)
@@ -38,7 +38,7 @@ _OF_ITERATIONS = "share of iterations"
 def _constant(
     default: Any, help: str, check: Check, *, paper: Any = None, large: Any = None, **more: Any
 ) -> Any:
-    """Declare a constant of the method, whose option has its name.
+    """Declare a constant of the method.
 
     ``paper`` and ``large`` are the published value and that of the preset for GPUs, if others.
     """

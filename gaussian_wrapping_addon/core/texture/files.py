@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""GLB and OBJ files."""
+"""Files of a textured mesh: GLB, OBJ, and what a result folder holds beside them."""
 
 from __future__ import annotations
 

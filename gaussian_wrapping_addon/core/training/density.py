@@ -21,29 +21,6 @@ from ..stereo.plane_evidence import AGREEING_SHARE, THROUGH_SHARE, photos_asked
 from .adam import Adam
 from .wrapping import WrapView
 
-# -- Gaussians in space that photos see through (docs/method.md, section 4.6) ---------------------
-
-
-def contradicted(
-    means: np.ndarray, priors: Mapping[int, DepthPrior], least_views: int
-) -> np.ndarray:
-    """Tell which Gaussians stand where photos show nothing, (n,) bool; scene frame.
-
-    At least ``least_views`` photos must see through a Gaussian, and more of them than of those
-    whose confirmed depth agrees with its own. Never true beyond the smallest radius of the far
-    shell: what lies there may be the sky.
-    """
-    means = np.asarray(means, np.float64)
-    through, agreeing = (np.zeros(len(means), np.int32) for _ in range(2))
-    views = sorted(priors)
-    for prior in (priors[views[k]] for k in photos_asked(len(views))):
-        shown, row, column, own = prior.camera.shown(means)
-        through[shown] += prior.free[row, column] > (1.0 + THROUGH_SHARE) * own
-        agreeing[shown] += np.abs(prior.known[row, column] - own) < AGREEING_SHARE * own
-    near = np.linalg.norm(means, axis=1) < limits.FAR_RADIUS
-    return near & (through >= least_views) & (through > agreeing)
-
-
 # -- Density control: clone and split Gaussians with high gradients, prune transparent ones -------
 
 GRADIENT_THRESHOLD = 2e-4
@@ -320,3 +297,26 @@ def prune_contributors(adam: Adam, needed: np.ndarray) -> int:
         return 0
     adam.rebuild(keep, np.zeros(len(keep), np.bool_), {})
     return len(needed) - len(keep)
+
+
+# -- Gaussians in space that photos see through (docs/method.md, section 4.6) ---------------------
+
+
+def contradicted(
+    means: np.ndarray, priors: Mapping[int, DepthPrior], least_views: int
+) -> np.ndarray:
+    """Tell which Gaussians stand where photos show nothing, (n,) bool; scene frame.
+
+    At least ``least_views`` photos must see through a Gaussian, and more of them than of those
+    whose confirmed depth agrees with its own. Never true beyond the smallest radius of the far
+    shell: what lies there may be the sky.
+    """
+    means = np.asarray(means, np.float64)
+    through, agreeing = (np.zeros(len(means), np.int32) for _ in range(2))
+    views = sorted(priors)
+    for prior in (priors[views[k]] for k in photos_asked(len(views))):
+        shown, row, column, own = prior.camera.shown(means)
+        through[shown] += prior.free[row, column] > (1.0 + THROUGH_SHARE) * own
+        agreeing[shown] += np.abs(prior.known[row, column] - own) < AGREEING_SHARE * own
+    near = np.linalg.norm(means, axis=1) < limits.FAR_RADIUS
+    return near & (through >= least_views) & (through > agreeing)

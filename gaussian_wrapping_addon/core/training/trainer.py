@@ -59,169 +59,7 @@ from .state import (
     save_checkpoint,
 )
 
-# -- Colours far behind everything, where no photo shows what is there ----------------------------
-#
-# A view from a new place looks past the border of what the photos show, and sees black there. A
-# coarse sphere in the colours that the photos have in these directions looks right more often. It
-# comes after the training, which needs the black: only before black must a surface become opaque
-# to look right. See docs/method.md, section 11.11.
-
 _logger = logging.getLogger(__name__)
-
-DIRECTIONS = 2000
-"""Cells of the sphere, 4.5 degrees apart."""
-
-LONGEST_PX = 144
-"""Long side of the training views that are rendered."""
-
-CLEAR_TRANSMITTANCE = 0.03
-"""A cell is left open where any photo sees through more than this, on average: training has found
-its colour with black behind, and would be too bright with another."""
-
-REACH_FACTOR = 2.0
-"""Radius of the sphere over the distance of the farthest Gaussian."""
-
-NEAREST = 6
-"""Filled cells met by rays of photos, that lend their colours to a cell."""
-
-SIZE_SHARE = 0.7
-FLATNESS = 0.15
-OPACITY = 0.95
-"""Standard deviations along the sphere, over the distance of cells, and across it; opacity."""
-
-
-def with_backdrop(
-    gaussians: OrientedGaussians, photos: PhotoSource, views: Iterable[int],
-    renderer: Renderer | None = None, *, threads: int = 0,
-) -> OrientedGaussians:  # fmt: skip
-    """Return trained Gaussians with a sphere behind them, open where the photos see through.
-
-    ``views`` are the training views. A renderer given overwrites its last view.
-    """
-    farthest = float(gaussians.means.norm(dim=1).max()) if len(gaussians) else 0.0
-    radius = max(LEAST_REACH, REACH_FACTOR * farthest)
-    directions = fibonacci_directions(DIRECTIONS)
-    tree = cKDTree(directions)
-    through, seen = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
-    colors = np.zeros((DIRECTIONS, 3))
-    raw, renderer = RawArrays.from_gaussians(gaussians.detached()), renderer or ViewRenderer()
-    options = RenderOptions(depth=False, threads=threads)
-    for view in views:
-        camera = photos.camera(view, divisor_for(photos, view, LONGEST_PX))
-        image = renderer.render(raw, camera, options)
-        rays = (camera.rays() @ camera.rotation).reshape(-1, 3)  # (p, 3) scene frame
-        cell = tree.query(onto_sphere(camera.center, rays, radius))[1]
-        pixels = np.bincount(cell, minlength=DIRECTIONS)
-        passed = np.bincount(cell, 1.0 - image.alpha.reshape(-1), minlength=DIRECTIONS)
-        np.maximum(through, passed / np.maximum(pixels, 1), out=through)
-        seen += pixels
-        for channel in range(3):
-            values = image.color[..., channel].reshape(-1)
-            colors[:, channel] += np.bincount(cell, values, minlength=DIRECTIONS)
-    filled = through <= CLEAR_TRANSMITTANCE
-    met = np.flatnonzero(filled & (seen > 0))  # open cells would lend black
-    if len(met) == 0:
-        return gaussians
-    count, step = int(filled.sum()), np.sqrt(4.0 * np.pi / DIRECTIONS)
-    known = colors[met] / seen[met, None]
-    away, nearest = cKDTree(directions[met]).query(directions[filled], k=min(NEAREST, len(met)))
-    away, nearest = away.reshape(count, -1), nearest.reshape(count, -1)
-    weight = 1.0 / (away**2 + (0.5 * step) ** 2)  # (count, k)
-    color = (known[nearest] * weight[..., None]).sum(1) / weight.sum(1, keepdims=True)
-    _logger.info("backdrop: %d Gaussians where no photo sees through", count)
-    sphere = gaussians_at(
-        radius * directions[filled], np.clip(color, 0.0, 1.0),
-        np.full(count, SIZE_SHARE * radius * step), gaussians.sh_degree,
-        normals=-directions[filled], flatness=FLATNESS, opacities=OPACITY,
-    )  # fmt: skip
-    return gaussians.joined(sphere)
-
-
-# -- What a training does when the device fails that it runs on: less of its memory, or none of it
-
-
-class DeviceRecovery:
-    """Brings states to the backend that computes, and to another where that fails.
-
-    The stepper's backend is then replaced by the processor's, and the live view renders where it
-    computes; the photos follow the poses of the state in use.
-    """
-
-    def __init__(self, stepper: Stepper, photos: PosedPhotos, live: LiveView, threads: int) -> None:
-        self.stepper, self.photos, self.live, self.threads = stepper, photos, live, threads
-
-    def adopt(self, state: TrainingState) -> None:
-        """Bring a state to where the backend computes, and the photos to its poses."""
-        backend = self.stepper.backend
-        state.adam = backend.adopted(state.adam)
-        state.statistics = backend.adopted_statistics(state.statistics)
-        self.photos.poses = state.poses
-
-    def begun(self, state: TrainingState) -> Snapshot:
-        """Adopt a state and return its snapshot; on the processor where the device fails at it."""
-        before = state.adam, state.statistics
-        try:
-            self.adopt(state)
-            return state.snapshot()
-        except (WrapError, RuntimeError) as error:
-            if not self.is_device_failure(error):
-                raise
-            name = self.stepper.backend.name
-            self._use_processor()
-            state.adam, state.statistics = before
-            self.adopt(state)
-            _note(state, name, error, "on the processor")
-            return state.snapshot()
-
-    def is_device_failure(self, error: Exception) -> bool:
-        """Tell whether the device that trains failed, so that the training can do without it."""
-        return not isinstance(self.stepper.backend, CpuBackend) and is_device_failure(error)
-
-    def without_device(
-        self, error: Exception, snapshot: Snapshot, again: Callable[[], TrainingState]
-    ) -> TrainingState:
-        """Go back to what a failing device has left: with less of its memory, or without it.
-
-        That is the last snapshot, unless a driver that was reset took it along: then ``again``
-        returns the state of the last checkpoint, or of a new start.
-        """
-        backend = self.stepper.backend
-        smaller = is_memory_failure(error) and backend.use_less_memory()
-        if not smaller:
-            self._use_processor()
-        try:
-            state = TrainingState.of_snapshot(snapshot)
-            self.adopt(state)
-        except (WrapError, RuntimeError) as lost:
-            # The snapshot is lost, or there is no room for its copy.
-            if not is_device_failure(lost):
-                raise
-            smaller = False
-            self._use_processor()
-            self.photos.poses = None  # as at the first start
-            state = again()
-            self.adopt(state)
-        _note(state, backend.name, error, "with less memory" if smaller else "on the processor")
-        return state
-
-    def _use_processor(self) -> None:
-        self.stepper.backend = CpuBackend(self.threads)
-        self.live.renderer = self.stepper.renderer
-
-
-def _note(state: TrainingState, device: str, error: Exception, onward: str) -> None:
-    _logger.warning(
-        "%s failed (%s): going on %s from iteration %d", device, error, onward, state.iteration
-    )
-    state.warnings.append(
-        ReportWarning(
-            "device-failed",
-            f"{device} failed in the training ({error}); it went on {onward} from iteration "
-            f"{state.iteration}.",
-            "Close other programs that use the GPU, or choose fewer Gaussians.",
-        )
-    )
-
 
 # -- Training loop: from photos and cameras to oriented Gaussians, resumable at any iteration -----
 
@@ -603,3 +441,165 @@ class _Trainer:
             f"{speed:.1f} it/s",
             **figures,
         )
+
+
+# -- What a training does when the device fails that it runs on: less of its memory, or none of it
+
+
+class DeviceRecovery:
+    """Brings states to the backend that computes, and to another where that fails.
+
+    The stepper's backend is then replaced by the processor's, and the live view renders where it
+    computes; the photos follow the poses of the state in use.
+    """
+
+    def __init__(self, stepper: Stepper, photos: PosedPhotos, live: LiveView, threads: int) -> None:
+        self.stepper, self.photos, self.live, self.threads = stepper, photos, live, threads
+
+    def adopt(self, state: TrainingState) -> None:
+        """Bring a state to where the backend computes, and the photos to its poses."""
+        backend = self.stepper.backend
+        state.adam = backend.adopted(state.adam)
+        state.statistics = backend.adopted_statistics(state.statistics)
+        self.photos.poses = state.poses
+
+    def begun(self, state: TrainingState) -> Snapshot:
+        """Adopt a state and return its snapshot; on the processor where the device fails at it."""
+        before = state.adam, state.statistics
+        try:
+            self.adopt(state)
+            return state.snapshot()
+        except (WrapError, RuntimeError) as error:
+            if not self.is_device_failure(error):
+                raise
+            name = self.stepper.backend.name
+            self._use_processor()
+            state.adam, state.statistics = before
+            self.adopt(state)
+            _note(state, name, error, "on the processor")
+            return state.snapshot()
+
+    def is_device_failure(self, error: Exception) -> bool:
+        """Tell whether the device that trains failed, so that the training can do without it."""
+        return not isinstance(self.stepper.backend, CpuBackend) and is_device_failure(error)
+
+    def without_device(
+        self, error: Exception, snapshot: Snapshot, again: Callable[[], TrainingState]
+    ) -> TrainingState:
+        """Go back to what a failing device has left: with less of its memory, or without it.
+
+        That is the last snapshot, unless a driver that was reset took it along: then ``again``
+        returns the state of the last checkpoint, or of a new start.
+        """
+        backend = self.stepper.backend
+        smaller = is_memory_failure(error) and backend.use_less_memory()
+        if not smaller:
+            self._use_processor()
+        try:
+            state = TrainingState.of_snapshot(snapshot)
+            self.adopt(state)
+        except (WrapError, RuntimeError) as lost:
+            # The snapshot is lost, or there is no room for its copy.
+            if not is_device_failure(lost):
+                raise
+            smaller = False
+            self._use_processor()
+            self.photos.poses = None  # as at the first start
+            state = again()
+            self.adopt(state)
+        _note(state, backend.name, error, "with less memory" if smaller else "on the processor")
+        return state
+
+    def _use_processor(self) -> None:
+        self.stepper.backend = CpuBackend(self.threads)
+        self.live.renderer = self.stepper.renderer
+
+
+def _note(state: TrainingState, device: str, error: Exception, onward: str) -> None:
+    _logger.warning(
+        "%s failed (%s): going on %s from iteration %d", device, error, onward, state.iteration
+    )
+    state.warnings.append(
+        ReportWarning(
+            "device-failed",
+            f"{device} failed in the training ({error}); it went on {onward} from iteration "
+            f"{state.iteration}.",
+            "Close other programs that use the GPU, or choose fewer Gaussians.",
+        )
+    )
+
+
+# -- Colours far behind everything, where no photo shows what is there ----------------------------
+#
+# A view from a new place looks past the border of what the photos show, and sees black there. A
+# coarse sphere in the colours that the photos have in these directions looks right more often. It
+# comes after the training, which needs the black: only before black must a surface become opaque
+# to look right. See docs/method.md, section 11.11.
+
+DIRECTIONS = 2000
+"""Cells of the sphere, 4.5 degrees apart."""
+
+LONGEST_PX = 144
+"""Long side of the training views that are rendered."""
+
+CLEAR_TRANSMITTANCE = 0.03
+"""A cell is left open where any photo sees through more than this, on average: training has found
+its colour with black behind, and would be too bright with another."""
+
+REACH_FACTOR = 2.0
+"""Radius of the sphere over the distance of the farthest Gaussian."""
+
+NEAREST = 6
+"""Filled cells met by rays of photos, that lend their colours to a cell."""
+
+SIZE_SHARE = 0.7
+FLATNESS = 0.15
+OPACITY = 0.95
+"""Standard deviations along the sphere, over the distance of cells, and across it; opacity."""
+
+
+def with_backdrop(
+    gaussians: OrientedGaussians, photos: PhotoSource, views: Iterable[int],
+    renderer: Renderer | None = None, *, threads: int = 0,
+) -> OrientedGaussians:  # fmt: skip
+    """Return trained Gaussians with a sphere behind them, open where the photos see through.
+
+    ``views`` are the training views. A renderer given overwrites its last view.
+    """
+    farthest = float(gaussians.means.norm(dim=1).max()) if len(gaussians) else 0.0
+    radius = max(LEAST_REACH, REACH_FACTOR * farthest)
+    directions = fibonacci_directions(DIRECTIONS)
+    tree = cKDTree(directions)
+    through, seen = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
+    colors = np.zeros((DIRECTIONS, 3))
+    raw, renderer = RawArrays.from_gaussians(gaussians.detached()), renderer or ViewRenderer()
+    options = RenderOptions(depth=False, threads=threads)
+    for view in views:
+        camera = photos.camera(view, divisor_for(photos, view, LONGEST_PX))
+        image = renderer.render(raw, camera, options)
+        rays = (camera.rays() @ camera.rotation).reshape(-1, 3)  # (p, 3) scene frame
+        cell = tree.query(onto_sphere(camera.center, rays, radius))[1]
+        pixels = np.bincount(cell, minlength=DIRECTIONS)
+        passed = np.bincount(cell, 1.0 - image.alpha.reshape(-1), minlength=DIRECTIONS)
+        np.maximum(through, passed / np.maximum(pixels, 1), out=through)
+        seen += pixels
+        for channel in range(3):
+            values = image.color[..., channel].reshape(-1)
+            colors[:, channel] += np.bincount(cell, values, minlength=DIRECTIONS)
+    filled = through <= CLEAR_TRANSMITTANCE
+    met = np.flatnonzero(filled & (seen > 0))  # open cells would lend black
+    if len(met) == 0:
+        return gaussians
+    count, step = int(filled.sum()), np.sqrt(4.0 * np.pi / DIRECTIONS)
+    known = colors[met] / seen[met, None]
+    away, nearest = cKDTree(directions[met]).query(directions[filled], k=min(NEAREST, len(met)))
+    away, nearest = away.reshape(count, -1), nearest.reshape(count, -1)
+    weight = 1.0 / (away**2 + (0.5 * step) ** 2)  # (count, k)
+    color = (known[nearest] * weight[..., None]).sum(1) / weight.sum(1, keepdims=True)
+    _logger.info("backdrop: %d Gaussians where no photo sees through", count)
+    sphere = gaussians_at(
+        radius * directions[filled], np.clip(color, 0.0, 1.0),
+        np.full(count, SIZE_SHARE * radius * step), gaussians.sh_degree,
+        normals=-directions[filled], flatness=FLATNESS, opacities=OPACITY,
+    )  # fmt: skip
+    return gaussians.joined(sphere)

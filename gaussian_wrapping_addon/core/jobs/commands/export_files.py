@@ -228,7 +228,7 @@ def _write_mesh(
             path, local @ frame.turn.T, mesh.faces, mesh.corner_uvs,
             copy_names["albedo"], copy_names["normal"], mesh.face_atlas,
         )  # fmt: skip
-    else:
+    elif format == "glb":
         maps = {
             f"{name}_png": [_png(file) for file in files]
             for name in ("normal", "occlusion")
@@ -242,6 +242,8 @@ def _write_mesh(
             path, local, mesh.faces, mesh.corner_uvs, albedo_png, frame.offset,
             shading=shading, face_atlas=mesh.face_atlas, **maps,
         )  # fmt: skip
+    else:
+        raise UsageError(f"The worker writes no {format} files.", "Export it from Blender.")
     contents = {
         "region": mesh.region, "level": mesh.level, "shading": shading, "textures": textures,
         "vertices": len(mesh.vertices), "faces": len(mesh.faces),
