@@ -6,7 +6,7 @@
 
 Only files that end in ``.py`` count. "Called in one place" counts the names of functions and
 methods for which the package has exactly one call of that name. Parameters exclude ``self`` and
-``cls``, and functions that are compiled (``kernel``, ``part``, ``inline``, ``intrinsic``) are left
+``cls``, and functions that are compiled (``kernel``, ``part``, ...) are left
 out there. The options of ``wrap`` are those that ``wrap --help`` shows in a process of that tree.
 """
 
@@ -28,7 +28,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "gaussian_wrapping_addon"
-COMPILED = {"kernel", "part", "inline", "intrinsic"}
+COMPILED = {"kernel", "part", "inline", "intrinsic", "compile_time"}
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 _NO_CODE = {
     tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT,

@@ -323,7 +323,7 @@ def _tanks(
     samples = request.samples or TANKS_SAMPLES
     protocols = _protocols(request, cameras)
     scores = score_tanks(
-        *mesh, cameras, scene, start,
+        mesh, cameras, scene, start,
         refine=align == "icp", protocols=protocols, samples=samples,
         seed=request.seed, threads=request.threads, progress=progress.span(0.1, 1.0),
     )  # fmt: skip

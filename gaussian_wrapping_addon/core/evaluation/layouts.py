@@ -433,7 +433,7 @@ def align_to_log(cameras: Sequence[Camera], scene: TanksScene, *, seed: int) -> 
 
 
 def score_tanks(
-    vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera], scene: TanksScene,
+    mesh: tuple[np.ndarray, np.ndarray], cameras: Sequence[Camera], scene: TanksScene,
     start: Similarity, *, refine: bool, protocols: Sequence[str], samples: int = SAMPLES,
     seed: int = 0, threads: int = 1, progress: Progress | None = None,
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
@@ -444,7 +444,7 @@ def score_tanks(
     surface seen by the cameras, downsampled to voxels of tau / 4. ``legacy`` uses vertices and
     face centres. Each is refined separately, as in the original scripts.
 
-    Vertices (v, 3) and faces (f, 3) are in the job's frame, like the cameras; ``start`` is
+    The mesh is vertices (v, 3) and faces (f, 3) in the job's frame, like the cameras; ``start`` is
     ``truth_from_job`` before the refinement. Returns for each protocol ``score``, ``transform``
     and ``refinement`` (or ``None``), plain JSON values.
 
@@ -455,6 +455,7 @@ def score_tanks(
     DatasetError
         The refinement finds no correspondences, or the crop holds no truth.
     """
+    vertices, faces = mesh
     progress = progress or Progress()
     truth = scene.cloud[scene.crop.inside(scene.cloud)]
     if len(truth) == 0:

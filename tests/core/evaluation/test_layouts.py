@@ -264,12 +264,12 @@ def test_a_scan_of_the_true_mesh_scores_one(scene: Path) -> None:
     start = align_to_log(cameras, tanks, seed=0).transform
     placed = JOB_FROM_TRUTH.points(MESH[0])
     result = score_tanks(
-        placed, MESH[1], cameras[::2], tanks, start, refine=False, protocols=("scan",)
+        (placed, MESH[1]), cameras[::2], tanks, start, refine=False, protocols=("scan",)
     )["scan"]
     assert result["score"]["f1"] >= 0.99
     assert result["refinement"] is None
     with pytest.raises(UsageError, match="needs cameras"):
-        score_tanks(placed, MESH[1], [], tanks, start, refine=False, protocols=("scan",))
+        score_tanks((placed, MESH[1]), [], tanks, start, refine=False, protocols=("scan",))
 
 
 def test_a_mesh_that_is_wrong_in_one_half_loses_that_half(scene: Path) -> None:
@@ -279,7 +279,7 @@ def test_a_mesh_that_is_wrong_in_one_half_loses_that_half(scene: Path) -> None:
     start = align_to_log(cameras, tanks, seed=0).transform
     placed = JOB_FROM_TRUTH.points(vertices)
     score = score_tanks(
-        placed, faces, cameras, tanks, start,
+        (placed, faces), cameras, tanks, start,
         refine=False, protocols=("uniform",), samples=40_000,
     )["uniform"]["score"]  # fmt: skip
     # Within tau of the seam, true points of the other half are met too.
@@ -288,7 +288,7 @@ def test_a_mesh_that_is_wrong_in_one_half_loses_that_half(scene: Path) -> None:
     # The half alone is refined to its place: it is precise, and complete by half.
     half = faces[faces.max(1) < len(MESH[0])]
     score = score_tanks(
-        placed, half, cameras, tanks, start,
+        (placed, half), cameras, tanks, start,
         refine=True, protocols=("uniform",), samples=20_000,
     )["uniform"]["score"]  # fmt: skip
     assert score["precision"] >= 0.995
@@ -303,8 +303,7 @@ def test_the_same_seed_gives_the_same_figures(scene: Path) -> None:
     placed = JOB_FROM_TRUTH.points(MESH[0])
     first, second = (
         score_tanks(
-            placed,
-            MESH[1],
+            (placed, MESH[1]),
             [],
             tanks,
             start,
