@@ -7,6 +7,7 @@ the file, finishes its job or resumes it, and says as its last line of JSON what
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import sys
@@ -33,9 +34,7 @@ def say(**values: object) -> None:
 def start(blend: Path, photos: Path, keep: bool) -> Path:
     """Start a job and save the file."""
     choice = worker_setup.worker_choice(bpy.context)
-    worker_setup.worker_choice = lambda _context: worker_setup.WorkerChoice(
-        choice.python, choice.threads, keep
-    )
+    jobs.worker_choice = lambda _context: dataclasses.replace(choice, keep_running=keep)
     properties = bpy.context.scene.gwrap
     properties.preset = "DRAFT"
     # The fake worker heeds none of this; the real one is done the sooner.
