@@ -105,7 +105,7 @@ def four_layers(sigma: float) -> OrientedGaussians:
 
 # A sigma of 1e-4 is 1e-7 and 1e-9 of the depth: float32 depths (column z of the screen rows, the
 # solver's t) stand 6e-8 apart, so single layers are not resolved: depths are exact to their
-# rounding (five of them with 16 lanes, six with 8), and the gradient of the depth is not.
+# rounding (six of them in the worst case seen), and the gradient of the depth is not.
 @pytest.mark.parametrize("distance", [1e3, 1e5])
 def test_item_02_tiny_and_far(distance: float) -> None:
     camera = front_camera(focal=1.5e4 * distance, distance=distance)
