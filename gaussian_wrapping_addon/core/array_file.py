@@ -39,7 +39,7 @@ _HEADERS = {
 def write_arrays(path: Path, **arrays: np.ndarray) -> None:
     """Write arrays as ``numpy.savez`` does, atomically. Raises OSError: that failed."""
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **arrays)
+    np.savez(stream, **arrays)
     write_bytes(path, stream.getvalue())
 
 

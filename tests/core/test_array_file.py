@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.array_file import is_whole, read_arrays
+from gaussian_wrapping_addon.core.array_file import is_whole, read_arrays, write_arrays
 from gaussian_wrapping_addon.core.errors import ParseError
 
 
@@ -160,3 +160,11 @@ def test_a_link_is_no_file_of_a_stage(file: Path, tmp_path: Path) -> None:
 def test_the_limit_counts_what_is_read(file: Path) -> None:
     compress(file)
     assert list(read_arrays(file, ("b",), most_bytes=1000)) == ["b"]
+
+
+def test_what_is_written_is_what_was_given(tmp_path: Path) -> None:
+    given = {"a": np.arange(3), "b": np.ones((2, 2), np.float32)}
+    write_arrays(tmp_path / "x.npz", **given)
+    with np.load(tmp_path / "x.npz") as stored:
+        assert sorted(stored.files) == ["a", "b"]
+        assert all((stored[name] == array).all() for name, array in given.items())

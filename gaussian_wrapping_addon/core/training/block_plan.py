@@ -6,7 +6,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import io
 import json
 import logging
 import math
@@ -18,9 +17,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..array_file import read_arrays
+from ..array_file import read_arrays, write_arrays
 from ..errors import ParseError, UsageError
-from ..files import read_json, write_bytes, write_json
+from ..files import read_json, write_json
 from ..gaussians.model import OrientedGaussians
 from ..limits import MAX_BLOCKS
 from ..parallel import default_threads
@@ -329,9 +328,7 @@ _EXPOSURE = ("values", "trained", "first", "second", "steps")
 
 def save_plan(folder: Path, plan: BlockPlan) -> None:
     """Write a plan into a folder; both files are replaced atomically."""
-    stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **plan.to_arrays())
-    write_bytes(folder / ARRAYS_NAME, stream.getvalue())
+    write_arrays(folder / ARRAYS_NAME, **plan.to_arrays())
     write_json(
         folder / PLAN_NAME, {"version": VERSION, "digest": plan.digest, "plan": plan.to_json()}
     )

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon import batch
+from gaussian_wrapping_addon.command_line import setup_command
 from gaussian_wrapping_addon.core.errors import (
     EXIT_CANCELLED,
     EXIT_RESOURCES,
@@ -370,7 +371,7 @@ def test_the_build_for_cuda_is_offered_where_there_is_a_driver(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(install, "cuda_present", lambda: driver)
+    monkeypatch.setattr(setup_command, "cuda_present", lambda: driver)
     words = ["set-up-worker", "--dry-run", "--python", sys.executable, "--torch", torch]
     assert batch.main([*words, "--to", str(tmp_path / "env")]) == 0
     told = capfd.readouterr()

@@ -202,7 +202,7 @@ def test_too_little_memory_names_the_block_and_may_work_elsewhere(
     def full(*_: object, **__: object) -> None:
         raise MemoryError("Unable to allocate 9 GiB")
 
-    monkeypatch.setattr(block_module, "train_block", full)
+    monkeypatch.setattr(block_module, "block_training", full)
     with pytest.raises(ResourceError, match="Block 1 ran out of memory") as caught:
         trained(folder, job)
     assert "--set blocks" in caught.value.hint
