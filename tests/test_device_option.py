@@ -20,7 +20,7 @@ from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, EXIT_USAGE, Devic
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.jobs import runner
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.commands import device_check
+from gaussian_wrapping_addon.core.jobs.commands import device_check, doctor
 from gaussian_wrapping_addon.core.jobs.parts import runner as part_runner
 from gaussian_wrapping_addon.core.jobs.stages.meshing import mesh_key
 from gaussian_wrapping_addon.core.jobs.store.job_file import (
@@ -132,7 +132,7 @@ def test_with_a_driver_the_workers_python_decides(
 def test_a_worker_that_says_nothing_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(devices.choice, "device_count", lambda: 1)
     answers = [(1, "", "Traceback\nthe last line"), (0, '{"device": "cuda:0"}\n', "")]
-    monkeypatch.setattr(device_check, "run_to_end", lambda *_: answers.pop(0))
+    monkeypatch.setattr(doctor, "run_to_end", lambda *_: answers.pop(0))
     with pytest.raises(device_check.WorkerError, match="without a result: the last line"):
         device_check.require_device("cuda")
     device_check.require_device("cuda")

@@ -219,7 +219,7 @@ def test_a_worker_ends_with_its_caller_even_if_that_dies_first(
     tmp_path: Path, late_s: float, alive_s: float
 ) -> None:
     pid = abandon_worker(tmp_path, late_s=late_s, alive_s=alive_s, keep=False)
-    end_s = time.monotonic() + 4.0
+    end_s = time.monotonic() + 30.0
     while process_alive(pid, 0) and time.monotonic() < end_s:
         time.sleep(0.02)
     assert not process_alive(pid, 0), "an orphan works on"
@@ -232,7 +232,7 @@ def test_a_worker_ends_with_its_caller_even_if_that_dies_first(
 def test_a_worker_that_was_told_to_continue_outlives_its_caller(tmp_path: Path) -> None:
     pid = abandon_worker(tmp_path, late_s=0.0, alive_s=0.0, keep=True)
     folder = JobFolder(tmp_path / "out")
-    end_s = time.monotonic() + 5.0
+    end_s = time.monotonic() + 30.0
     while folder.read_status().state != "RUNNING" and time.monotonic() < end_s:
         time.sleep(0.02)
     time.sleep(0.3)  # several polls
