@@ -10,7 +10,6 @@ from tests.hostile.case import Build, Case, Group, Needs, Variant
 from tests.hostile.inputs import file, json_file, link, nothing, pipe, steps
 from tests.hostile.jobs import begun
 
-_CORE = "tests/core/farm"
 _VAST = b" " * (limits.MAX_PARTS_BYTES + 1)
 _AGAIN = r"batch\.py parts DIR"
 _LOOK = ("run-part", "out", "cameras")
@@ -66,8 +65,8 @@ _LISTS = Case(
     ),
     (
         "tests/core/jobs/parts/test_graph.py::test_what_does_not_fit_is_refused",
-        f"{_CORE}/test_part_states.py::test_damaged_states_count_as_left",
-        f"{_CORE}/test_part_states.py::test_odd_entries_do_no_harm",
+        "tests/core/jobs/parts/test_graph.py::test_damaged_states_count_as_left",
+        "tests/core/jobs/parts/test_graph.py::test_odd_entries_do_no_harm",
     ),
 )  # fmt: skip
 

@@ -151,7 +151,7 @@ _HEADERS = Case(
         _bad("no format", _replaced("format bin", "comment bin"), rf"the format line.*{_EXPECTED}"),
         _bad("0 bytes", file("set.ply"), rf"set\.ply, byte 0: not a PLY file.*{_EXPECTED}"),
     ),
-    (f"{_FOREIGN}::test_files_cut_anywhere_are_refused",),
+    (f"{_FOREIGN}::test_foreign_files_cut_anywhere_are_refused",),
 )
 
 
@@ -206,7 +206,7 @@ _VALUES = Case(
             3,
         ),
     ),
-    (f"{_FOREIGN}::test_senseless_gaussians_are_dropped_and_counted",),
+    (f"{_FOREIGN}::test_senseless_foreign_gaussians_are_dropped_and_counted",),
 )
 
 _TRIANGLE = (
