@@ -46,22 +46,7 @@ def require_bpy(job: JobFile, options: Namespace) -> None:
 
 
 def run_in_worker(request: dict[str, Any], *, module: str, what: str, grace_s: float = 2.0) -> int:
-    """Run a command in the worker's Python, log its output, and return its exit code.
-
-    Parameters
-    ----------
-    request : dict
-        What the child's module takes; plain JSON values.
-    module, what : str
-        The child's module, and its name in errors; all commands use the protocol above.
-    grace_s : float
-        Time in which it may end by itself when this is interrupted.
-
-    Raises
-    ------
-    WorkerError
-        It does not start, or ends without reporting an error.
-    """
+    """Run a command in the Python of the worker that is set up, as that of ``core`` does."""
     from ..core.jobs.client import worker_python
     from ..core.jobs.commands import run_in_worker as commands
 

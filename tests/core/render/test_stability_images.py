@@ -104,14 +104,14 @@ def four_layers(sigma: float) -> OrientedGaussians:
 
 
 # A sigma of 1e-4 is 1e-7 and 1e-9 of the depth: float32 depths (column z of the screen rows, the
-# solver's t) stand 6e-8 apart, so single layers are not resolved: depths are exact to their
-# rounding (six of them in the worst case seen), and the gradient of the depth is not.
+# solver's t) round to 2^-24 of it, so single layers are not resolved: depths are exact to six
+# roundings of the blending, and the gradient of the depth is not.
 @pytest.mark.parametrize("distance", [1e3, 1e5])
 def test_item_02_tiny_and_far(distance: float) -> None:
     camera = front_camera(focal=1.5e4 * distance, distance=distance)
     verdict = judge(four_layers(1e-4), camera, digits=DIGITS, gradient_digits=0)
     verdict.assert_within(
-        blended=1e-6, depth=4e-7, gradient=1e-5, depth_gradient=2.0, depth_count=15
+        blended=1e-6, depth=6 * 2.0**-24, gradient=1e-5, depth_gradient=2.0, depth_count=15
     )
 
 

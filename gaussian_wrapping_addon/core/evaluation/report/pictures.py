@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import html
 import io
 import math
 from collections.abc import Sequence
@@ -23,9 +24,10 @@ from .figures import items, measured, part
 # -- The learning curve as SVG, without a plotting library ----------------------------------------
 
 
-_COLORS = ("#0072b2", "#d55e00")  # distinguishable by colour-blind readers (Okabe and Ito)
-_WIDTH, _HEIGHT = 460, 360
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 34, 46
+COLORS = ("#0072b2", "#d55e00")  # distinguishable by colour-blind readers (Okabe and Ito)
+PLOT_WIDTH, PLOT_HEIGHT = 460, 360
+PLOT_LEFT, PLOT_RIGHT, PLOT_TOP, PLOT_BOTTOM = 62, 14, 34, 46
+PLOT_INNER = (PLOT_WIDTH - PLOT_LEFT - PLOT_RIGHT, PLOT_HEIGHT - PLOT_TOP - PLOT_BOTTOM)
 _TICKS = 6
 _MARGIN = 0.06  # margin around the points of an axis, as a share of their spread
 MAX_DOTS = 20  # curves with more points are drawn as a line without dots
@@ -33,7 +35,7 @@ MAX_DOTS = 20  # curves with more points are drawn as a line without dots
 _Points = list[tuple[float, float]]
 
 
-def _axis(values: Sequence[float]) -> tuple[float, float, list[float]]:
+def linear_axis(values: Sequence[float]) -> tuple[float, float, list[float]]:
     """Return the ends of an axis and its ticks."""
     spread = max(values) - min(values) or abs(values[0]) or 1.0
     begin, end = min(values) - _MARGIN * spread, max(values) + _MARGIN * spread
@@ -44,29 +46,71 @@ def _axis(values: Sequence[float]) -> tuple[float, float, list[float]]:
     return begin, end, [step * k for k in range(first, last + 1)]
 
 
-def _text(x: float, y: float, content: str, anchor: str = "middle", extra: str = "") -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{extra}>{content}</text>'
+def svg_text(x: float, y: float, content: str, anchor: str = "middle", extra: str = "") -> str:
+    """Return an SVG text; ``extra`` are further attributes."""
+    attributes = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{extra}'
+    return f"<text {attributes}>{html.escape(content)}</text>"
 
 
-def _dot(x: float, y: float, color: str) -> str:
+def svg_dot(x: float, y: float, color: str) -> str:
+    """Return the dot of a point in SVG."""
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{color}"/>'
+
+
+def svg_line(places: Sequence[tuple[float, float]], color: str) -> str:
+    """Return a line through points (pixels) in SVG."""
+    path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+    return f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="1.5"/>'
+
+
+def svg_frame(title: str, x_label: str, y_label: str, left: int, top: int) -> list[str]:
+    """Return the frame and the titles of a diagram whose corner is there (pixels), as SVG."""
+    width, height = PLOT_INNER
+    middle_x, middle_y = left + PLOT_LEFT + width / 2, top + PLOT_TOP + height / 2
+    turned = f' transform="rotate(-90 {left + 14} {middle_y:.1f})"'
+    corner = f'x="{left + PLOT_LEFT}" y="{top + PLOT_TOP}"'
+    return [
+        f'<rect {corner} width="{width}" height="{height}" fill="none" stroke="#888"/>',
+        svg_text(middle_x, top + 20, title, extra=' font-weight="bold"'),
+        svg_text(middle_x, top + PLOT_HEIGHT - 8, x_label),
+        svg_text(left + 14, middle_y, y_label, extra=turned),
+    ]
+
+
+def svg_ticks(
+    x_ticks: Sequence[tuple[float, str]], y_ticks: Sequence[tuple[float, str]], left: int, top: int
+) -> list[str]:
+    """Return the grid lines of a diagram: pixels and labels of its ticks, as SVG."""
+    x0, y0 = left + PLOT_LEFT, top + PLOT_TOP
+    width, height = PLOT_INNER
+    parts = []
+    for x, label in x_ticks:
+        parts.append(f'<path d="M{x:.1f} {y0}V{y0 + height}" stroke="#ddd" stroke-width="0.7"/>')
+        parts.append(svg_text(x, y0 + height + 15, label))
+    for y, label in y_ticks:
+        parts.append(f'<path d="M{x0} {y:.1f}h{width}" stroke="#ddd" stroke-width="0.7"/>')
+        parts.append(svg_text(x0 - 5, y + 4, label, "end"))
+    return parts
+
+
+def svg_document(parts: Sequence[str], width: int, height: int) -> bytes:
+    """Return the file of a drawing of that size (pixels) on white."""
+    size = f'width="{width}" height="{height}"'
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size} viewBox="0 0 {width} {height}" '
+        'font-family="sans-serif" font-size="11">'
+    )
+    lines = [head, f'<rect {size} fill="white"/>', *parts, "</svg>"]
+    return ("\n".join(lines) + "\n").encode()
 
 
 def _diagram(title: str, y_label: str, curves: dict[str, _Points], left: int) -> list[str]:
     """Return a diagram over the iterations, of curves by their names."""
-    width, height = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
-    x0, y0 = left + _LEFT, _TOP
-    middle_x, middle_y = x0 + width / 2, y0 + height / 2
-    turned = f' transform="rotate(-90 {left + 14} {middle_y:.1f})"'
-    parts = [
-        f'<rect x="{x0}" y="{y0}" width="{width}" height="{height}" fill="none" stroke="#888"/>',
-        _text(middle_x, 20, title, extra=' font-weight="bold"'),
-        _text(middle_x, _HEIGHT - 8, "iteration"),
-        _text(left + 14, middle_y, y_label, extra=turned),
-    ]
+    width, height = PLOT_INNER
+    x0, y0 = left + PLOT_LEFT, PLOT_TOP
     points = [point for curve in curves.values() for point in curve]
     (x_low, x_high, x_ticks), (y_low, y_high, y_ticks) = (
-        _axis([p[k] for p in points]) for k in (0, 1)
+        linear_axis([p[k] for p in points]) for k in (0, 1)
     )
 
     def across(value: float) -> float:
@@ -75,25 +119,19 @@ def _diagram(title: str, y_label: str, curves: dict[str, _Points], left: int) ->
     def up(value: float) -> float:
         return y0 + height * (1.0 - (value - y_low) / (y_high - y_low))
 
-    for value in x_ticks:
-        x = across(value)
-        parts.append(f'<path d="M{x:.1f} {y0}V{y0 + height}" stroke="#ddd" stroke-width="0.7"/>')
-        parts.append(_text(x, y0 + height + 15, f"{value:.6g}"))
-    for value in y_ticks:
-        y = up(value)
-        parts.append(f'<path d="M{x0} {y:.1f}h{width}" stroke="#ddd" stroke-width="0.7"/>')
-        parts.append(_text(x0 - 5, y + 4, f"{value:.6g}", "end"))
+    ticks = (
+        [(across(value), f"{value:.6g}") for value in x_ticks],
+        [(up(value), f"{value:.6g}") for value in y_ticks],
+    )
+    parts = [*svg_frame(title, "iteration", y_label, left, 0), *svg_ticks(*ticks, left, 0)]
     for number, (name, curve) in enumerate(curves.items()):
-        color, places = _COLORS[number], [(across(x), up(y)) for x, y in curve]
+        color, places = COLORS[number], [(across(x), up(y)) for x, y in curve]
         if len(places) > 1:
-            path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-            parts.append(
-                f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="1.5"/>'
-            )
+            parts.append(svg_line(places, color))
         if len(places) <= MAX_DOTS:
-            parts += [_dot(x, y, color) for x, y in places]
+            parts += [svg_dot(x, y, color) for x, y in places]
         y = y0 + 14 + 15 * number
-        parts += [_dot(x0 + 10, y - 4, color), _text(x0 + 18, y, name, "start")]
+        parts += [svg_dot(x0 + 10, y - 4, color), svg_text(x0 + 18, y, name, "start")]
     return parts
 
 
@@ -224,17 +262,9 @@ def write_learning_curve(training: dict[str, Any], path: Path) -> bool:
     end, held_out = measured(training.get("iterations")), measured(training.get("held_out_psnr"))
     if end is not None and held_out is not None:
         curves["held-out photos (mean, at the end)"] = [(end, held_out)]
-    size = f'width="{2 * _WIDTH}" height="{_HEIGHT}"'
-    head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" {size} viewBox="0 0 {2 * _WIDTH} {_HEIGHT}" '
-        'font-family="sans-serif" font-size="11">'
-    )
-    lines = [
-        head,
-        f'<rect {size} fill="white"/>',
+    parts = [
         *_diagram("Image quality", "PSNR (dB)", curves, 0),
-        *_diagram("Model size", "Gaussians (thousands)", {"Gaussians": count}, _WIDTH),
-        "</svg>",
+        *_diagram("Model size", "Gaussians (thousands)", {"Gaussians": count}, PLOT_WIDTH),
     ]
-    write_bytes(path, ("\n".join(lines) + "\n").encode())
+    write_bytes(path, svg_document(parts, 2 * PLOT_WIDTH, PLOT_HEIGHT))
     return True
