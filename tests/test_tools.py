@@ -143,6 +143,7 @@ def test_the_tests_that_execute_a_line_are_taken(tree: Path, tmp_path: Path) -> 
     assert select.tests(unmeasured, found[key]) == (["tests/test_shapes.py"], "names")
 
 
+@pytest.mark.proof
 def test_two_trees_are_compared_by_the_same_faults(
     tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

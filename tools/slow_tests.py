@@ -62,8 +62,8 @@ def main() -> int:
     """Read a log and write the list."""
     parser = argparse.ArgumentParser(description="Write tests/slow_tests.txt.")
     parser.add_argument("log", type=Path, help="output of pytest --durations=0")
-    parser.add_argument("--limit", type=float, default=0.5, metavar="SECONDS")
-    parser.add_argument("--setup-limit", type=float, default=2.0, metavar="SECONDS")
+    parser.add_argument("--limit", type=float, default=0.2, metavar="SECONDS")
+    parser.add_argument("--setup-limit", type=float, default=1.0, metavar="SECONDS")
     options = parser.parse_args()
     entries, left_s = slow_entries(
         options.log.read_text(encoding="utf-8"), options.limit, options.setup_limit

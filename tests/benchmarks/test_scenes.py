@@ -44,6 +44,7 @@ from gaussian_wrapping_addon.core.meshing.checks import validate_manifold
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.scene_regions import read_region
 from gaussian_wrapping_addon.core.scene.camera import Camera
+from tests.proofs import first_then_proofs
 
 for _module in ("bpy", "embreex"):
     if importlib.util.find_spec(_module) is None:
@@ -111,6 +112,7 @@ def test_true_meshes_of_things_are_closed_and_lie_in_their_region(name: str) -> 
     assert not content.region.contains(others).any()
 
 
+@pytest.mark.proof
 def test_the_rooms_truth_is_one_closed_solid_around_its_free_space(
     folders: dict[str, Path],
 ) -> None:
@@ -129,7 +131,7 @@ def test_the_rooms_truth_is_one_closed_solid_around_its_free_space(
     assert not crop.contains(vertices).all()  # the outer side of the walls is not judged
 
 
-@pytest.mark.parametrize("name", ["spot", "room"])
+@pytest.mark.parametrize("name", first_then_proofs(["spot", "room"]))
 def test_photos_show_the_geometry_where_the_cameras_say(name: str, tmp_path: Path) -> None:
     content = _apart(scene_content, scene_kind(name), 4, 2, (320, 240))
     shown = [not part.surrounding for part in content.parts]

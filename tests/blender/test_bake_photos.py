@@ -153,6 +153,7 @@ def test_udim_tiles_become_one_tiled_image(job: JobFolder) -> None:
     assert psnr_of_textures(bpy.context.object) > GOOD_DB
 
 
+@pytest.mark.proof
 def test_modifiers_are_baked_for_and_stay(job: JobFolder) -> None:
     import_ball(job)
     thing = add_ball(uvs=True)
@@ -164,6 +165,7 @@ def test_modifiers_are_baked_for_and_stay(job: JobFolder) -> None:
     assert psnr_of_textures(thing) > GOOD_DB
 
 
+@pytest.mark.proof
 def test_fewer_faces_become_a_lighter_object_with_a_normal_map(job: JobFolder) -> None:
     frame = import_ball(job)
     thing = add_ball()

@@ -55,6 +55,7 @@ def region_of(folder: Path) -> bpy.types.Object:
     return region
 
 
+@pytest.mark.proof
 def test_the_workers_answer_is_shown_until_something_changes(tmp_path: Path) -> None:
     if importlib.util.find_spec("torch") is None:
         pytest.skip("the worker of this test is this Python, which has no torch")

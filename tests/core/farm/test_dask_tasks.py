@@ -144,6 +144,7 @@ def test_a_cluster_whose_workers_have_all_ended_is_told(
     own.close(0.0)
 
 
+@pytest.mark.proof
 def test_a_scheduler_that_is_gone_is_told_whatever_is_asked(tmp_path: Path) -> None:
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))

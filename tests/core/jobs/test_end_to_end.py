@@ -276,6 +276,7 @@ def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str
     assert np.median(distance) < 0.03
 
 
+@pytest.mark.proof
 def test_fewer_faces_get_a_normal_map_occlusion_and_levels(
     wrapped: tuple[BallScene, Path, str],
 ) -> None:
@@ -359,6 +360,7 @@ def test_a_region_is_estimated_and_meshed_in_tiles_by_two_processes(
     assert not list((root / "out" / "stages").glob("mesh-tiled-*/tiles*"))
 
 
+@pytest.mark.proof
 def test_a_killed_training_resumes_to_the_same_gaussians(
     wrapped: tuple[BallScene, Path, str], tmp_path: Path
 ) -> None:

@@ -72,6 +72,7 @@ def test_the_coarse_training_is_not_done_without_its_plan(alone: JobFolder) -> N
         aside.rename(path)
 
 
+@pytest.mark.proof
 def test_two_processes_train_blocks_side_by_side_to_the_same_gaussians(
     alone: JobFolder, tmp_path: Path
 ) -> None:

@@ -65,6 +65,7 @@ def test_two_processes_make_the_mesh_of_one_though_a_part_of_each_kind_is_killed
     assert not list(running(folder))
 
 
+@pytest.mark.proof
 def test_dask_workers_that_die_are_replaced(alone: JobFolder, tmp_path: Path) -> None:
     folder, job = tiled_sphere(tmp_path, computers="local", processes=2)
     killed: dict[str, tuple[int, int]] = {}

@@ -172,6 +172,7 @@ def test_a_scheduler_that_is_killed_ends_the_job_with_a_sentence_and_loses_nothi
     assert {name: states(folder)[name].token for name in kept} == {n: done[n] for n in kept}
 
 
+@pytest.mark.proof
 def test_a_worker_of_another_version_is_told(farm: Farm, tmp_path: Path) -> None:
     other = tmp_path / "older" / PACKAGE.name
     shutil.copytree(PACKAGE, other, ignore=shutil.ignore_patterns("__pycache__"))

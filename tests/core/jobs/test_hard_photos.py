@@ -265,6 +265,7 @@ def test_the_command_line_says_what_is_wrong(name: str, tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "result").exists()
 
 
+@pytest.mark.proof
 def test_the_command_line_meshes_wide_photos(tmp_path: Path) -> None:
     source = MESHED["10 120 degrees"].write(tmp_path / "input")
     done = batch(

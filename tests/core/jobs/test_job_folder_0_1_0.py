@@ -128,7 +128,7 @@ def test_another_region_is_meshed_from_its_training(job: JobFolder) -> None:
     assert report(job)["regions"]["half"]["check"]["good"] is True
 
 
-@pytest.mark.slow
+@pytest.mark.proof
 def test_more_goes_on_from_its_checkpoint(job: JobFolder) -> None:
     before, earlier = stages(job), report(job)["training"]
     batch(job, "more", "--out", "job", "--iterations", "20", "--no-blend")

@@ -60,6 +60,7 @@ def planned(tmp_path: Path) -> JobFolder:
     return folder
 
 
+@pytest.mark.proof
 @pytest.mark.timeout(900)
 def test_a_job_made_part_by_part_is_the_job(planned: JobFolder, tmp_path: Path) -> None:
     names = [part.name for part in read_parts(planned.root).parts]
@@ -121,6 +122,7 @@ def test_exit_codes_say_what_a_farm_may_do(planned: JobFolder) -> None:
     assert (code, f"is run by process {os.getpid()}" in said) == (2, True)
 
 
+@pytest.mark.proof
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM")
 def test_a_part_that_is_told_to_end_says_that_it_may_work_elsewhere(planned: JobFolder) -> None:
     for name in ("cameras", "train"):
@@ -139,6 +141,7 @@ def test_a_part_that_is_told_to_end_says_that_it_may_work_elsewhere(planned: Job
     assert run(planned, "plan-ball")[0] == 0
 
 
+@pytest.mark.proof
 @pytest.mark.skipif(sys.platform == "win32", reason="no small disk is mounted there")
 def test_a_part_on_a_full_disk_says_so_and_that_it_may_work_later(tmp_path: Path) -> None:
     with mounted_disk(tmp_path / "disk") as disk:

@@ -90,12 +90,14 @@ def test_an_impossible_length_of_a_single_region(
         make_job("mesh", Path(earlier.source), settings, {str(box): length})
 
 
+@pytest.mark.proof
 def test_no_length_is_the_automatic_one(sphere: tuple[JobFolder, Path]) -> None:
     asked = [batch("estimate-mesh", sphere, *more) for more in ((), ("--edge-length", "0"))]
     counts = [re.search(r"triangles: .*", said).group() for _, said in asked]  # type: ignore[union-attr]
     assert counts[0] == counts[1]
 
 
+@pytest.mark.proof
 def test_a_length_beyond_the_region_is_clamped_and_said(sphere: tuple[JobFolder, Path]) -> None:
     folder, _ = sphere
     words = "was larger than 1/8 of the region's diagonal"

@@ -155,6 +155,7 @@ def test_the_mesh_has_the_same_bits(meshed: dict[str, Path], name: str) -> None:
             np.testing.assert_array_equal(own[array], base[array], err_msg=array)
 
 
+@pytest.mark.proof
 @pytest.mark.parametrize("name", list(SIMILARITIES))
 @pytest.mark.parametrize("file", ["mesh.ply", "mesh.obj", "mesh.glb"])
 def test_files_hold_the_mesh_after_undoing_the_similarity(

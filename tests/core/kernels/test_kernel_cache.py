@@ -146,6 +146,7 @@ def block_caches(package: Path) -> None:
         (folder / "__pycache__").touch()
 
 
+@pytest.mark.proof
 def test_without_any_place_kernels_work_and_one_line_says_so(installed: Path) -> None:
     block_caches(installed / PACKAGE.name)
     environment = {"HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE, "LOCALAPPDATA": NOWHERE}

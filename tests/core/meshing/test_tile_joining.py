@@ -41,6 +41,7 @@ from tests.core.meshing.meshing_scenes import (
 )
 from tests.core.meshing.test_tiles import SHAPES, points_on_sheet
 from tests.core.meshing.tiled_meshing import LabelledTiles, labelled_tiles
+from tests.proofs import first_then_proofs
 
 SIGMA = 0.02
 ALL_PARTS = MeshingSettings(points=1, min_component_share=0.0)
@@ -159,6 +160,7 @@ def peak_bytes(work: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
+@pytest.mark.proof
 def test_memory_is_that_of_the_simplified_mesh(tmp_path: Path) -> None:
     tiles = labelled(torus(), cube(1.5), 12, 4000, spacing="adaptive")
     # The simplified mesh is a fiftieth, so that the dense one decides where it is held.
@@ -223,7 +225,7 @@ def test_a_face_is_of_the_surface_where_one_side_of_it_is_solid() -> None:
     np.testing.assert_array_equal(border.close(np.array([1, 7])), face)  # the region's boundary
 
 
-@pytest.mark.parametrize("share", [1.0, 0.2])
+@pytest.mark.parametrize("share", first_then_proofs([0.2, 1.0]))
 def test_joined_at_once_or_not_labels_full_of_touching_parts_become_manifold(share: float) -> None:
     tiles = blotchy_tiles()
     tiles = dataclasses.replace(tiles, plan=dataclasses.replace(tiles.plan, share=share))

@@ -298,7 +298,7 @@ def test_pairs_of_panoramas() -> None:
     assert len(pairs) == len(set(pairs)) < 900
 
 
-@pytest.mark.slow
+@pytest.mark.proof
 def test_panoramas_without_cameras_are_solved_as_a_rig(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     write_panoramas(tmp_path / "set", 3, 800)

@@ -37,6 +37,7 @@ def solved(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(photos, tmp_path_factory.mktemp("solved"), Progress(), threads=2)
 
 
+@pytest.mark.proof
 def test_cameras_go_around_what_turns(made: Turntable, solved: Scene) -> None:
     errors = pose_errors(solved.cameras, made.cameras)
     assert len(errors.names) == COUNT
@@ -45,6 +46,7 @@ def test_cameras_go_around_what_turns(made: Turntable, solved: Scene) -> None:
     assert solved.facts["turntable_photos"] == COUNT
 
 
+@pytest.mark.proof
 def test_each_photo_has_a_mask_of_what_turns(solved: Scene) -> None:
     assert solved.facts["photos_masked_as_turning"] == COUNT
     assert solved.facts["photos_masked"] == COUNT
@@ -61,6 +63,7 @@ def test_each_photo_has_a_mask_of_what_turns(solved: Scene) -> None:
         assert mask[row, column].mean() > 0.9
 
 
+@pytest.mark.proof
 def test_masks_of_a_turntable_show_background(solved: Scene, tmp_path: Path) -> None:
     modes = {mode: solved.mask_mode(mode) for mode in ("auto", "ignore", "background")}
     assert modes == {"auto": "background", "ignore": "ignore", "background": "background"}

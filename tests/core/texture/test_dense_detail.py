@@ -272,6 +272,7 @@ def test_the_map_darkens_under_a_roof_alone(scale: float, offset: float) -> None
     assert (again.image == result.image).all()
 
 
+@pytest.mark.proof
 def test_few_rays_without_noise_are_as_good_as_many() -> None:
     """A bumpy plane under a roof: beside 1024 rays, the map is nearer than 64 rays alone are."""
     plane = grid(48)

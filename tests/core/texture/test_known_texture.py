@@ -95,6 +95,7 @@ def test_borders_of_charts_do_not_show(
     assert found.gap < 0.6 * found.error_inside
 
 
+@pytest.mark.proof
 def test_leading_views_leave_no_borders_where_brightness_is_uneven(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

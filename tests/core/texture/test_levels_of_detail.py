@@ -57,6 +57,7 @@ def painted(tmp_path_factory) -> TexturedMesh:
     return TexturedMesh(mesh, uvs, image)
 
 
+@pytest.mark.proof
 def test_each_level_is_closed_a_quarter_and_looks_alike(
     painted: TexturedMesh, tmp_path: Path
 ) -> None:

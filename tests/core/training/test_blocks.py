@@ -40,6 +40,7 @@ from tests.core.device_kernels import DEVICES
 from tests.core.training.device_training import backend_of
 from tests.core.training.row_scene import SETTINGS, join_blocks, row_scene, train_block, two_blocks
 from tests.core.training.test_trainer import StopAt, assert_same
+from tests.proofs import first_then_proofs
 
 # -- Training of a block: what stands still, interruptions, what is taken over --------------------
 
@@ -83,7 +84,7 @@ BUSY = dataclasses.replace(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("device", [None, *DEVICES])
+@pytest.mark.parametrize("device", first_then_proofs([None, *DEVICES]))
 def test_what_stands_still_keeps_every_bit(
     device: str | None,
     request: pytest.FixtureRequest,

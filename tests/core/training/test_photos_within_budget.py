@@ -105,7 +105,7 @@ def child(folder: str, count: int) -> None:
     print(own_peak_bytes())
 
 
-@pytest.mark.slow
+@pytest.mark.proof
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peaks of Linux")
 def test_memory_does_not_grow_with_the_photos(tmp_path: Path) -> None:
     first = tmp_path / "000.png"

@@ -76,6 +76,7 @@ def test_no_edges_no_corners(photo: tuple[np.ndarray, Camera]) -> None:
     assert refined_corners(grey, square + np.array([460, 340]), 6) is None, "beyond the border"
 
 
+@pytest.mark.proof
 def test_scale_of_a_rendered_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Photos of a lens with distortion and exact cameras: within 0.3 % (acceptance)."""
     # Points are no part of it, and take long to find.

@@ -122,6 +122,7 @@ def test_photos_are_reduced_to_the_given_side(job: Path) -> None:
     assert half["training_pixels"] == pytest.approx(full["training_pixels"] / 4, rel=0.05)
 
 
+@pytest.mark.proof
 def test_a_mesh_file_with_the_photos_of_a_job(job: Path, tmp_path: Path) -> None:
     mesh = str(job_mesh(job, None))
     out = tmp_path / "figures.json"

@@ -104,6 +104,7 @@ def test_a_file_in_world_coordinates_is_baked_in_its_place(
     assert not (job.root / "result").exists()
 
 
+@pytest.mark.proof
 def test_own_uvs_and_tiles_come_back_with_udim_names(job: JobFolder, tmp_path: Path) -> None:
     """The first bake's OBJ: its UVs are split over two tiles, and baked onto again."""
     code, said = bake(job, write_world(tmp_path / "ball.ply"), "--name", "first", "--export", "obj")

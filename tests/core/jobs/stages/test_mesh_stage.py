@@ -56,6 +56,7 @@ from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
 from tests.core.jobs.mesh_walk import walk_mesh
 from tests.core.meshing.meshing_scenes import ShapeField, cube, gaussians_on, sphere
 from tests.core.render.cuda.emulation import EmulatedKernels
+from tests.proofs import first_then_proofs
 
 PROCESSOR = choose_device("cpu")
 
@@ -154,11 +155,15 @@ GPU = DeviceChoice("cuda:0", "Some GPU", "It passed.")
 
 @pytest.mark.parametrize(
     ("free_gib", "device", "renderers"),
-    [
-        (4, "cuda:0", [DeviceRenderer]),
-        (1, "cuda:0", [DeviceRenderer, ViewRenderer]),
-        (0, "cpu", [ViewRenderer]),
-    ],
+    first_then_proofs(
+        [
+            (1, "cuda:0", [DeviceRenderer, ViewRenderer]),
+            (0, "cpu", [ViewRenderer]),
+            (4, "cuda:0", [DeviceRenderer]),
+        ],
+        2,
+        names=3,
+    ),
 )
 def test_on_a_gpu_the_field_and_the_depth_maps_are_there_if_they_fit(
     free_gib: int,

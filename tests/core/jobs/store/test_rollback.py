@@ -119,6 +119,7 @@ def test_a_copy_that_is_put_back_names_its_own_place(folder: JobFolder) -> None:
     assert copy.read_status().result == str(copy.result)
 
 
+@pytest.mark.proof
 def test_an_unexpected_failure_and_one_after_another_do_as_well(folder: JobFolder) -> None:
     job = read_job(folder.job_path)
     for raised in ('MeshingError("a")', "MeshingError(1 / 0)", "MeshingError(bytes(10**15))"):

@@ -224,6 +224,7 @@ def test_many_gaussians_and_many_points_of_one_tile(emulator_library: Path) -> N
     assert_same(found, wanted)
 
 
+@pytest.mark.proof
 def test_every_barrier_of_the_gradient_is_needed(tmp_path: Path) -> None:
     text = cuda_source()
     begin = text.index("query_gradients(")
