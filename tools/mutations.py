@@ -13,7 +13,8 @@ moved. Messages, calls of loggers and annotations are left alone.
 The tests of a mutation are those that execute its line by coverage recorded with
 ``--cov-context=test`` in any tree that has the line, fastest first by ``--durations`` (a log of
 ``pytest --durations=0``); ``--renamed`` tells where test files are in the other tree (JSON, a
-path to a list of paths). Without coverage they are those whose files import or are named after its
+path to a list of paths). Both trees run the tests that either would choose, at the same time, as
+far as they have them. Without coverage they are those whose files import or are named after its
 module. Coverage sees no lines of compiled functions: there the lines count that call them, through
 other compiled functions too. Tests that fail without the mutation are left out. Results are written
 after each mutation; the same command continues where it was stopped.
@@ -264,12 +265,12 @@ class Selection:
 
     def tests(self, key: Key, site: Site) -> tuple[list[str], str]:
         """Return the tests and how they were found, ``"coverage"`` or ``"names"``."""
-        covering = {here for m in self._measured for t in m.tests(key) if (here := self._here(t))}
+        covering = {here for m in self._measured for t in m.tests(key) if (here := self.named(t))}
         if tests := spread(covering, self._seconds, self.most):
             return tests, "coverage"
         return self._by_name(site), "names"
 
-    def _here(self, test: str) -> str | None:
+    def named(self, test: str) -> str | None:
         """Return the name that a test has in this tree, None if it has none."""
         file, _, name = test.partition("::")
         function = name.partition("[")[0].rpartition("::")[2]
@@ -427,12 +428,20 @@ def compare(options: argparse.Namespace) -> dict[str, Any]:
         found: dict[str, Any] = {"kind": key[2]}
         pair = copies.get()
         try:
-            for side in trees:
-                site = places[side][key]
-                with reading:
-                    tests, how = select[side].tests(key, site)
-                limit_s = options.timeout
-                found[side] = {**pair[side].run(site, tests, limit_s), "found_by": how}
+            with reading:
+                chosen_here = {s: select[s].tests(key, places[s][key]) for s in trees}
+
+            def run_side(side: str) -> dict[str, Any]:
+                tests, how = chosen_here[side]
+                # Those of the other tree too: where files were merged, other ones come first.
+                others = chosen_here["new" if side == "old" else "old"][0]
+                there = (select[side].named(test) for test in others)
+                tests = list(dict.fromkeys([*tests, *(test for test in there if test)]))
+                result = pair[side].run(places[side][key], tests, options.timeout)
+                return {**result, "found_by": how}
+
+            with ThreadPoolExecutor(len(trees)) as sides:
+                found.update(zip(trees, sides.map(run_side, trees), strict=True))
         finally:
             copies.put(pair)
         with writing:
