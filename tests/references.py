@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
-SKIPPED_FOLDERS = {"__pycache__", "build", "dist", "node_modules", "shared", "site"}
+SKIPPED_FOLDERS = {"__pycache__", "build", "dist", "node_modules", "site"}
 
 GENERATED = {
     "report.md": "written by every job",

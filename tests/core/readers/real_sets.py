@@ -8,14 +8,13 @@ from pathlib import Path
 
 import pytest
 
-FOLDER = Path(
-    os.environ.get("GW_DATA_SETS", Path(__file__).resolve().parents[4] / "shared" / "data")
-)
+SETS = "GW_DATA_SETS"
+"""Variable that names the folder of the data sets."""
 
 
 def real_set(name: str) -> Path:
     """Return the folder of a data set, or skip the test."""
-    folder = FOLDER / name
-    if not folder.is_dir():
-        pytest.skip(f"needs the photos of {name}: there is no {folder} (set GW_DATA_SETS)")
+    folder = Path(os.environ.get(SETS, "")) / name
+    if SETS not in os.environ or not folder.is_dir():
+        pytest.skip(f"needs the photos of {name}: {SETS} names no folder that holds them")
     return folder
