@@ -61,7 +61,8 @@ class EstimateInputs:
 class _State:
     """By the region's session id."""
 
-    running: dict[int, Task[Estimate]] = field(default_factory=dict)
+    # A string: ``typing`` would keep Task[Estimate], and with it bpy, which then crashes at exit.
+    running: "dict[int, Task[Estimate]]" = field(default_factory=dict)
     inputs: dict[int, EstimateInputs] = field(default_factory=dict)
     estimates: dict[int, Estimate] = field(default_factory=dict)
 
