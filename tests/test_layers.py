@@ -232,6 +232,31 @@ def test_blender_layers_import_nothing_heavy(layer: str) -> None:
     assert wrong == []
 
 
+@pytest.mark.parametrize("layer", ["ops", "ui"])
+def test_no_own_generic_is_subscripted_at_import(layer: str) -> None:
+    """``typing`` keeps what is subscripted, and with it bpy beyond Python's end, where 4.2 crashes.
+
+    Modules with properties of Blender evaluate their annotations; the others read them as text.
+    """
+    wrong, evaluated = [], 0
+    for path in python_files(PACKAGE / layer):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        own = {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+        imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        names = [name for node in imports if node.level for name in node.names]
+        own |= {name.name for name in names if not name.name.isupper()}  # no tables
+        if any(node.module == "__future__" for node in imports):
+            continue
+        for node in ast.walk(tree):
+            given = [getattr(node, name, None) for name in ("annotation", "returns")]
+            for part in (part for hint in given if hint for part in ast.walk(hint)):
+                evaluated += 1
+                if isinstance(part, ast.Subscript) and getattr(part.value, "id", "") in own:
+                    wrong.append(f"{path.relative_to(PACKAGE)}:{part.lineno}")
+    assert evaluated > 50
+    assert wrong == []
+
+
 def test_blender_side_of_core_loads_without_heavy_packages() -> None:
     code = (
         "import sys, importlib\n"
