@@ -139,6 +139,9 @@ APART_SHARE = 0.4
 """Photos look at no one thing if the middles of half of them pass their common point by more than
 this share of the cameras' spread: 0.02 to 0.22 around things, 0.6 and more inside rooms, along
 streets, and in parallel rows."""
+ASIDE_DEG = 10.0
+"""Photos from one side have no thing in their middle either: half of them look along directions
+that differ less than this from their mean. A row of seven photos 1.5 degrees apart has 2.6."""
 SURROUNDINGS_REACH = 3.0
 """Reach of what such photos show, in median distances of points from the nearest camera."""
 SURROUNDINGS_MIN_VIEWS = 3
@@ -254,14 +257,18 @@ def _focus(cameras: Sequence[Camera], points: np.ndarray) -> tuple[np.ndarray, f
 
 
 def _look_at_one_thing(cameras: Sequence[Camera], focus: np.ndarray) -> bool:
-    """Tell whether the middles of the photos meet at a point."""
+    """Tell whether the middles of the photos meet at a point, and see it from several sides."""
     centers = np.array([c.center for c in cameras])  # (c, 3)
     gazes = np.array([c.gaze for c in cameras])  # (c, 3)
     gazes /= np.linalg.norm(gazes, axis=1, keepdims=True)
     to_focus = focus - centers
     missed = to_focus - (to_focus * gazes).sum(1, keepdims=True) * gazes
     spread = np.median(np.linalg.norm(centers - centers.mean(0), axis=1))
-    return bool(np.median(np.linalg.norm(missed, axis=1)) <= APART_SHARE * spread)
+    if np.median(np.linalg.norm(missed, axis=1)) > APART_SHARE * spread:
+        return False
+    sides = to_focus / np.maximum(np.linalg.norm(to_focus, axis=1, keepdims=True), 1e-12)
+    mean = sides.mean(0) / max(np.linalg.norm(sides.mean(0)), 1e-12)
+    return bool(np.median(sides @ mean) <= np.cos(np.radians(ASIDE_DEG)))
 
 
 def _surroundings(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

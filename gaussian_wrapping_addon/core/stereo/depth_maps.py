@@ -21,7 +21,15 @@ from ..parallel import default_threads, run_chunks
 from ..progress import Progress
 from ..scene.camera import Camera
 from ..scene.scene import PhotoSource
-from .matching import NO_PRIOR, MatchingLevel, grey_levels, in_image, source_views
+from .matching import (
+    MatchingLevel,
+    coarser_planes,
+    finer_planes,
+    grey_levels,
+    in_image,
+    source_views,
+)
+from .semi_global import matched_planes, volume_bytes
 
 # -- Planes of triangles between points whose depth is known (docs/method.md, section 11.6) -------
 
@@ -111,12 +119,18 @@ def plane_normals(planes: np.ndarray, camera: Camera) -> np.ndarray:
 
 _logger = logging.getLogger(__name__)
 
-COARSE_SWEEPS, COARSE_GEOMETRIC_SWEEPS, FINE_SWEEPS = 3, 2, 2
+COARSE_SWEEPS, COARSE_GEOMETRIC_SWEEPS, FINE_SWEEPS = 1, 2, 1
 """Sweeps at the coarse level before and after photos are compared, and at the fine level."""
 
 GEOMETRIC_COST = 0.15  # of a pixel of forward-backward error
 RANDOM_SHARE = 0.25
 """Share of the pixels that start with a random plane although triangles cover them."""
+
+GUIDE_STEPS = 8
+"""Semi-global matching of a photo takes about as long as so many coarse sweeps."""
+
+MOST_VOLUME_BYTES, ALL_VOLUMES_BYTES = 400_000_000, 1_000_000_000
+"""Memory of the costs of one photo, and of all that are matched at a time."""
 
 NEAREST_FACTOR, FARTHEST_FACTOR = 1.5, 0.02
 """Range of the inverse depths over that of the sparse points."""
@@ -194,8 +208,9 @@ def estimate_depth_maps(
     sources = source_views(full, points)
     ranges = np.array([_depth_range(camera, points) for camera in full])
     matcher = _Matcher(photos, views, points, sources, ranges, seed, threads, progress)
-    coarse = matcher.coarse(2 * fine)
-    level, means = matcher.fine(coarse, fine)
+    guides = matcher.guides(fine)
+    coarse = matcher.coarse(2 * fine, guides)
+    level, means = matcher.fine(coarse, fine, guides)
     found = []
     for number, view in enumerate(views):
         color, mask = photos.photo(view, fine), photos.mask(view, fine)
@@ -216,32 +231,77 @@ class _Matcher:
         self.sources, self.ranges, self.seed = sources, ranges, seed
         self.threads, self.progress = threads, progress
         # A fine sweep visits four times the pixels of a coarse one.
-        self.steps = len(views) * (COARSE_SWEEPS + COARSE_GEOMETRIC_SWEEPS + 4 * FINE_SWEEPS)
+        steps = GUIDE_STEPS + COARSE_SWEEPS + COARSE_GEOMETRIC_SWEEPS + 4 * FINE_SWEEPS
+        self.steps = len(views) * steps
         self.done, self.lock = 0, threading.Lock()
 
-    def coarse(self, divisor: int) -> MatchingLevel:
-        """Match from sparse points and random planes."""
+    def guides(self, divisor: int) -> list[np.ndarray]:
+        """Return the planes (h, w, 3) that semi-global matching finds and two sources confirm.
+
+        0 elsewhere. Photos whose costs would take too much memory are matched at half the size.
+        """
+        full = [self.photos.camera(view, divisor) for view in self.views]
+        most_bytes = max(volume_bytes(camera.width * camera.height) for camera in full)
+        halved = most_bytes > MOST_VOLUME_BYTES
+        if halved:
+            most_bytes //= 4
+        level = self._level(2 * divisor if halved else divisor)
+
+        def match(view: int) -> None:
+            chosen = self.sources[view]
+            if len(chosen):
+                level.planes_of(view)[:] = matched_planes(
+                    level.cameras[view], level.greys[view],
+                    [level.cameras[k] for k in chosen], [level.greys[k] for k in chosen],
+                    self.ranges[view],
+                )  # fmt: skip
+
+        at_once = max(1, ALL_VOLUMES_BYTES // most_bytes)
+        self._each(match, GUIDE_STEPS, min(self.threads, at_once))
+        level.confirm_all()
+        guides = []
+        for view, camera in enumerate(full):
+            least = min(LEAST_SOURCES, len(self.sources[view]))
+            known = (_BITS[level.confirmed[view]] >= least)[..., None]
+            guide = np.where(known, level.planes_of(view), np.float32(0))
+            guides.append(finer_planes(guide, (camera.height, camera.width)) if halved else guide)
+        return guides
+
+    def coarse(self, divisor: int, guides: list[np.ndarray]) -> MatchingLevel:
+        """Match at half the guides' size, from them, sparse points and random planes."""
         level = self._level(divisor)
+        guides = [
+            coarser_planes(guide, grey.shape)
+            for guide, grey in zip(guides, level.greys, strict=True)
+        ]
 
         def photometric(view: int) -> None:
-            self._start(level, view)
+            self._start(level, view, guides[view])
             for turn in range(COARSE_SWEEPS):
-                level.sweep(view, turn, self.seed, fresh=True)
+                level.sweep(view, turn, self.seed, fresh=True, prior=guides[view])
 
-        self._each(photometric, COARSE_SWEEPS)
+        self._each(photometric, COARSE_SWEEPS, self.threads)
         level.confirm_all()
         level.compare_brightness()
         for turn in range(COARSE_GEOMETRIC_SWEEPS):
-            self._geometric_sweep(level, COARSE_SWEEPS + turn, turn == 0, 1)
+            self._geometric_sweep(level, guides, COARSE_SWEEPS + turn, turn == 0, 1)
         level.confirm_all()
         return level
 
-    def fine(self, coarse: MatchingLevel, divisor: int) -> tuple[MatchingLevel, list[np.ndarray]]:
+    def fine(
+        self, coarse: MatchingLevel, divisor: int, guides: list[np.ndarray]
+    ) -> tuple[MatchingLevel, list[np.ndarray]]:
         """Refine at twice the size; return the level and the mean inverse depths."""
         level = self._level(divisor)
-        self._each(lambda view: level.start_from(coarse, view), 0)
+
+        def start(view: int) -> None:
+            level.start_from(coarse, view)
+            known = guides[view][..., 0] > 0
+            level.planes_of(view)[known] = guides[view][known]
+
+        self._each(start, 0, self.threads)
         for turn in range(FINE_SWEEPS):
-            self._geometric_sweep(level, COARSE_SWEEPS + turn, turn == 0, 4)
+            self._geometric_sweep(level, guides, COARSE_SWEEPS + turn, turn == 0, 4)
         return level, level.confirm_all()
 
     def _level(self, divisor: int) -> MatchingLevel:
@@ -250,21 +310,25 @@ class _Matcher:
         return MatchingLevel(cameras, greys, self.sources, self.ranges)
 
     def _geometric_sweep(
-        self, level: MatchingLevel, turn: int, with_prior: bool, weight: int
-    ) -> None:
+        self, level: MatchingLevel, guides: list[np.ndarray], turn: int, with_points: bool,
+        weight: int,
+    ) -> None:  # fmt: skip
         """Sweep over all photos, comparing with the depths that all had before."""
         depths = level.inverse_depths()
 
         def run(view: int) -> None:
-            prior = self._prior(level, view, reliable=weight == 1) if with_prior else NO_PRIOR
+            prior = guides[view]
+            if with_points:
+                between = self._prior(level, view, reliable=weight == 1)
+                prior = np.where(prior[..., :1] > 0, prior, between)
             level.sweep(
                 view, turn, self.seed, geometric=GEOMETRIC_COST, inverse_depths=depths, prior=prior
             )
 
-        self._each(run, weight)
+        self._each(run, weight, self.threads)
 
-    def _each(self, work: Callable[[int], object], weight: int) -> None:
-        """Do work for all photos on all threads, and report progress."""
+    def _each(self, work: Callable[[int], object], weight: int, threads: int) -> None:
+        """Do work for all photos, and report progress."""
 
         def run(begin: int, end: int) -> None:
             for view in range(begin, end):
@@ -273,7 +337,7 @@ class _Matcher:
                 if weight:
                     self._report(weight)
 
-        run_chunks(run, np.arange(len(self.views) + 1), self.threads)
+        run_chunks(run, np.arange(len(self.views) + 1), threads)
 
     def _report(self, weight: int) -> None:
         with self.lock:  # or a thread could report less than another one before it
@@ -281,11 +345,13 @@ class _Matcher:
             share = self.done / self.steps
             self.progress.update(share, f"matching photos for a dense start · {share:.0%}")
 
-    def _start(self, level: MatchingLevel, view: int) -> None:
-        """Planes between sparse points; random ones elsewhere and for a share of the pixels."""
+    def _start(self, level: MatchingLevel, view: int, guide: np.ndarray) -> None:
+        """Guides, else planes between sparse points; random ones elsewhere and for a share."""
         camera, random = level.cameras[view], np.random.default_rng([self.seed, view])
         pixels, inverse = points_in_view(camera, self.points)
-        planes = triangle_planes(pixels, inverse, camera)
+        planes = np.where(
+            guide[..., :1] > 0, guide, triangle_planes(pixels, inverse, camera)
+        )  # (h, w, 3)
         low, high = level.depth_ranges[view]
         gap = (planes[..., 0] < low) | (planes[..., 0] > high)
         gap |= random.random(gap.shape) < RANDOM_SHARE

@@ -349,6 +349,39 @@ NO_PRIOR = np.zeros((0, 0, 3), np.float32)
 NO_DEPTHS = np.zeros(1, np.float32)
 
 
+def finer_planes(planes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the planes (h, w, 3) of a photo of twice the size; inverse depths of 0 stay 0."""
+    row, column = np.mgrid[: shape[0], : shape[1]]
+    above = _above(shape, planes.shape)
+    finer = planes[above]
+    known = finer[..., 0] > 0
+    finer[..., 0] += finer[..., 1] * (0.5 * column - 0.25 - above[1])
+    finer[..., 0] += finer[..., 2] * (0.5 * row - 0.25 - above[0])
+    finer[..., 1:] *= 0.5
+    return np.where(known[..., None], finer, np.float32(0))
+
+
+def coarser_planes(planes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the planes (h, w, 3) of a photo of half the size: those of each first pixel of four.
+
+    Those of inverse depth 0 stay so.
+    """
+    row, column = (2 * np.arange(size) for size in shape)
+    coarser = planes[np.minimum(row, planes.shape[0] - 1)][
+        :, np.minimum(column, planes.shape[1] - 1)
+    ]  # (h, w, 3)
+    known = coarser[..., 0] > 0
+    coarser[..., 0] += 0.5 * (coarser[..., 1] + coarser[..., 2])
+    coarser[..., 1:] *= 2.0
+    return np.where(known[..., None], coarser, np.float32(0))
+
+
+def _above(shape: tuple[int, ...], coarse: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return row and column, at half the size, of the pixels of a photo."""
+    row, column = np.mgrid[: shape[0], : shape[1]]
+    return np.minimum(row // 2, coarse[0] - 1), np.minimum(column // 2, coarse[1] - 1)
+
+
 def grey_levels(photo: np.ndarray) -> np.ndarray:
     """Return a photo (h, w, 3) uint8 as (h, w) uint8 grey levels."""
     return np.asarray(photo @ np.array(LUMA) + 0.5, np.uint8)
@@ -474,15 +507,10 @@ class MatchingLevel:
 
     def start_from(self, coarse: MatchingLevel, view: int) -> None:
         """Take over planes and brightness of a level of half the size."""
-        height, width = self.greys[view].shape
-        last_row, last_column = (n - 1 for n in coarse.greys[view].shape)
-        row, column = np.mgrid[:height, :width]
-        above = np.minimum(row // 2, last_row), np.minimum(column // 2, last_column)
-        planes = coarse.planes_of(view)[above]  # (h, w, 3)
-        planes[..., 0] += planes[..., 1] * (0.5 * column - 0.25 - above[1])
-        planes[..., 0] += planes[..., 2] * (0.5 * row - 0.25 - above[0])
+        shape = self.greys[view].shape
+        above = _above(shape, coarse.greys[view].shape)
+        planes = finer_planes(coarse.planes_of(view), shape)
         planes[..., 0] = planes[..., 0].clip(*self.depth_ranges[view])
-        planes[..., 1:] *= 0.5
         self.planes_of(view)[:] = planes
         self._best_sources[view][:] = coarse._best_sources[view][above]
         self.costs[view][:] = coarse.costs[view][above]
