@@ -22,12 +22,14 @@ from ..progress import Progress
 from ..scene.camera import Camera
 from ..scene.scene import PhotoSource
 from .matching import (
+    NO_PRIOR,
     MatchingLevel,
     coarser_planes,
     finer_planes,
     grey_levels,
     in_image,
     source_views,
+    widest_angle_deg,
 )
 from .semi_global import matched_planes, volume_bytes
 
@@ -119,8 +121,14 @@ def plane_normals(planes: np.ndarray, camera: Camera) -> np.ndarray:
 
 _logger = logging.getLogger(__name__)
 
-COARSE_SWEEPS, COARSE_GEOMETRIC_SWEEPS, FINE_SWEEPS = 1, 2, 1
-"""Sweeps at the coarse level before and after photos are compared, and at the fine level."""
+COARSE_SWEEPS, COARSE_GEOMETRIC_SWEEPS, FINE_SWEEPS = 3, 2, 2
+GUIDED_COARSE_SWEEPS, GUIDED_FINE_SWEEPS = 1, 1
+"""Sweeps at the coarse level before and after photos are compared, and at the fine level; fewer
+where semi-global matching has found the planes."""
+
+GUIDED_ANGLE_DEG = 10.0
+"""Semi-global matching guides photos whose sources all see their points within this angle. From
+wider apart, squares of two photos look less alike than windows that follow the surface."""
 
 GEOMETRIC_COST = 0.15  # of a pixel of forward-backward error
 RANDOM_SHARE = 0.25
@@ -230,26 +238,37 @@ class _Matcher:
         self.photos, self.views, self.points = photos, views, points
         self.sources, self.ranges, self.seed = sources, ranges, seed
         self.threads, self.progress = threads, progress
+        full = [photos.camera(view, 1) for view in views]
+        self.guided = [
+            0.0 < widest_angle_deg(full, view, chosen, points) <= GUIDED_ANGLE_DEG
+            for view, chosen in enumerate(sources)
+        ]
         # A fine sweep visits four times the pixels of a coarse one.
-        steps = GUIDE_STEPS + COARSE_SWEEPS + COARSE_GEOMETRIC_SWEEPS + 4 * FINE_SWEEPS
-        self.steps = len(views) * steps
+        plain = COARSE_SWEEPS + COARSE_GEOMETRIC_SWEEPS + 4 * FINE_SWEEPS
+        guided = GUIDE_STEPS + GUIDED_COARSE_SWEEPS + COARSE_GEOMETRIC_SWEEPS
+        guided += 4 * GUIDED_FINE_SWEEPS
+        self.steps = sum(guided if by_guide else plain for by_guide in self.guided)
         self.done, self.lock = 0, threading.Lock()
 
     def guides(self, divisor: int) -> list[np.ndarray]:
         """Return the planes (h, w, 3) that semi-global matching finds and two sources confirm.
 
-        0 elsewhere. Photos whose costs would take too much memory are matched at half the size.
+        0 elsewhere, and in photos that it does not guide. Photos whose costs would take too much
+        memory are matched at half the size.
         """
         full = [self.photos.camera(view, divisor) for view in self.views]
-        most_bytes = max(volume_bytes(camera.width * camera.height) for camera in full)
+        shapes = [(camera.height, camera.width) for camera in full]
+        if not any(self.guided):
+            return [np.zeros((*shape, 3), np.float32) for shape in shapes]
+        most_bytes = max(volume_bytes(height * width) for height, width in shapes)
         halved = most_bytes > MOST_VOLUME_BYTES
         if halved:
             most_bytes //= 4
         level = self._level(2 * divisor if halved else divisor)
 
         def match(view: int) -> None:
-            chosen = self.sources[view]
-            if len(chosen):
+            if self.guided[view]:
+                chosen = self.sources[view]
                 level.planes_of(view)[:] = matched_planes(
                     level.cameras[view], level.greys[view],
                     [level.cameras[k] for k in chosen], [level.greys[k] for k in chosen],
@@ -257,14 +276,13 @@ class _Matcher:
                 )  # fmt: skip
 
         at_once = max(1, ALL_VOLUMES_BYTES // most_bytes)
-        self._each(match, GUIDE_STEPS, min(self.threads, at_once))
+        self._each(match, [GUIDE_STEPS * known for known in self.guided], at_once)
         level.confirm_all()
         guides = []
-        for view, camera in enumerate(full):
-            least = min(LEAST_SOURCES, len(self.sources[view]))
-            known = (_BITS[level.confirmed[view]] >= least)[..., None]
+        for view, shape in enumerate(shapes):
+            known = (_BITS[level.confirmed[view]] >= LEAST_SOURCES)[..., None]
             guide = np.where(known, level.planes_of(view), np.float32(0))
-            guides.append(finer_planes(guide, (camera.height, camera.width)) if halved else guide)
+            guides.append(finer_planes(guide, shape) if halved else guide)
         return guides
 
     def coarse(self, divisor: int, guides: list[np.ndarray]) -> MatchingLevel:
@@ -274,17 +292,18 @@ class _Matcher:
             coarser_planes(guide, grey.shape)
             for guide, grey in zip(guides, level.greys, strict=True)
         ]
+        sweeps = [GUIDED_COARSE_SWEEPS if known else COARSE_SWEEPS for known in self.guided]
 
         def photometric(view: int) -> None:
             self._start(level, view, guides[view])
-            for turn in range(COARSE_SWEEPS):
-                level.sweep(view, turn, self.seed, fresh=True, prior=guides[view])
+            for turn in range(sweeps[view]):
+                level.sweep(view, turn, self.seed, fresh=True, prior=self._guide(guides, view))
 
-        self._each(photometric, COARSE_SWEEPS, self.threads)
+        self._each(photometric, sweeps)
         level.confirm_all()
         level.compare_brightness()
         for turn in range(COARSE_GEOMETRIC_SWEEPS):
-            self._geometric_sweep(level, guides, COARSE_SWEEPS + turn, turn == 0, 1)
+            self._geometric_sweep(level, guides, turn, COARSE_GEOMETRIC_SWEEPS, 1)
         level.confirm_all()
         return level
 
@@ -299,10 +318,13 @@ class _Matcher:
             known = guides[view][..., 0] > 0
             level.planes_of(view)[known] = guides[view][known]
 
-        self._each(start, 0, self.threads)
+        self._each(start, [0] * len(self.views))
         for turn in range(FINE_SWEEPS):
-            self._geometric_sweep(level, guides, COARSE_SWEEPS + turn, turn == 0, 4)
+            self._geometric_sweep(level, guides, turn, GUIDED_FINE_SWEEPS, 4)
         return level, level.confirm_all()
+
+    def _guide(self, guides: list[np.ndarray], view: int) -> np.ndarray:
+        return guides[view] if self.guided[view] else NO_PRIOR
 
     def _level(self, divisor: int) -> MatchingLevel:
         cameras = [self.photos.camera(view, divisor) for view in self.views]
@@ -310,34 +332,43 @@ class _Matcher:
         return MatchingLevel(cameras, greys, self.sources, self.ranges)
 
     def _geometric_sweep(
-        self, level: MatchingLevel, guides: list[np.ndarray], turn: int, with_points: bool,
+        self, level: MatchingLevel, guides: list[np.ndarray], turn: int, guided_turns: int,
         weight: int,
     ) -> None:  # fmt: skip
-        """Sweep over all photos, comparing with the depths that all had before."""
+        """Sweep over all photos, comparing with the depths that all had before.
+
+        Guided photos have so many turns, the others all.
+        """
         depths = level.inverse_depths()
+        swept = [turn < guided_turns or not known for known in self.guided]
 
         def run(view: int) -> None:
-            prior = guides[view]
-            if with_points:
+            if not swept[view]:
+                return
+            prior = self._guide(guides, view)
+            if turn == 0:
                 between = self._prior(level, view, reliable=weight == 1)
-                prior = np.where(prior[..., :1] > 0, prior, between)
+                prior = np.where(prior[..., :1] > 0, prior, between) if len(prior) else between
             level.sweep(
-                view, turn, self.seed, geometric=GEOMETRIC_COST, inverse_depths=depths, prior=prior
-            )
+                view, COARSE_SWEEPS + turn, self.seed, geometric=GEOMETRIC_COST,
+                inverse_depths=depths, prior=prior,
+            )  # fmt: skip
 
-        self._each(run, weight, self.threads)
+        self._each(run, [weight * counts for counts in swept])
 
-    def _each(self, work: Callable[[int], object], weight: int, threads: int) -> None:
-        """Do work for all photos, and report progress."""
+    def _each(
+        self, work: Callable[[int], object], weights: Sequence[int], at_once: int = 1 << 16
+    ) -> None:
+        """Do work for all photos, so many at a time, and report progress."""
 
         def run(begin: int, end: int) -> None:
             for view in range(begin, end):
                 self.progress.check()
                 work(view)
-                if weight:
-                    self._report(weight)
+                if weights[view]:
+                    self._report(weights[view])
 
-        run_chunks(run, np.arange(len(self.views) + 1), threads)
+        run_chunks(run, np.arange(len(self.views) + 1), min(self.threads, at_once))
 
     def _report(self, weight: int) -> None:
         with self.lock:  # or a thread could report less than another one before it

@@ -102,6 +102,27 @@ def _sources_of(view: int, inside: np.ndarray, scale: np.ndarray, rays: np.ndarr
     return np.array(chosen, np.int64)
 
 
+def widest_angle_deg(
+    cameras: Sequence[Camera], view: int, sources: np.ndarray, points: np.ndarray
+) -> float:
+    """Return the largest of the angles under which the points of a photo see it and a source.
+
+    Of each source it is the median over the points (n, 3) in both images; 0 where there are none.
+    """
+    camera, widest = cameras[view], 0.0
+    points = points[:: max(1, -(-len(points) // _MOST_POINTS))]
+    points = points[in_image(camera, points)[0]]
+    for source in sources:
+        both = points[in_image(cameras[source], points)[0]]
+        if len(both):
+            one, other = both - camera.center, both - cameras[source].center
+            cosine = (one * other).sum(1)
+            cosine /= np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+            middle = np.median(np.clip(cosine, -1.0, 1.0))
+            widest = max(widest, float(np.degrees(np.arccos(middle))))
+    return widest
+
+
 # -- One sweep of PatchMatch over a photo: planes spread between pixels and are refined -----------
 #
 # See docs/method.md, section 11.3.

@@ -173,14 +173,16 @@ def _lens(camera: Camera) -> np.ndarray:
 # -- Costs: how many bits of two census codes differ ----------------------------------------------
 
 
-@intrinsic
-def _bits_set(context: Any, value: Any) -> Any:
+def _count_bits(context: Any, value: Any) -> Any:
     """Count the bits of a uint32 that are set."""
 
     def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return builder.ctpop(arguments[0])
 
     return numba.types.uint32(numba.types.uint32), generate
+
+
+_bits_set: Any = intrinsic(_count_bits)
 
 
 @kernel(fast=False)
@@ -417,9 +419,8 @@ def fit_planes(inverse: np.ndarray, reach: float, planes: np.ndarray) -> None:
                     ):
                         fx, fy = np.float32(x), np.float32(y)
                         z = inverse[row + y, column + x] - w
-                        limit = reach
-                        if turn == 0:
-                            limit += reach * np.float32(0.5) * (abs(fx) + abs(fy))
+                        wider = np.float32(0.5) * (abs(fx) + abs(fy)) if turn == 0 else zero
+                        limit = reach * (one + wider)
                         off = (z - a * fx - b * fy) / limit
                         if off * off > one:
                             continue

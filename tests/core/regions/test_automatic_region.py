@@ -124,12 +124,14 @@ def test_photos_from_inside_get_the_room_and_not_the_air_in_its_middle() -> None
     assert region.volume < 3.0 * 8.0 * ROOM.prod()
 
 
-def test_photos_in_a_parallel_row_get_all_that_they_show() -> None:
+@pytest.mark.parametrize("meets", [False, True])
+def test_photos_in_a_row_get_all_that_they_show(meets: bool) -> None:
+    """Also where their middles meet: all photos are from one side."""
     rng = np.random.default_rng(6)
-    cameras = [
-        look_at(np.array([x, 0.0, 0.0]), np.array([x, 10.0, 0.0]), f"{k}", 640, 480, 620.0)
-        for k, x in enumerate(np.linspace(-0.6, 0.6, 7))
-    ]
+    cameras = []
+    for k, x in enumerate(np.linspace(-0.6, 0.6, 7)):
+        target = np.array([0.0 if meets else x, 4.5, 0.0])
+        cameras.append(look_at(np.array([x, 0.0, 0.0]), target, f"{k}", 640, 480, 620.0))
     depth = rng.uniform(3.0, 6.0, 3000)
     shown = np.stack(
         [rng.uniform(-0.45, 0.45, 3000) * depth, depth, rng.uniform(-0.35, 0.35, 3000) * depth], 1
