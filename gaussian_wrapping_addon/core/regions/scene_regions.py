@@ -140,8 +140,9 @@ APART_SHARE = 0.4
 this share of the cameras' spread: 0.02 to 0.22 around things, 0.6 and more inside rooms, along
 streets, and in parallel rows."""
 ASIDE_DEG = 10.0
-"""Photos from one side have no thing in their middle either: half of them look along directions
-that differ less than this from their mean. A row of seven photos 1.5 degrees apart has 2.6."""
+SIDE_SHARE = 0.1
+"""Photos from one side have no thing in their middle either: seen from where the middles meet, all
+cameras but this share lie within this angle of their mean direction."""
 SURROUNDINGS_REACH = 3.0
 """Reach of what such photos show, in median distances of points from the nearest camera."""
 SURROUNDINGS_MIN_VIEWS = 3
@@ -268,7 +269,7 @@ def _look_at_one_thing(cameras: Sequence[Camera], focus: np.ndarray) -> bool:
         return False
     sides = to_focus / np.maximum(np.linalg.norm(to_focus, axis=1, keepdims=True), 1e-12)
     mean = sides.mean(0) / max(np.linalg.norm(sides.mean(0)), 1e-12)
-    return bool(np.median(sides @ mean) <= np.cos(np.radians(ASIDE_DEG)))
+    return bool(np.quantile(sides @ mean, SIDE_SHARE) <= np.cos(np.radians(ASIDE_DEG)))
 
 
 def _surroundings(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

@@ -126,9 +126,9 @@ GUIDED_COARSE_SWEEPS, GUIDED_FINE_SWEEPS = 1, 1
 """Sweeps at the coarse level before and after photos are compared, and at the fine level; fewer
 where semi-global matching has found the planes."""
 
-GUIDED_ANGLE_DEG = 10.0
-"""Semi-global matching guides photos whose sources all see their points within this angle. From
-wider apart, squares of two photos look less alike than windows that follow the surface."""
+LEAST_GUIDED_DEG, GUIDED_ANGLE_DEG = 0.5, 10.0
+"""Semi-global matching guides photos whose widest source sees their points within these angles.
+From wider apart, squares of two photos look less alike than windows that follow the surface."""
 
 GEOMETRIC_COST = 0.15  # of a pixel of forward-backward error
 RANDOM_SHARE = 0.25
@@ -239,10 +239,18 @@ class _Matcher:
         self.sources, self.ranges, self.seed = sources, ranges, seed
         self.threads, self.progress = threads, progress
         full = [photos.camera(view, 1) for view in views]
-        self.guided = [
-            0.0 < widest_angle_deg(full, view, chosen, points) <= GUIDED_ANGLE_DEG
-            for view, chosen in enumerate(sources)
-        ]
+        widest = [widest_angle_deg(full, view, near, points) for view, near in enumerate(sources)]
+        self.guided = [LEAST_GUIDED_DEG < angle <= GUIDED_ANGLE_DEG for angle in widest]
+        while True:  # a guide is confirmed by those of the sources
+            lonely = [
+                view
+                for view, near in enumerate(sources)
+                if self.guided[view] and sum(self.guided[k] for k in near) < LEAST_SOURCES
+            ]
+            if not lonely:
+                break
+            for view in lonely:
+                self.guided[view] = False
         # A fine sweep visits four times the pixels of a coarse one.
         plain = COARSE_SWEEPS + COARSE_GEOMETRIC_SWEEPS + 4 * FINE_SWEEPS
         guided = GUIDE_STEPS + GUIDED_COARSE_SWEEPS + COARSE_GEOMETRIC_SWEEPS
@@ -282,7 +290,11 @@ class _Matcher:
         for view, shape in enumerate(shapes):
             known = (_BITS[level.confirmed[view]] >= LEAST_SOURCES)[..., None]
             guide = np.where(known, level.planes_of(view), np.float32(0))
-            guides.append(finer_planes(guide, shape) if halved else guide)
+            if halved:
+                guide = finer_planes(guide, shape)
+                low, high = level.depth_ranges[view]
+                guide[(guide[..., 0] < low) | (guide[..., 0] > high)] = 0.0
+            guides.append(guide)
         return guides
 
     def coarse(self, divisor: int, guides: list[np.ndarray]) -> MatchingLevel:

@@ -387,10 +387,11 @@ def coarser_planes(planes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
     Those of inverse depth 0 stay so.
     """
-    row, column = (2 * np.arange(size) for size in shape)
-    coarser = planes[np.minimum(row, planes.shape[0] - 1)][
-        :, np.minimum(column, planes.shape[1] - 1)
-    ]  # (h, w, 3)
+    rows, columns = (
+        np.minimum(2 * np.arange(size), last - 1)
+        for size, last in zip(shape, planes.shape, strict=False)
+    )
+    coarser = planes[np.ix_(rows, columns)]  # (h, w, 3)
     known = coarser[..., 0] > 0
     coarser[..., 0] += 0.5 * (coarser[..., 1] + coarser[..., 2])
     coarser[..., 1:] *= 2.0

@@ -144,6 +144,18 @@ def test_a_plain_wall_beside_a_thing_keeps_its_depth(
     assert wrong_share(found, truth) < (0.85 if large else 0.65) * wrong_share(alone, truth)
 
 
+def test_photos_without_two_guided_sources_are_matched_as_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene, photos, _ = row_scene()
+    near = [widest_angle_deg([v.camera for v in scene.views], 3, np.arange(7), scene.points)]
+    # The middle photo alone has all its sources within this angle.
+    monkeypatch.setattr(depth_maps, "GUIDED_ANGLE_DEG", near[0] * 1.01)
+    found = middle_map(scene, photos)
+    monkeypatch.setattr(depth_maps, "GUIDED_ANGLE_DEG", 0.0)
+    np.testing.assert_array_equal(found.depth, middle_map(scene, photos).depth)
+
+
 def test_the_widest_angle_is_that_of_the_farthest_source() -> None:
     scene, _, _ = row_scene()
     given = [view.camera for view in scene.views]
