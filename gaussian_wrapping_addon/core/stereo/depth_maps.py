@@ -276,7 +276,13 @@ class _Matcher:
 
         def match(view: int) -> None:
             if self.guided[view]:
-                chosen = self.sources[view]
+                # One from the same place looks alike at all depths.
+                chosen = [
+                    source
+                    for source in self.sources[view]
+                    if widest_angle_deg(full, view, np.array([source]), self.points)
+                    > LEAST_GUIDED_DEG
+                ]
                 level.planes_of(view)[:] = matched_planes(
                     level.cameras[view], level.greys[view],
                     [level.cameras[k] for k in chosen], [level.greys[k] for k in chosen],

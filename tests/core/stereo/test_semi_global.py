@@ -144,6 +144,18 @@ def test_a_plain_wall_beside_a_thing_keeps_its_depth(
     assert wrong_share(found, truth) < (0.85 if large else 0.65) * wrong_share(alone, truth)
 
 
+def test_photos_from_the_same_place_tell_no_depth() -> None:
+    scene, photos, truth = row_scene()
+    middle = COUNT // 2
+    views = (*scene.views, scene.views[middle], scene.views[middle])
+    burst = dataclasses.replace(scene, views=views)
+    taken = PhotosInMemory(burst, [*photos.photos, *[photos.photos[middle]] * 2])
+    maps = estimate_depth_maps(
+        taken, range(COUNT + 2), scene.points, Progress(), side_px=640, threads=2
+    )
+    assert wrong_share(maps[middle], truth) < 0.15
+
+
 def test_photos_without_two_guided_sources_are_matched_as_before(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
