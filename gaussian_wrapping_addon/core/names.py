@@ -22,7 +22,8 @@ from .errors import UsageError
 # made from the name of the folder or object (:func:`file_stem`).
 
 
-AUTOMATIC_REGIONS = ("auto", "all")  # values that a job accepts instead of a region file
+AUTO = "auto"
+AUTOMATIC_REGIONS = (AUTO, "all")  # values that a job accepts instead of a region file
 REPORT_FOLDER = "report"
 """Folder of the report's pictures in a result; reserved, no region may use it."""
 JOB_MARKER = ".gaussian-wrapping-job"  # empty file that makes a folder one of a job

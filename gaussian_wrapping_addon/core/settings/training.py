@@ -392,19 +392,21 @@ class TrainingSettings(MethodSettings):
         off="Take the cameras as they are given", since="0.2.0",
     )
     region_weight: float = setting(
-        1.0,
-        help="Gaussians inside the job's regions count this many times where their number is "
-        "limited.",
-        check=Range(1.0, 1000.0),
+        10.0,
+        help="The training is for the job's regions, the automatic one among them: most iterations "
+        "see what shows them, and Gaussians inside count this many times where their number is "
+        "limited. 1: for all that the photos show, as for the region `all`.",
+        check=Range(1.0, 1000.0), presets={"paper": 1.0},
         option=Option(
             "--region-weight", "W",
-            "Gaussians inside the regions count this many times where their number is limited",
+            "how much the training is for the regions; 1: for all that the photos show",
         ),
     )
     focus: str = setting(
         "",
-        help="JSON list of the job's region bodies, world coordinates. Written when a job that "
-        "trains is made with a region weight; other regions are meshed from the same training.",
+        help="JSON list of the bodies of the regions that the training is for, world coordinates; "
+        "`auto` for the automatic one. Written when a job that trains is made; other regions are "
+        "meshed from the same training.",
     )
     mask_mode: str = setting(
         "auto",

@@ -28,8 +28,8 @@ from .matching import (
     finer_planes,
     grey_levels,
     in_image,
+    source_angles_deg,
     source_views,
-    widest_angle_deg,
 )
 from .semi_global import matched_planes, volume_bytes
 
@@ -239,12 +239,16 @@ class _Matcher:
         self.sources, self.ranges, self.seed = sources, ranges, seed
         self.threads, self.progress = threads, progress
         full = [photos.camera(view, 1) for view in views]
-        widest = [widest_angle_deg(full, view, near, points) for view, near in enumerate(sources)]
-        self.guided = [LEAST_GUIDED_DEG < angle <= GUIDED_ANGLE_DEG for angle in widest]
+        self.guiding: list[np.ndarray] = []  # of each photo, the sources that tell its depth
+        self.guided: list[bool] = []
+        for view, near in enumerate(sources):
+            angles = source_angles_deg(full, view, near, points)
+            self.guiding.append(near[angles > LEAST_GUIDED_DEG])  # others look alike at all depths
+            self.guided.append(bool((angles <= GUIDED_ANGLE_DEG).all()))
         while True:  # a guide is confirmed by those of the sources
             lonely = [
                 view
-                for view, near in enumerate(sources)
+                for view, near in enumerate(self.guiding)
                 if self.guided[view] and sum(self.guided[k] for k in near) < LEAST_SOURCES
             ]
             if not lonely:
@@ -276,13 +280,7 @@ class _Matcher:
 
         def match(view: int) -> None:
             if self.guided[view]:
-                # One from the same place looks alike at all depths.
-                chosen = [
-                    source
-                    for source in self.sources[view]
-                    if widest_angle_deg(full, view, np.array([source]), self.points)
-                    > LEAST_GUIDED_DEG
-                ]
+                chosen = self.guiding[view]
                 level.planes_of(view)[:] = matched_planes(
                     level.cameras[view], level.greys[view],
                     [level.cameras[k] for k in chosen], [level.greys[k] for k in chosen],
@@ -290,7 +288,7 @@ class _Matcher:
                 )  # fmt: skip
 
         at_once = max(1, ALL_VOLUMES_BYTES // most_bytes)
-        self._each(match, [GUIDE_STEPS * known for known in self.guided], at_once)
+        self._each(match, [GUIDE_STEPS * guided for guided in self.guided], at_once)
         level.confirm_all()
         guides = []
         for view, shape in enumerate(shapes):
@@ -310,7 +308,7 @@ class _Matcher:
             coarser_planes(guide, grey.shape)
             for guide, grey in zip(guides, level.greys, strict=True)
         ]
-        sweeps = [GUIDED_COARSE_SWEEPS if known else COARSE_SWEEPS for known in self.guided]
+        sweeps = [GUIDED_COARSE_SWEEPS if guided else COARSE_SWEEPS for guided in self.guided]
 
         def photometric(view: int) -> None:
             self._start(level, view, guides[view])
@@ -358,7 +356,7 @@ class _Matcher:
         Guided photos have so many turns, the others all.
         """
         depths = level.inverse_depths()
-        swept = [turn < guided_turns or not known for known in self.guided]
+        swept = [turn < guided_turns or not guided for guided in self.guided]
 
         def run(view: int) -> None:
             if not swept[view]:

@@ -29,6 +29,7 @@ from .matching_cost import (
     brightness_of,
     confirm,
     fill_window,
+    lens_matrix,
     normal_of,
     random_share,
     slopes_of,
@@ -102,25 +103,24 @@ def _sources_of(view: int, inside: np.ndarray, scale: np.ndarray, rays: np.ndarr
     return np.array(chosen, np.int64)
 
 
-def widest_angle_deg(
+def source_angles_deg(
     cameras: Sequence[Camera], view: int, sources: np.ndarray, points: np.ndarray
-) -> float:
-    """Return the largest of the angles under which the points of a photo see it and a source.
+) -> np.ndarray:
+    """Return the angle of each source (s,): the median of those between rays to the same point.
 
-    Of each source it is the median over the points (n, 3) in both images; 0 where there are none.
+    Of the points (n, 3) that both images hold; 0 where there are none.
     """
-    camera, widest = cameras[view], 0.0
+    camera, angles = cameras[view], np.zeros(len(sources))
     points = points[:: max(1, -(-len(points) // _MOST_POINTS))]
     points = points[in_image(camera, points)[0]]
-    for source in sources:
+    for number, source in enumerate(sources):
         both = points[in_image(cameras[source], points)[0]]
         if len(both):
             one, other = both - camera.center, both - cameras[source].center
             cosine = (one * other).sum(1)
             cosine /= np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
-            middle = np.median(np.clip(cosine, -1.0, 1.0))
-            widest = max(widest, float(np.degrees(np.arccos(middle))))
-    return widest
+            angles[number] = np.degrees(np.arccos(np.median(np.clip(cosine, -1.0, 1.0))))
+    return angles
 
 
 # -- One sweep of PatchMatch over a photo: planes spread between pixels and are refined -----------
@@ -546,20 +546,13 @@ class MatchingLevel:
             here, there = self.cameras[view], self.cameras[source]
             rotation = there.rotation @ here.rotation.T
             offset = there.cam_from_world[:, 3] - rotation @ here.cam_from_world[:, 3]
-            lens_here, lens_there = _matrix(here), _matrix(there)
+            lens_here, lens_there = lens_matrix(here), lens_matrix(there)
             maps.append(_map(lens_there, rotation, offset, lens_here))
             back_maps.append(_map(lens_here, rotation.T, -rotation.T @ offset, lens_there))
             sizes.append((there.width - 1, there.height - 1))
         bases = np.asarray(self.sources[view], np.uint64) * np.uint64(self._photo_pixels)
         forth, back = (np.array(rows, np.float32).reshape(-1, 12) for rows in (maps, back_maps))
         return forth, back, np.array(sizes, np.float32).reshape(-1, 2), bases
-
-
-def _matrix(camera: Camera) -> np.ndarray:
-    """(3, 3) pixels from camera coordinates; centres of pixels at whole numbers."""
-    return np.array(
-        [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
-    )
 
 
 def _lens(camera: Camera) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..compiled import kernel, part
+from ..scene.camera import Camera
 
 # -- Plane hypotheses in compiled code (docs/method.md, section 11.1) -----------------------------
 #
@@ -27,6 +28,13 @@ NEAREST_Z = F32(1e-6)
 """Least homogeneous depth, relative to that in the first view, in front of the other camera."""
 MAX_BACK_ERROR_PX = F32(3)
 """Largest forward-backward error that counts; occluded pixels have larger ones."""
+
+
+def lens_matrix(camera: Camera) -> np.ndarray:
+    """Return the (3, 3) pixels from camera coordinates; centres of pixels at whole numbers."""
+    return np.array(
+        [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
+    )
 
 
 @part(fast=True)

@@ -19,6 +19,7 @@ from scipy import ndimage
 
 from ..compiled import kernel, part
 from ..scene.camera import Camera
+from .matching_cost import lens_matrix
 
 MOST_HYPOTHESES = 256
 LEAST_HYPOTHESES = 16
@@ -113,7 +114,7 @@ def _turned(
     """
     rotation = other.rotation @ camera.rotation.T
     offset = other.cam_from_world[:, 3] - rotation @ camera.cam_from_world[:, 3]
-    lens, lens_there = _lens(camera), _lens(other)
+    lens, lens_there = lens_matrix(camera), lens_matrix(other)
     move = lens @ rotation.T @ offset
     low, high = _reached(camera, move, depth_range)
     columns, rows = np.maximum(high - low + 1, 1)
@@ -161,13 +162,6 @@ def _hypotheses(camera: Camera, moves: np.ndarray, depth_range: np.ndarray) -> n
     wanted = np.ceil((high - low) * float(longest))
     count = int(np.clip(wanted, LEAST_HYPOTHESES, MOST_HYPOTHESES))
     return np.linspace(low, high, count).astype(np.float32)
-
-
-def _lens(camera: Camera) -> np.ndarray:
-    """(3, 3) pixels from camera coordinates; centres of pixels at whole numbers."""
-    return np.array(
-        [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
-    )
 
 
 # -- Costs: how many bits of two census codes differ ----------------------------------------------

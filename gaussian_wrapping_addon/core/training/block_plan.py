@@ -35,10 +35,10 @@ from ..stereo.depth_maps import FILE_NAME, DepthPrior, load_priors, matching_div
 from .backend import Backend
 from .density import largest_contributors
 from .exposure import Exposure
+from .focus import Focus
 from .growth_selection import photo_detail, select_image_size
 from .live_view import divisor_for
 from .model_selection import ModelSelection
-from .rounds import Inside
 from .start import Handover
 from .state import fingerprint, load_checkpoint
 from .trainer import DETAIL_PHOTOS, train
@@ -108,7 +108,7 @@ class CoarseTraining:
 
 def train_coarse(
     scene: Scene, photos: PhotoSource, settings: TrainingSettings, folder: Path, progress: Progress,
-    *, seed: int = 0, threads: int = 0, inside: Inside | None = None,
+    *, seed: int = 0, threads: int = 0, focus: Focus | None = None,
     backend: Backend | None = None,
 ) -> CoarseTraining:  # fmt: skip
     """Train the whole scene coarsely, or read a finished such training of the same folder.
@@ -121,7 +121,7 @@ def train_coarse(
     """
     result = train(
         scene, photos, settings, folder, progress,
-        seed=seed, threads=threads, inside=inside, backend=backend,
+        seed=seed, threads=threads, focus=focus, backend=backend,
     )  # fmt: skip
     settings = dataclasses.replace(settings, mask_mode=scene.mask_mode(settings.mask_mode))
     key = fingerprint(scene, settings, seed)

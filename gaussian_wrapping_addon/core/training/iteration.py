@@ -21,6 +21,7 @@ from .backend import Backend, Shown, Window, windows
 from .background import draw_background
 from .camera_poses import pose_rate_px
 from .exposure import exposure_rate
+from .focus import SURROUNDINGS_SHARE, Focus
 from .multi_view import MultiViewOptions
 from .schedule import Schedule
 from .state import TrainingState
@@ -30,6 +31,9 @@ AVERAGE_SHARE = 0.05
 
 _MAX_WINDOWS = 1 << 12
 """Upper bound of the windows per photo; combines view and window into one history index."""
+
+_FIRST_OF_FOCUS = _MAX_WINDOWS // 2
+"""Number of the first window of what the regions cover in a photo."""
 
 
 class NotFinite(Exception):  # noqa: N818 - asks for a restart, caught in trainer.py
@@ -47,6 +51,7 @@ class _Sample:
     number: int
     camera: Camera
     shown: Shown
+    of_surroundings: bool
 
 
 class Stepper:
@@ -60,15 +65,18 @@ class Stepper:
         For each training view, the views that the multi-view terms compare it with.
     backend : Backend
         Computes; the samples drawn do not depend on it.
+    focus : Focus, optional
+        What most iterations are for; without it they are drawn evenly over all pixels.
     """
 
     def __init__(
         self, photos: PhotoSource, schedule: Schedule, views: Sequence[int],
         neighbours: dict[int, np.ndarray], backend: Backend, threads: int,
+        focus: Focus | None = None,
     ) -> None:  # fmt: skip
         self.photos, self.schedule, self.views = photos, schedule, list(views)
         self.settings, self.threads = schedule.settings, threads
-        self.neighbours, self.backend = neighbours, backend
+        self.neighbours, self.backend, self.focus = neighbours, backend, focus
         self.priors: dict[int, DepthPrior] = {}
         """Confirmed depths of views that training started on."""
         self.multi_view = MultiViewOptions.of_settings(schedule.settings)
@@ -169,17 +177,43 @@ class Stepper:
     def _draw_sample(self, state: TrainingState) -> _Sample:
         view = state.next_view(self.views)
         divisor = self.schedule.divisor(state.iteration)
+        parts, surroundings = self._parts(state, view, divisor)
+        if surroundings:
+            divisor = self.schedule.coarser(divisor)
         whole, mask = self.photos.camera(view, divisor), self.photos.mask(view, divisor)
-        choices = windows(whole.width, whole.height, self.settings.pixels_per_iteration)
+        choices = parts or windows(whole.width, whole.height, self.settings.pixels_per_iteration)
         numbers = np.arange(len(choices))
         if mask is not None and self.settings.mask_mode == "ignore":
             shown = np.array([bool(window.of(mask).any()) for window in choices])
             numbers = np.flatnonzero(shown) if shown.any() else numbers
         number = int(numbers[int(state.random.integers(len(numbers)))])
         window = choices[number]
-        part = None if len(choices) == 1 else window
+        part = None if len(choices) == 1 and not parts else window
+        number += _FIRST_OF_FOCUS if parts else 0
         seen = self.backend.shown(self.photos, view, divisor, part)
-        return _Sample(view, divisor, whole, window, number, window.camera(whole), seen)
+        return _Sample(
+            view, divisor, whole, window, number, window.camera(whole), seen, surroundings
+        )
+
+    def _parts(self, state: TrainingState, view: int, divisor: int) -> tuple[list[Window], bool]:
+        """Return the windows of the regions in a photo, none where it is trained on whole.
+
+        The second value tells whether that is for the surroundings alone.
+        """
+        if self.focus is None:
+            return [], False
+        whole = self.photos.camera(view, divisor)
+        boxes = self.focus.rectangles(whole)
+        if boxes == [Window(0, 0, whole.width, whole.height)]:
+            return [], False
+        if not boxes or state.random.random() < SURROUNDINGS_SHARE:
+            return [], True
+        limit = self.settings.pixels_per_iteration
+        return [
+            dataclasses.replace(part, left=part.left + box.left, top=part.top + box.top)
+            for box in boxes
+            for part in windows(box.width, box.height, limit)
+        ], False
 
     def _is_empty(self, sample: _Sample) -> bool:
         """Return whether the mask leaves no pixel to compare."""
@@ -198,6 +232,8 @@ class Stepper:
 
     def _compares_views(self, state: TrainingState, sample: _Sample) -> bool:
         if not state.model_selection.chose("multi_view") or len(self.neighbours[sample.view]) == 0:
+            return False
+        if sample.of_surroundings:
             return False
         return self.schedule.compares_views(state.iteration)
 

@@ -26,6 +26,7 @@ from ..render.view_renderer import ViewRenderer
 from ..scene.scene import PhotoSource, evenly_spaced
 from ..settings import TrainingSettings
 from .exposure import corrected_for_measuring
+from .focus import Focus
 from .state import HeldOutMetrics
 
 _logger = logging.getLogger(__name__)
@@ -200,6 +201,7 @@ def png(picture: np.ndarray) -> bytes:
 def held_out_metrics(
     gaussians: OrientedGaussians, photos: PhotoSource, names: Mapping[int, str], progress: Progress,
     *, threads: int, renderer: Renderer | None = None, exposed: bool = False,
+    focus: Focus | None = None,
 ) -> tuple[list[HeldOutMetrics], str]:  # fmt: skip
     """Return the metrics of held-out photos, given by view and name, and why they have no LPIPS.
 
@@ -214,9 +216,17 @@ def held_out_metrics(
         mask = photos.mask(view, 1)
         if mask is not None and not mask.any():
             continue
-        image = _rendered(renderer, raw, photos, view, 1, threads, exposed)
-        scores = score_images(image, photos.photo(view, 1), mask, lpips=lpips, threads=threads)
-        figures.append(HeldOutMetrics(name, scores.psnr, scores.ssim, scores.lpips))
+        image, photo = (
+            _rendered(renderer, raw, photos, view, 1, threads, exposed),
+            photos.photo(view, 1),
+        )
+        scores = score_images(image, photo, mask, lpips=lpips, threads=threads)
+        of_regions = None
+        if focus is not None:
+            shown = focus.shown(photos.camera(view, 1))
+            shown = shown if mask is None else shown & mask
+            of_regions = min(psnr(image, photo, shown), BEST_PSNR) if shown.any() else None
+        figures.append(HeldOutMetrics(name, scores.psnr, scores.ssim, scores.lpips, of_regions))
     if not figures or any(figure.lpips is not None for figure in figures):
         return figures, ""
     return figures, reason or TOO_SMALL

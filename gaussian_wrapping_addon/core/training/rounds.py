@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -32,17 +32,12 @@ PRUNE_DIVISOR = 2
 VOTE_DIVISOR = 4
 """Divisors of the image size at which views are rendered for pruning and for the vote."""
 
-Inside = Callable[[np.ndarray], np.ndarray]
-"""Maps (n, 3) points to (n,) bool."""
-
 
 class Rounds:
     """Updates of the set of Gaussians. They depend on the state and the inputs alone.
 
     Parameters
     ----------
-    inside : callable, optional
-        Tells which points lie in the regions that density control favours.
     progress : Progress
         Checked for cancellation before every view of a round.
     filter_views : sequence of int, optional
@@ -52,11 +47,10 @@ class Rounds:
     def __init__(
         self,
         stepper: Stepper,
-        inside: Inside | None,
         progress: Progress,
         filter_views: Sequence[int] | None = None,
     ) -> None:
-        self.stepper, self.inside = stepper, inside
+        self.stepper = stepper
         self.filter_views = stepper.views if filter_views is None else list(filter_views)
         self.photos: PhotoSource = stepper.photos
         self.schedule: Schedule = stepper.schedule
@@ -182,14 +176,14 @@ class Rounds:
     def _wrap(self, state: TrainingState) -> bool:
         """Clone Gaussians with the opposite orientation; return whether there are new ones."""
         errors = self._normal_errors(state)
-        limit = self.settings.max_gaussians
+        limit = self.schedule.max_gaussians
         return wrap(state.adam, errors, self.settings.wrap_share, limit) > 0
 
     def _region_weights(self, state: TrainingState) -> np.ndarray | None:
         """Return (n,) weights of the Gaussians, or ``None`` if all weigh the same."""
-        if self.inside is None or self.settings.region_weight == 1.0:
+        if self.stepper.focus is None:
             return None
-        within = self.inside(state.adam.array("means").astype(np.float64))
+        within = self.stepper.focus.contains(state.adam.array("means").astype(np.float64))
         return np.where(within, self.settings.region_weight, 1.0)
 
     def _views(self, divisor: int) -> Iterator[WrapView]:

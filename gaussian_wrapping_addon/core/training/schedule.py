@@ -82,12 +82,20 @@ class Schedule:
     refines : bool
         Whether the Gaussians come from another training: then the finest level, all harmonics
         and late learning rates apply from the start.
+    budget_share : float
+        Of the settings' largest number of Gaussians.
     """
 
     settings: TrainingSettings
     long_side_px: int
     finest: int = 1
     refines: bool = False
+    budget_share: float = 1.0
+
+    @property
+    def max_gaussians(self) -> int:
+        """Largest number of Gaussians."""
+        return max(1, round(self.budget_share * self.settings.max_gaussians))
 
     @property
     def total(self) -> int:
@@ -121,6 +129,10 @@ class Schedule:
         while chosen > self.finest and self.long_side_px / chosen < SMALLEST_SIDE_PX:
             chosen //= 2
         return chosen
+
+    def coarser(self, divisor: int) -> int:
+        """Return the divisor of the next coarser level, or this one if that is too small."""
+        return 2 * divisor if self.long_side_px / (2 * divisor) >= SMALLEST_SIDE_PX else divisor
 
     def sh_degree(self, iteration: int) -> int:
         """Return the degree of the harmonics, where they are on."""
@@ -198,7 +210,7 @@ class Schedule:
         A part of ``max_gaussians`` is reserved for the wrapping rounds.
         """
         growth = (1.0 + self.settings.wrap_share) ** self.settings.wrap_rounds
-        return max(1, math.floor(self.settings.max_gaussians / growth))
+        return max(1, math.floor(self.max_gaussians / growth))
 
     def budget(self, iteration: int) -> int:
         """Return the limit on the number of Gaussians after this iteration.

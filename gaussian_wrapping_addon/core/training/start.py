@@ -28,9 +28,10 @@ from ..stereo.depth_maps import (
     cells_of,
     estimate_depth_maps,
     fill_gaps,
-    fuse,
+    lifted,
     load_priors,
     matching_divisor,
+    merged,
     open_cells,
     priors_of,
     save_priors,
@@ -38,6 +39,7 @@ from ..stereo.depth_maps import (
 from ..stereo.plane_filling import fill_plain_parts
 from .background import inside_masks
 from .exposure import Exposure
+from .focus import OUTSIDE_SIZE, Focus
 from .model_selection import Decision, ModelSelection, decide
 
 # -- What a training takes over from another one, instead of starting and deciding for itself -----
@@ -202,6 +204,7 @@ class DenseStart:
 def dense_start(
     scene: Scene, photos: PhotoSource, views: Sequence[int], setting: str, progress: Progress, *,
     side_px: int, max_gaussians: int, sh_degree: int, seed: int, threads: int,
+    focus: Focus | None = None,
 ) -> DenseStart:  # fmt: skip
     """Match the photos of the training views and return flat Gaussians on the surfaces found.
 
@@ -219,7 +222,7 @@ def dense_start(
         return DenseStart(None, {}, decision)
     maps = fill_plain_parts(maps, points, progress, seed=seed)
     wanted = start_budget(max_gaussians)
-    found = fuse(maps, wanted)
+    found = _fused(maps, wanted, focus)
     guesses = fill_gaps(maps, found, round(GUESS_SHARE * wanted))
     known = np.concatenate([found.positions, points])
     shell, _ = far_shell(maps, known, round(SHELL_SHARE * wanted))
@@ -240,6 +243,15 @@ def dense_start(
         kept = np.sort(random.choice(len(gaussians), max_gaussians, replace=False))
         gaussians = gaussians.select(torch.from_numpy(kept))
     return DenseStart(gaussians, priors_of(views, maps), decision)
+
+
+def _fused(maps: Sequence[DepthMap], wanted: int, focus: Focus | None) -> DensePoints:
+    """Return about ``wanted`` points on confirmed depths, farther apart outside the focus."""
+    pixels = lifted(maps, [m.confidence for m in maps])
+    if focus is not None:
+        apart = np.where(focus.contains(pixels.positions), 1.0, OUTSIDE_SIZE)
+        pixels = dataclasses.replace(pixels, sizes=apart * pixels.sizes)
+    return merged(pixels, wanted)
 
 
 def start_budget(max_gaussians: int) -> int:
@@ -327,6 +339,7 @@ class PointStart:
     max_gaussians: int
     seed: int
     threads: int
+    focus: Focus | None = None
 
     def gaussians(
         self, key: str, progress: Progress
@@ -345,6 +358,7 @@ class PointStart:
                 scene, self.photos, self.views, settings.dense_start, progress.span(0.0, 0.0),
                 side_px=settings.match_px, max_gaussians=self.max_gaussians,
                 sh_degree=settings.sh_degree, seed=self.seed, threads=self.threads,
+                focus=self.focus,
             )  # fmt: skip
             if start.gaussians is not None:
                 priors = start.priors if self.uses_priors else {}

@@ -410,13 +410,13 @@ class HeldOutMetrics:
     ssim: float
     lpips: float | None = None
     """``None`` if not measured."""
+    region_psnr: float | None = None
+    """dB, of the pixels that look through the regions; ``None`` without any."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values; ``lpips`` only if measured."""
+        """Return plain JSON values; what is not measured is left out."""
         values = dataclasses.asdict(self)
-        if self.lpips is None:
-            del values["lpips"]
-        return values
+        return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -447,6 +447,11 @@ class TrainingResult:
         return _mean([figure.psnr for figure in self.held_out])
 
     @property
+    def region_psnr(self) -> float:
+        """Mean PSNR of the regions in the held-out photos that show them, dB; NaN without any."""
+        return _mean([f.region_psnr for f in self.held_out if f.region_psnr is not None])
+
+    @property
     def held_out_ssim(self) -> float:
         """Mean SSIM of the held-out photos; NaN without any."""
         return _mean([figure.ssim for figure in self.held_out])
@@ -472,6 +477,8 @@ class TrainingResult:
         if self.held_out:
             values["held_out_psnr"] = self.held_out_psnr
             values["held_out_ssim"] = self.held_out_ssim
+            if not math.isnan(self.region_psnr):
+                values["held_out_region_psnr"] = self.region_psnr
             if not math.isnan(self.held_out_lpips):
                 values["held_out_lpips"] = self.held_out_lpips
             elif self.lpips_note:

@@ -39,12 +39,13 @@ from .camera_poses import PosedPhotos
 from .cpu_backend import CpuBackend
 from .exposure import Exposure
 from .exposure_selection import first_decisions
+from .focus import Focus
 from .growth_selection import photo_detail, select_image_size
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import LiveView, divisor_for, held_out_metrics, measure_held_out
 from .model_selection import Decision, start_poses
 from .multi_view import find_neighbours
-from .rounds import Inside, Rounds
+from .rounds import Rounds
 from .schedule import SMALLEST_SIDE_PX, Schedule
 from .splat_start import start_from_splat, wrapping_settings
 from .start import LEAST_REACH, Handover, PointStart, onto_sphere
@@ -81,7 +82,7 @@ RESTART_RATE = 0.5
 def train(
     scene: Scene, photos: PhotoSource, settings: TrainingSettings, folder: Path, progress: Progress,
     *, seed: int = 0, threads: int = 0, start: Path | Handover | None = None,
-    inside: Inside | None = None, backend: Backend | None = None,
+    focus: Focus | None = None, backend: Backend | None = None,
 ) -> TrainingResult:  # fmt: skip
     """Train oriented Gaussians on the photos of a scene.
 
@@ -105,8 +106,8 @@ def train(
         and does not densify (:func:`~.splat_start.wrapping_settings`). Or what another training of
         the scene has found; nothing is started or decided then, and the result's ``poses`` are
         ``None``.
-    inside : callable, optional
-        Tells for points (n, 3), scene frame, where ``settings.region_weight`` applies.
+    focus : Focus, optional
+        What the training is for; ``settings.region_weight`` applies there.
     backend : Backend, optional
         Where to train; by default on the processor. A checkpoint goes on on any. One that fails
         (memory, driver) is replaced by the processor, with a warning in the result.
@@ -129,7 +130,7 @@ def train(
     try:
         with decoded_in(photos, folder):
             run = _Trainer(
-                scene, photos, settings, folder, seed, threads, start, inside, progress, backend
+                scene, photos, settings, folder, seed, threads, start, focus, progress, backend
             )
             return run.run()
     finally:
@@ -142,7 +143,7 @@ class _Trainer:
     def __init__(
         self, scene: Scene, photos: PhotoSource, settings: TrainingSettings, folder: Path,
         seed: int, threads: int, start: Path | Handover | None = None,
-        inside: Inside | None = None, progress: Progress | None = None,
+        focus: Focus | None = None, progress: Progress | None = None,
         backend: Backend | None = None,
     ) -> None:  # fmt: skip
         handover = start if isinstance(start, Handover) else None
@@ -155,7 +156,7 @@ class _Trainer:
         self.progress = progress or Progress()
         self.photos = CancellablePhotos(self.posed, self.progress)
         self.folder, self.seed, self.threads = folder, seed, threads
-        self.start_splat, self.inside, self.handover = start_splat, inside, handover
+        self.start_splat, self.handover = start_splat, handover
         if handover is not None and handover.views is not None:
             self.held_out, self.views = [], list(handover.views)
         else:
@@ -169,10 +170,11 @@ class _Trainer:
         numbers = np.array(self.views)
         self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
         self.image_decision, finest = self._image_size(side_px)
-        self.schedule = Schedule(settings, side_px, finest, start_splat is not None)
+        share = 1.0 if focus is None else focus.budget_share(sizes)
+        self.schedule = Schedule(settings, side_px, finest, start_splat is not None, share)
         self.stepper = Stepper(
             self.posed, self.schedule, self.views, self.neighbours,
-            backend or CpuBackend(threads), threads,
+            backend or CpuBackend(threads), threads, focus,
         )  # fmt: skip
         self.live_figures: dict[str, float] = {}
         self.live = LiveView(
@@ -207,7 +209,7 @@ class _Trainer:
         key = fingerprint(self.scene, self.settings, self.seed, self.start_splat, taken_over)
         self.progress.update(0.0, "preparing the Gaussians")
         rounds = Rounds(
-            self.stepper, self.inside, self.progress,
+            self.stepper, self.progress,
             None if handover is None else handover.filter_views,
         )  # fmt: skip
         state = load_checkpoint(self.folder, key)
@@ -287,7 +289,7 @@ class _Trainer:
         held_out, lpips_note = held_out_metrics(
             gaussians, self.photos, names, self.progress,
             threads=self.threads, renderer=self.stepper.renderer,
-            exposed=state.exposure is not None,
+            exposed=state.exposure is not None, focus=self.stepper.focus,
         )  # fmt: skip
         return TrainingResult(
             gaussians, self.schedule.total, tuple(state.history), tuple(held_out), seconds,
@@ -360,6 +362,7 @@ class _Trainer:
         return PointStart(
             self.scene, self.photos, self.views, self.settings, self.folder,
             self.schedule.divisor(0), self.schedule.growth_limit(), self.seed, self.threads,
+            self.stepper.focus,
         )  # fmt: skip
 
     def _saved_priors(self, state: TrainingState, key: str) -> dict[int, DepthPrior]:

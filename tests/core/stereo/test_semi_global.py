@@ -16,7 +16,7 @@ from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
 from gaussian_wrapping_addon.core.scene.scene import Scene, View
 from gaussian_wrapping_addon.core.stereo import depth_maps
 from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap, estimate_depth_maps
-from gaussian_wrapping_addon.core.stereo.matching import coarser_planes, widest_angle_deg
+from gaussian_wrapping_addon.core.stereo.matching import coarser_planes, source_angles_deg
 from gaussian_wrapping_addon.core.stereo.semi_global import MOST_HYPOTHESES, matched_planes
 from tests.core.stereo.textured_plane import grey_photo, true_planes
 from tests.core.training.small_scene import PhotosInMemory
@@ -160,22 +160,23 @@ def test_photos_without_two_guided_sources_are_matched_as_before(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scene, photos, _ = row_scene()
-    near = [widest_angle_deg([v.camera for v in scene.views], 3, np.arange(7), scene.points)]
+    given = [view.camera for view in scene.views]
+    near = source_angles_deg(given, 3, np.array([0, 1, 2, 4, 5, 6]), scene.points).max()
     # The middle photo alone has all its sources within this angle.
-    monkeypatch.setattr(depth_maps, "GUIDED_ANGLE_DEG", near[0] * 1.01)
+    monkeypatch.setattr(depth_maps, "GUIDED_ANGLE_DEG", near * 1.01)
     found = middle_map(scene, photos)
     monkeypatch.setattr(depth_maps, "GUIDED_ANGLE_DEG", 0.0)
     np.testing.assert_array_equal(found.depth, middle_map(scene, photos).depth)
 
 
-def test_the_widest_angle_is_that_of_the_farthest_source() -> None:
+def test_the_angles_of_sources_are_those_of_rays_to_the_same_points() -> None:
     scene, _, _ = row_scene()
     given = [view.camera for view in scene.views]
     wall = scene.points[scene.points[:, 2] == FAR]
-    found = widest_angle_deg(given, 0, np.arange(1, COUNT), wall)
-    assert found == pytest.approx(np.degrees(np.arctan(STEP * (COUNT - 1) / FAR)), rel=0.1)
-    assert widest_angle_deg(given, 0, np.arange(0), wall) == 0.0
-    assert widest_angle_deg(given, 0, np.arange(1, COUNT), wall[:0]) == 0.0
+    found = source_angles_deg(given, 0, np.arange(COUNT), wall)
+    true = np.degrees(np.arctan(STEP * np.arange(COUNT) / FAR))
+    np.testing.assert_allclose(found, true, rtol=0.1, atol=1e-3)
+    assert (source_angles_deg(given, 0, np.arange(COUNT), wall[:0]) == 0.0).all()
 
 
 def test_planes_of_half_the_size_are_those_of_the_resized_camera() -> None:

@@ -134,7 +134,7 @@ class Run:
         self.stepper = Stepper(self.posed, schedule, self.views, neighbours, backend, 1)
         if case.priors:
             self.stepper.priors = {v: sphere_prior(photos, v) for v in self.views}
-        self.rounds = Rounds(self.stepper, None, Progress())
+        self.rounds = Rounds(self.stepper, Progress())
         self.gradients: dict[str, np.ndarray] = {}
         self.by_pose: Any = None
         self._watch()

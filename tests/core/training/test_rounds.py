@@ -59,7 +59,7 @@ def rounds_of(scene: Scene, photos: PhotosInMemory, settings: TrainingSettings) 
     views = list(range(len(scene.views)))
     neighbours = {view: np.zeros(0, np.int64) for view in views}
     stepper = Stepper(photos, Schedule(settings, SIZE_PX), views, neighbours, CpuBackend(1), 1)
-    return Rounds(stepper, None, Progress("train"))
+    return Rounds(stepper, Progress("train"))
 
 
 def run(

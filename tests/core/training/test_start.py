@@ -14,11 +14,13 @@ import torch
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.scene.scene import PhotoSource, Scene
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.stereo.depth_maps import CELL_PX, FILE_NAME, DepthMap
 from gaussian_wrapping_addon.core.training import trainer
+from gaussian_wrapping_addon.core.training.focus import OUTSIDE_SIZE, Focus
 from gaussian_wrapping_addon.core.training.rounds import Rounds
 from gaussian_wrapping_addon.core.training.start import (
     FLATNESS,
@@ -53,11 +55,13 @@ def start(
     *,
     max_gaussians: int = 3000,
     seed: int = 0,
+    focus: Focus | None = None,
 ) -> DenseStart:
     own_scene, own_photos = ball_scene()
     return dense_start(
         scene or own_scene, photos or own_photos, FEW, setting, Progress(),
         side_px=SIDE_PX, max_gaussians=max_gaussians, sh_degree=1, seed=seed, threads=1,
+        focus=focus,
     )  # fmt: skip
 
 
@@ -100,6 +104,23 @@ def test_confirmed_gaussians_lie_flat_on_the_surfaces() -> None:
     assert all(torch.isfinite(t).all() for _, t in gaussians.tensors())
     # No larger than the photos' resolution and the number allow, no gaps either.
     assert 0.01 < np.median(np.exp(scales[confirmed, 0])) < 0.2
+
+
+def test_points_are_closer_together_where_the_training_is_for() -> None:
+    half = Focus([Region.box("half", np.array([0.0, -9.0, -9.0]), np.array([9.0, 9.0, 9.0]))])
+    found = start(focus=half).gaussians
+    assert found is not None
+    shares, spacings = [], []
+    for gaussians in (started(), found):
+        near = gaussians.select(torch.linalg.norm(gaussians.means, dim=1) < 2.5)
+        right = half.contains(near.means.numpy())
+        size = np.exp(near.log_scales.numpy()[:, 0])
+        shares.append(right.mean())
+        spacings.append(np.median(size[~right]) / np.median(size[right]))
+    assert 1.5 < spacings[1] / spacings[0] < 1.2 * OUTSIDE_SIZE
+    assert shares[0] < 0.7
+    assert shares[1] > 0.75
+    assert len(found) == pytest.approx(len(started()), rel=0.3)
 
 
 def test_the_decision_tells_how_much_was_confirmed() -> None:
@@ -198,7 +219,7 @@ def first_state(setting: str, folder: Path, events: list[ProgressEvent]) -> Trai
     settings = dataclasses.replace(SETTINGS, dense_start=setting)
     progress = Progress("train", events.append)
     run = trainer._Trainer(few, own, settings, folder, 0, 1, progress=progress)
-    return run._start(Rounds(run.stepper, run.inside, progress), "key")
+    return run._start(Rounds(run.stepper, progress), "key")
 
 
 def test_the_training_starts_from_what_the_setting_says(tmp_path: Path) -> None:

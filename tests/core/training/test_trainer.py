@@ -337,7 +337,7 @@ def test_windows_that_a_mask_empties_say_nothing(tmp_path: Path) -> None:
         SETTINGS, iterations=30, pixels_per_iteration=450, holdout_every=0, exposure="off"
     )
     run = trainer._Trainer(scene, store, settings, tmp_path, 0, 1)
-    state = run._start(rounds.Rounds(run.stepper, None, Progress()), "key")
+    state = run._start(rounds.Rounds(run.stepper, Progress()), "key")
     for _ in range(30):
         run.stepper.step(state)
     numbers = {row[1] % iteration._MAX_WINDOWS for row in state.error_history._rows}

@@ -561,6 +561,9 @@ def headline(report: dict[str, Any]) -> list[str]:
     psnr, held_out = measured(training.get("held_out_psnr")), items(training.get("held_out"))
     known = psnr is not None and bool(held_out)
     text = f"PSNR {psnr:.2f} dB ({plural(len(held_out), 'photo')})" if known else NOT_MEASURED
+    of_regions = measured(training.get("held_out_region_psnr"))
+    if known and of_regions is not None:
+        text += f", {of_regions:.2f} dB where they show the regions"
     lines.append(f"held-out photos: {text}")
     for name, region in part(report, "regions").items():
         statistics = part(region, "statistics")

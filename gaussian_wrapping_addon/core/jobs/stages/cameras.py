@@ -24,6 +24,7 @@ from ...loading.other_inputs import (
     splat_extent,
 )
 from ...loading.source_kind import SPLAT
+from ...names import AUTO
 from ...progress import Progress, ReportWarning, read_warnings
 from ...readers.point_files import is_splat_path
 from ...scene.scene import Scene, View
@@ -344,11 +345,16 @@ def is_whole_scene(stage_folder: Path) -> bool:
 
 
 def regions_listed(listed: str, scene: Scene) -> list[Region]:
-    """Return the regions of a setting that is a JSON list of region bodies, scene frame."""
-    from ...regions.scene_regions import parse_region, region_in_scene
+    """Return the regions of a setting that is a JSON list of region bodies, scene frame.
+
+    ``"auto"`` instead of a body is the automatic region.
+    """
+    from ...regions.scene_regions import automatic_region, parse_region, region_in_scene
 
     return [
-        region_in_scene(parse_region(body, Path("job.json")), scene.world_from_scene)
+        automatic_region(scene)
+        if body == AUTO
+        else region_in_scene(parse_region(body, Path("job.json")), scene.world_from_scene)
         for body in json.loads(listed)
     ]
 

@@ -32,15 +32,13 @@ from ..store.rollback import (
 from ..store.stage_folder import Stage, read_done, record_interrupted_time, run_stage
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ...gaussians.model import OrientedGaussians
     from ...photos.store import PhotoStore
     from ...scene.scene import Scene
     from ...stereo.depth_maps import DepthPrior
     from ...training.backend import Backend
     from ...training.block_plan import BlockPlan
-    from ...training.rounds import Inside
+    from ...training.focus import Focus
     from ...training.state import TrainingResult
 
 
@@ -255,21 +253,21 @@ class TrainingStages:
         self._fit_device(coarse_settings(self._settings).max_gaussians)
         self._root.mkdir(parents=True, exist_ok=True)
         estimated, warnings = self._estimated(self._root, progress)
-        inside = self._inside_regions()
+        focus = self._focus()
 
         def whole(folder: Path) -> bool:
             return (self._root / PLAN_NAME).is_file() and is_whole(self._root / ARRAYS_NAME)
 
         def work(folder: Path, progress: Progress) -> dict[str, Any]:
             with _time_noted(folder), _within_memory("The coarse training"):
-                done = self._train_coarse(folder, progress, inside)
+                done = self._train_coarse(folder, progress, focus)
             listed = [warning.to_json() for warning in warnings]
             return {**done, "estimate": estimated, "warnings": [*listed, *done["warnings"]]}
 
         return run_stage(self._root, COARSE, COARSE_KEY, progress, work, whole=whole)
 
     def _train_coarse(
-        self, folder: Path, progress: Progress, inside: Inside | None
+        self, folder: Path, progress: Progress, focus: Focus | None
     ) -> dict[str, Any]:
         from ...scene.scene import with_poses
         from ...training.block_plan import coarse_settings, plan_blocks, save_plan, train_coarse
@@ -280,7 +278,7 @@ class TrainingStages:
         coarse = train_coarse(
             scene, _photos(scene, less), less, folder,
             progress.span(0.0, 0.9), seed=self.job.settings.seed, threads=self.threads,
-            inside=inside, backend=self._backend(),
+            focus=focus, backend=self._backend(),
         )  # fmt: skip
         if coarse.poses is not None:
             scene = with_poses(scene, coarse.poses)
@@ -316,7 +314,7 @@ class TrainingStages:
                 f"The training has no block {index}, but {self._settings.blocks} blocks.",
                 "Plan the parts again: batch.py parts DIR.",
             )
-        inside = self._inside_regions()
+        focus = self._focus()
 
         def whole(folder: Path) -> bool:
             done = read_done(folder) or {}
@@ -325,12 +323,12 @@ class TrainingStages:
 
         def work(folder: Path, progress: Progress) -> dict[str, Any]:
             with _time_noted(folder), _within_memory(f"Block {index}"):
-                return self._train_block(index, folder, progress, inside)
+                return self._train_block(index, folder, progress, focus)
 
         return run_stage(self._root, BLOCK, f"{index:04d}", progress, work, whole=whole)
 
     def _train_block(
-        self, index: int, folder: Path, progress: Progress, inside: Inside | None
+        self, index: int, folder: Path, progress: Progress, focus: Focus | None
     ) -> dict[str, Any]:
         from ...gaussians.files import save_gaussians
         from ...training.blocks import block_training
@@ -343,7 +341,7 @@ class TrainingStages:
         shorter, handover = block_training(plan, index, settings, priors)
         result = train(
             scene, _photos(scene, settings), shorter, folder, progress,
-            seed=self.job.settings.seed, threads=self.threads, inside=inside,
+            seed=self.job.settings.seed, threads=self.threads, focus=focus,
             backend=self._backend(), start=handover,
         )  # fmt: skip
         save_gaussians(folder / GAUSSIANS_NAME, result.gaussians)
@@ -437,14 +435,14 @@ class TrainingStages:
         self._fit_device(self._settings.max_gaussians)
         scene = self._scene
         estimated, warnings = self._estimated(stage_folder, progress)
-        inside = self._inside_regions()
+        focus = self._focus()
         _logger.info("training on %s", self.device.device)
 
         def attempt(settings: TrainingSettings) -> TrainingResult:
             return train(
                 scene, _photos(scene, settings), settings, stage_folder, progress,
                 seed=self.job.settings.seed, threads=self.threads,
-                start=start_splat_of(self.job), inside=inside, backend=self._backend(),
+                start=start_splat_of(self.job), focus=focus, backend=self._backend(),
             )  # fmt: skip
 
         trained = train_with_oom_retry(
@@ -578,21 +576,14 @@ class TrainingStages:
             self.device.device, self.threads, or_processor=self.job.settings.device == "auto"
         )
 
-    def _inside_regions(self) -> Inside | None:
-        """Return the test whether points lie in the job's weighted regions, scene frame, if any."""
+    def _focus(self) -> Focus | None:
+        """Return the regions that the training is for, if any."""
+        from ...training.focus import Focus
         from .cameras import regions_listed
 
         if not self._settings.focus:
             return None
-        regions = regions_listed(self._settings.focus, self._scene)
-
-        def inside(points: np.ndarray) -> np.ndarray:
-            found = regions[0].contains(points, 0.0)
-            for region in regions[1:]:
-                found |= region.contains(points, 0.0)
-            return found
-
-        return inside
+        return Focus(regions_listed(self._settings.focus, self._scene))
 
 
 def compile_if_needed(

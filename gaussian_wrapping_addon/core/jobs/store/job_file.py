@@ -24,7 +24,7 @@ from ...errors import DatasetError, ParseError, SettingError, UsageError, WrapEr
 from ...files import finite_json, read_json, real_path, write_json
 from ...limits import SHORTEST_EDGE
 from ...masks.mask_folder import check_model_file
-from ...names import AUTOMATIC_REGIONS, RESULT_FORMATS, file_stem, region_name, region_names
+from ...names import AUTO, AUTOMATIC_REGIONS, RESULT_FORMATS, file_stem, region_name, region_names
 from ...regions.files import parse_region_file, read_region_body
 from ...scene.camera import Similarity
 from ...scene.frames import FileFrame
@@ -34,6 +34,7 @@ from ...settings import (
     JobSettings,
     MeshingSettings,
     TextureSettings,
+    TrainingSettings,
     from_json,
     key_values,
     to_json,
@@ -231,8 +232,7 @@ def make_job(
     training, mask_regions = settings.training, settings.mask_regions
     if command == "wrap":
         listed = json.dumps(list(bodies.values()), sort_keys=True)
-        weighted = training.region_weight != 1.0 and bodies
-        training = replace(training, focus=listed if weighted else "")
+        training = replace(training, focus=_focus_of(training, names, bodies))
         mask_regions = listed if _makes_masks_of_regions(settings, source, bodies) else ""
     settings = replace(
         settings, training=training, mask_regions=mask_regions,
@@ -241,6 +241,13 @@ def make_job(
         control_points=str(real_path(control)) if control else "",
     )  # fmt: skip
     return JobFile(command, str(real_path(source)), settings, bodies, lengths)
+
+
+def _focus_of(training: TrainingSettings, names: Sequence[str], bodies: Mapping[str, Any]) -> str:
+    """Return the setting that tells what the training is for; empty where that is everything."""
+    if training.region_weight == 1.0 or "all" in names:
+        return ""
+    return json.dumps([*bodies.values(), *([AUTO] if AUTO in names else [])], sort_keys=True)
 
 
 def _makes_masks_of_regions(settings: JobSettings, source: Path, bodies: Mapping[str, Any]) -> bool:
@@ -303,11 +310,11 @@ def _check_bodies(settings: JobSettings, bodies: dict[str, Any]) -> None:
         ("training.focus", settings.training.focus), ("mask_regions", settings.mask_regions),
     ):  # fmt: skip
         if text:
-            _check_region_list(where, text)
+            _check_region_list(where, text, automatic=where == "training.focus")
 
 
-def _check_region_list(where: str, text: str) -> None:
-    """Raise for a setting that is no JSON list of region bodies."""
+def _check_region_list(where: str, text: str, *, automatic: bool) -> None:
+    """Raise for a setting that is no JSON list of region bodies, the automatic one among them."""
     try:
         listed = json.loads(text)
     except (ValueError, RecursionError):
@@ -317,7 +324,13 @@ def _check_region_list(where: str, text: str) -> None:
             f"job.json: settings.{where} is no list of regions.", "Start the job again."
         )
     name = where.rpartition(".")[2]
-    _check_regions({f"{name}[{number}]": body for number, body in enumerate(listed)})
+    _check_regions(
+        {
+            f"{name}[{number}]": body
+            for number, body in enumerate(listed)
+            if not (automatic and body == AUTO)
+        }
+    )
 
 
 def _check_regions(bodies: dict[str, Any]) -> None:

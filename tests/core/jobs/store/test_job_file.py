@@ -172,9 +172,14 @@ def test_regions_that_a_training_favours_stay_its_own(tmp_path: Path) -> None:
         }
         (tmp_path / f"{name}.json").write_text(json.dumps(bodies[name]))
     settings = preset("draft", regions=(str(tmp_path / "head.json"),))
-    assert make_job("wrap", tmp_path, settings).settings.training.focus == ""
-    weighted = replace(settings, training=replace(settings.training, region_weight=4.0))
-    trained = make_job("wrap", tmp_path, weighted)
+    evenly = replace(settings, training=replace(settings.training, region_weight=1.0))
+    assert make_job("wrap", tmp_path, evenly).settings.training.focus == ""
+    everything = replace(settings, regions=(*settings.regions, "all"))
+    assert make_job("wrap", tmp_path, everything).settings.training.focus == ""
+    both = make_job("wrap", tmp_path, replace(settings, regions=("auto", *settings.regions)))
+    assert json.loads(both.settings.training.focus) == [bodies["head"], "auto"]
+    assert JobFile.from_json(both.to_json()) == both
+    trained = make_job("wrap", tmp_path, settings)
     assert json.loads(trained.settings.training.focus) == [bodies["head"]]
     other = replace(trained.settings, regions=(str(tmp_path / "foot.json"),))
     meshed = make_job("mesh", tmp_path, other)
