@@ -23,7 +23,9 @@ from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings, 
 from tests.core.jobs.finished_sphere import write_cube
 from tests.core.training.row_scene import SETTINGS, row_scene
 
-TRAINING = dataclasses.replace(SETTINGS, iterations=120, blocks=2, checkpoint_every_s=0.2)
+TRAINING = dataclasses.replace(
+    SETTINGS, iterations=120, blocks=2, checkpoint_every_s=0.2, region_weight=1.0
+)
 
 
 def row_job(root: Path, **changes: object) -> tuple[JobFolder, JobFile]:
