@@ -9,14 +9,7 @@ import pytest
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.evaluation.alignment import icp, pose_errors, refine_as_tanks
 from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
-
-
-def rotation_about(axis: list[float], degrees: float) -> np.ndarray:
-    a = np.array(axis) / np.linalg.norm(axis)
-    k = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-    angle = np.radians(degrees)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
-
+from tests.core.evaluation.written_layouts import rotation_about
 
 TRUE = Similarity(3.7, rotation_about([1, 2, -1], 131.0), np.array([5.0, -2.0, 0.3]))
 
@@ -31,51 +24,41 @@ def bumpy_sphere(count: int) -> np.ndarray:
     return d * radius[:, None]
 
 
-def assert_same(found: Similarity, true: Similarity, tolerance: float) -> None:
-    assert abs(found.scale / true.scale - 1) < tolerance
-    np.testing.assert_allclose(found.rotation, true.rotation, atol=tolerance)
-    size = max(1.0, float(np.abs(true.translation).max()))
-    np.testing.assert_allclose(found.translation, true.translation, atol=tolerance * size)
-
-
 @pytest.mark.parametrize("with_scale", [False, True])
 def test_icp_converges_on_a_perturbed_surface(with_scale: bool) -> None:
     target = bumpy_sphere(4000) + np.array([2e5, 0, 1e5])
-    nudge = Similarity(
-        1.02 if with_scale else 1.0, rotation_about([0, 1, 1], 4.0), np.array([0.03, -0.02, 0.04])
-    )
+    scale = 1.02 if with_scale else 1.0
+    nudge = Similarity(scale, rotation_about([0, 1, 1], 4.0), np.array([0.03, -0.02, 0.04]))
     center = target.mean(0)
     # source = what the nudge (about the centre) maps to the target.
     source = nudge.inverse().points(target - center) + center
-    found = icp(
-        source, target, Similarity(), max_distance=0.5, iterations=300, with_scale=with_scale
-    )
+    found, many = (
+        icp(
+            source, target, Similarity(), max_distance=0.5, iterations=300, with_scale=with_scale,
+            threads=threads,
+        )
+        for threads in (1, 2)
+    )  # fmt: skip
     assert found.converged
     assert found.fitness == 1.0
     assert np.linalg.norm(found.transform.points(source) - target, axis=1).max() < 1e-6
     assert found.rmse < 1e-6
     assert with_scale or found.transform.scale == pytest.approx(1.0, abs=1e-12)
-    many = icp(
-        source, target, Similarity(), max_distance=0.5, iterations=300, with_scale=with_scale,
-        threads=2,
-    )  # fmt: skip
     assert (many.transform.matrix() == found.transform.matrix()).all()
 
 
-def test_icp_leaves_far_points_out() -> None:
+def test_icp_leaves_far_points_out_and_refuses_what_it_cannot_pair() -> None:
     target = bumpy_sphere(2000)
     source = np.concatenate([target + np.array([0.02, 0, 0]), target[:500] + np.array([9.0, 0, 0])])
     found = icp(source, target, Similarity(), max_distance=0.3, iterations=200, with_scale=False)
     assert found.fitness == 2000 / 2500
     np.testing.assert_allclose(found.transform.translation, [-0.02, 0, 0], atol=1e-6)
-
-
-def test_icp_refuses_what_it_cannot_pair() -> None:
-    target = bumpy_sphere(100)
-    with pytest.raises(DatasetError, match="initial alignment is wrong"):
-        icp(target + 50.0, target, Similarity(), max_distance=0.1, with_scale=True)
-    with pytest.raises(DatasetError, match="at least 3 source points"):
-        icp(target[:2], target, Similarity(), max_distance=0.1, with_scale=True)
+    for source, words in (
+        (target + 50.0, "initial alignment is wrong"),
+        (target[:2], "at least 3 source points"),
+    ):
+        with pytest.raises(DatasetError, match=words):
+            icp(source, target, Similarity(), max_distance=0.1, with_scale=True)
 
 
 def test_the_three_stages_find_a_surface_that_is_sampled_elsewhere() -> None:

@@ -7,10 +7,10 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.io import savemat
 
 from gaussian_wrapping_addon import batch
@@ -24,7 +24,6 @@ from gaussian_wrapping_addon.core.evaluation.dtu import (
     score_dtu,
 )
 from gaussian_wrapping_addon.core.evaluation.layouts import (
-    THRESHOLDS,
     PolygonVolume,
     align_to_log,
     photo_numbers,
@@ -37,6 +36,7 @@ from gaussian_wrapping_addon.core.evaluation.layouts import (
 from gaussian_wrapping_addon.core.evaluation.surface_scores import face_normals
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from tests.core.evaluation.surface_scenes import ball, exact_sphere, joined
 from tests.core.evaluation.written_layouts import (
     JOB_FROM_TRUTH,
     Mesh,
@@ -48,31 +48,19 @@ from tests.core.evaluation.written_layouts import (
 )
 
 SCAN = 24
-
-
 MIDDLE = np.array([40.0, -20.0, 600.0])
-
-
 RADIUS, OFFSET = 12.0, 0.5
-
-
 NAMES = [f"rect_{i:03}_3_r5000.png" for i in range(1, 13)]
-
-
 CAMERAS = ring_of_cameras(NAMES, 150.0, MIDDLE)
 
 
-def ball(radius: float, middle: np.ndarray, subdivisions: int) -> Mesh:
-    mesh = trimesh.creation.icosphere(subdivisions)
-    return np.asarray(mesh.vertices) * radius + middle, np.asarray(mesh.faces, np.int64)
-
-
 def sphere_points(count: int) -> np.ndarray:
-    i = np.arange(count) + 0.5
-    z = 1 - 2 * i / count
-    angle = np.pi * (1 + 5**0.5) * i
-    r = np.sqrt(1 - z * z)
-    return MIDDLE + RADIUS * np.stack([r * np.cos(angle), r * np.sin(angle), z], 1)
+    return MIDDLE + exact_sphere(count, RADIUS).points
+
+
+def ball_at(radius: float, middle: np.ndarray = MIDDLE) -> Mesh:
+    vertices, faces = ball(5, radius)
+    return vertices + middle, faces
 
 
 @pytest.fixture(scope="module")
@@ -82,23 +70,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_dtu(root, SCAN, sphere_points(200_000), CAMERAS, middle=MIDDLE)
 
 
-def shell_with_debris() -> Mesh:
-    """A shell OFFSET outside of the truth, and a ball where nothing was observed."""
-    shell, debris = ball(RADIUS + OFFSET, MIDDLE, 5), ball(3.0, MIDDLE - [25.0, 0, 0], 2)
-    vertices = np.concatenate([shell[0], debris[0]])
-    return vertices, np.concatenate([shell[1], debris[1] + len(shell[0])])
-
-
 def test_a_shell_scores_its_offset(folder: Path, tmp_path: Path) -> None:
-    job = write_job(tmp_path / "job", shell_with_debris(), CAMERAS, JOB_FROM_TRUTH)
+    # The debris lies where nothing was observed.
+    mesh = joined(ball_at(RADIUS + OFFSET), ball_at(3.0, MIDDLE - [25.0, 0, 0]))
+    job = write_job(tmp_path / "job", mesh, CAMERAS, JOB_FROM_TRUTH)
     out = tmp_path / "scores.json"
     arguments = ["evaluate", str(job), "--truth", str(folder), "--scan", str(SCAN)]
     assert batch.main([*arguments, "--out", str(out)]) == 0
     report = json.loads(out.read_text())
     assert (report["layout"], report["scan"]) == ("dtu", SCAN)
-    assert report["alignment"]["cameras"] == 12
-    assert report["alignment"]["number_offset"] == 0
-    assert report["alignment"]["rmse_mm"] < 1e-6
+    aligned = report["alignment"]
+    assert (aligned["cameras"], aligned["number_offset"]) == (12, 0)
+    assert aligned["rmse_mm"] < 1e-6
     score = report["scores"]["dtu"]
     assert score["accuracy"] == pytest.approx(OFFSET, abs=0.005)
     # The prediction is thinned out to 0.2 mm: its nearest point is up to 0.2 aside.
@@ -106,31 +89,20 @@ def test_a_shell_scores_its_offset(folder: Path, tmp_path: Path) -> None:
     assert score["overall"] == pytest.approx((score["accuracy"] + score["completeness"]) / 2)
 
 
-def test_the_truth_itself_scores_nearly_nothing(folder: Path) -> None:
-    truth = read_dtu(folder, SCAN)
-    mesh = ball(RADIUS, MIDDLE, 5)
-    moved = JOB_FROM_TRUTH.points(mesh[0])
-    found = align_to_scan([c.moved(JOB_FROM_TRUTH) for c in CAMERAS], truth)
-    score = score_dtu(moved, mesh[1], truth, found.transform)
-    assert 0 < score.accuracy < 0.06
-    assert 0 < score.completeness < 0.12
-
-
 def test_points_below_the_ground_are_not_asked_for(folder: Path) -> None:
     truth = read_dtu(folder, SCAN)
-    points = truth.cloud
-    above = points[:, 2] > MIDDLE[2] - 10.0
-    np.testing.assert_array_equal(points @ truth.plane[:3] + truth.plane[3] > 0, above)
-    vertices, faces = ball(RADIUS, MIDDLE, 5)
+    above = truth.cloud[:, 2] > MIDDLE[2] - 10.0
+    np.testing.assert_array_equal(truth.cloud @ truth.plane[:3] + truth.plane[3] > 0, above)
+    vertices, faces = ball_at(RADIUS)
     kept = faces[vertices[faces].mean(1)[:, 2] > MIDDLE[2] - 10.2]
     score = score_dtu(vertices, kept, truth, Similarity())
+    assert 0 < score.accuracy < 0.06
     assert score.completeness < 0.12
     assert score.completeness_count == above.sum()
 
 
 def test_archived_cameras_count_from_zero(folder: Path, tmp_path: Path) -> None:
-    root = tmp_path / "copy"
-    write_dtu(root, SCAN, sphere_points(500), CAMERAS, middle=MIDDLE)
+    root = write_dtu(tmp_path / "copy", SCAN, sphere_points(500), CAMERAS, middle=MIDDLE)
     matrices = {}
     for i, camera in enumerate(CAMERAS):
         k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
@@ -140,48 +112,48 @@ def test_archived_cameras_count_from_zero(folder: Path, tmp_path: Path) -> None:
     np.savez(root / f"scan{SCAN}" / "cameras.npz", **matrices)
     truth = read_dtu(root, SCAN)
     assert truth.camera_source == "cameras.npz"
-    names = [f"{i:06}.png" for i in range(12)]
+    moved = [replace(c.moved(JOB_FROM_TRUTH), name=f"{i:06}.png") for i, c in enumerate(CAMERAS)]
     for source, wanted in ((truth, 0), (read_dtu(folder, SCAN), 1)):
-        moved = [
-            replace(c.moved(JOB_FROM_TRUTH), name=n) for c, n in zip(CAMERAS, names, strict=True)
-        ]
         found = align_to_scan(moved, source)
         assert found.number_offset == wanted
         assert found.rmse_mm < 1e-6
 
 
-def test_cameras_of_another_scene_are_refused(folder: Path) -> None:
+def test_cameras_of_another_scene_are_refused(folder: Path, scene: Path) -> None:
     truth = read_dtu(folder, SCAN)
-    mixed = [replace(c, name=n) for c, n in zip(CAMERAS, NAMES[5:] + NAMES[:5], strict=True)]
-    other = [
-        replace(c, cam_from_world=c.cam_from_world * [1, 1, 1, (-1) ** i])
-        for i, c in enumerate(mixed)
+    mixed = [
+        replace(c, name=n, cam_from_world=c.cam_from_world * [1, 1, 1, (-1) ** i])
+        for i, (c, n) in enumerate(zip(CAMERAS, NAMES[5:] + NAMES[:5], strict=True))
     ]
-    with pytest.raises(DatasetError, match=r"are off those of Calibration/cal18 by"):
-        align_to_scan(other, truth)
     named = [replace(c, name=f"{i + 900}.png") for i, c in enumerate(CAMERAS)]
-    with pytest.raises(DatasetError, match="0 of 12 photos"):
-        align_to_scan(named, truth)
+    for others, words in ((mixed, "are off those of Calibration/cal18 by"), (named, "0 of 12")):
+        with pytest.raises(DatasetError, match=words):
+            align_to_scan(others, truth)
+    rng = np.random.default_rng(0)
+    others = [
+        Camera(n, 4, 4, 4.0, 4.0, 2.0, 2.0, np.c_[np.eye(3), rng.normal(size=3) * 9])
+        for n in SCAN_NAMES
+    ]
+    with pytest.raises(DatasetError, match=r"match the trajectory|do not correspond"):
+        align_to_log(others, read_tanks(scene), seed=0)
 
 
 def test_wrong_files_are_refused_by_place(folder: Path, tmp_path: Path) -> None:
     path = tmp_path / "ObsMask24_10.mat"
-    good = {"ObsMask": np.ones((2, 2, 2), np.uint8), "BB": np.eye(3)[:2] * 0 + [[0], [9]], "Res": 1}
+    box = np.array([[0.0] * 3, [9.0] * 3])
+    good = {"ObsMask": np.ones((2, 2, 2), np.uint8), "BB": box, "Res": 1}
     savemat(path, good)
     assert read_observation_mask(path).volume.all()
-    for change, place in (
-        ({"Res": np.nan}, "Res"),
-        ({"Res": -1.0}, "Res"),
-        ({"BB": np.zeros((2, 3))}, "BB"),
-        ({"BB": np.zeros((3, 2))}, "BB"),
-        ({"ObsMask": np.ones((2, 2))}, "ObsMask"),
+    for values, words in (
+        ({**good, "Res": np.nan}, "Res:"),
+        ({**good, "BB": np.zeros((2, 3))}, "BB:"),
+        ({**good, "BB": np.zeros((3, 2))}, "BB:"),
+        ({**good, "ObsMask": np.ones((2, 2))}, "ObsMask:"),
+        ({"Mask": good["ObsMask"]}, "ObsMask: there is no such entry"),
     ):
-        savemat(path, {**good, **change})
-        with pytest.raises(ParseError, match=f"{place}:"):
+        savemat(path, values)
+        with pytest.raises(ParseError, match=words):
             read_observation_mask(path)
-    savemat(path, {"Mask": good["ObsMask"]})
-    with pytest.raises(ParseError, match="ObsMask: there is no such entry"):
-        read_observation_mask(path)
     savemat(path, {"P": np.zeros(3)})
     with pytest.raises(ParseError, match=r"P: \(3,\) is not"):
         read_plane(path)
@@ -193,25 +165,19 @@ def test_wrong_files_are_refused_by_place(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_scan_has_to_be_named(folder: Path) -> None:
-    mesh = ball(1.0, MIDDLE, 1)
-    with pytest.raises(UsageError, match="--scan 24"):
-        evaluate_mesh(*mesh, CAMERAS, EvaluationRequest(folder), Progress())
-    request = EvaluationRequest(folder, scan=SCAN, protocols=("scan",))
-    with pytest.raises(UsageError, match="its own protocol"):
-        evaluate_mesh(*mesh, CAMERAS, request, Progress())
-    with pytest.raises(UsageError, match="needs the cameras"):
-        evaluate_mesh(*mesh, [], EvaluationRequest(folder, scan=SCAN), Progress())
+    scan = EvaluationRequest(folder, scan=SCAN)
+    for cameras, request, words in (
+        (CAMERAS, EvaluationRequest(folder), "--scan 24"),
+        (CAMERAS, replace(scan, protocols=("scan",)), "its own protocol"),
+        ([], scan, "needs the cameras"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            evaluate_mesh(*ball_at(1.0), cameras, request, Progress())
 
 
 SCAN_NAMES = [f"{i:06}.jpg" for i in range(1, 22)]
-
-
 NOISE = 0.004
-
-
 MESH = bumpy_sphere(0.5, 4)
-
-
 SCAN_CAMERAS = ring_of_cameras(SCAN_NAMES, 2.0, np.zeros(3))
 
 
@@ -223,14 +189,13 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
 
 
-def half_wrong() -> tuple[Mesh, float]:
-    """The mesh with every face at x > 0 moved by 1.6, and the area share of the rest."""
-    vertices, faces = MESH
-    wrong = vertices[faces].mean(1)[:, 0] > 0
-    _, areas = face_normals(vertices, faces)
-    both = np.concatenate([vertices, vertices + np.array([1.6, 0, 0])])
-    moved = np.where(wrong[:, None], faces + len(vertices), faces)
-    return (both, moved), float(areas[~wrong].sum() / areas.sum())
+def placed(scene: Path, mesh: Mesh) -> dict[str, Any]:
+    """Place a mesh as a job has it; return all that its scores need."""
+    tanks = read_tanks(scene)
+    cameras = [camera.moved(JOB_FROM_TRUTH) for camera in SCAN_CAMERAS]
+    start = align_to_log(cameras, tanks, seed=0).transform
+    moved = JOB_FROM_TRUTH.points(mesh[0]), mesh[1]
+    return {"mesh": moved, "cameras": cameras, "scene": tanks, "start": start}
 
 
 def test_the_true_mesh_of_a_job_scores_one(scene: Path, tmp_path: Path) -> None:
@@ -259,61 +224,39 @@ def test_the_true_mesh_of_a_job_scores_one(scene: Path, tmp_path: Path) -> None:
 
 
 def test_a_scan_of_the_true_mesh_scores_one(scene: Path) -> None:
-    tanks = read_tanks(scene)
-    cameras = [camera.moved(JOB_FROM_TRUTH) for camera in SCAN_CAMERAS]
-    start = align_to_log(cameras, tanks, seed=0).transform
-    placed = JOB_FROM_TRUTH.points(MESH[0])
-    result = score_tanks(
-        (placed, MESH[1]), cameras[::2], tanks, start, refine=False, protocols=("scan",)
-    )["scan"]
+    given = {**placed(scene, MESH), "refine": False, "protocols": ("scan",)}
+    result = score_tanks(**given)["scan"]
     assert result["score"]["f1"] >= 0.99
     assert result["refinement"] is None
     with pytest.raises(UsageError, match="needs cameras"):
-        score_tanks((placed, MESH[1]), [], tanks, start, refine=False, protocols=("scan",))
+        score_tanks(**{**given, "cameras": []})
 
 
 def test_a_mesh_that_is_wrong_in_one_half_loses_that_half(scene: Path) -> None:
-    (vertices, faces), good = half_wrong()
-    tanks = read_tanks(scene)
-    cameras = [camera.moved(JOB_FROM_TRUTH) for camera in SCAN_CAMERAS]
-    start = align_to_log(cameras, tanks, seed=0).transform
-    placed = JOB_FROM_TRUTH.points(vertices)
-    score = score_tanks(
-        (placed, faces), cameras, tanks, start,
-        refine=False, protocols=("uniform",), samples=40_000,
-    )["uniform"]["score"]  # fmt: skip
+    vertices, faces = MESH
+    wrong = vertices[faces].mean(1)[:, 0] > 0
+    areas = face_normals(vertices, faces)[1]
+    good = float(areas[~wrong].sum() / areas.sum())
+    assert 0.4 < good < 0.6
+    both = np.concatenate([vertices, vertices + np.array([1.6, 0, 0])])
+    moved = np.where(wrong[:, None], faces + len(vertices), faces)
+    options = {"protocols": ("uniform",), "samples": 40_000}
+    score = score_tanks(**placed(scene, (both, moved)), refine=False, **options)
+    score = score["uniform"]["score"]
     # Within tau of the seam, true points of the other half are met too.
     assert score["precision"] == pytest.approx(good, abs=0.03)
     assert score["recall"] == pytest.approx(good, abs=0.06)
     # The half alone is refined to its place: it is precise, and complete by half.
-    half = faces[faces.max(1) < len(MESH[0])]
-    score = score_tanks(
-        (placed, half), cameras, tanks, start,
-        refine=True, protocols=("uniform",), samples=20_000,
-    )["uniform"]["score"]  # fmt: skip
+    score = score_tanks(**placed(scene, (vertices, faces[~wrong])), refine=True, **options)
+    score = score["uniform"]["score"]
     assert score["precision"] >= 0.995
     assert score["recall"] == pytest.approx(good, abs=0.06)
-    assert 0.4 < good < 0.6
 
 
 def test_the_same_seed_gives_the_same_figures(scene: Path) -> None:
-    tanks = read_tanks(scene, 0.05)
-    cameras = [camera.moved(JOB_FROM_TRUTH) for camera in SCAN_CAMERAS]
-    start = align_to_log(cameras, tanks, seed=3).transform
-    placed = JOB_FROM_TRUTH.points(MESH[0])
+    options = {"refine": True, "protocols": ("uniform",), "samples": 10_000, "seed": 3}
     first, second = (
-        score_tanks(
-            (placed, MESH[1]),
-            [],
-            tanks,
-            start,
-            refine=True,
-            protocols=("uniform",),
-            samples=10_000,
-            seed=3,
-            threads=threads,
-        )
-        for threads in (1, 2)
+        score_tanks(**placed(scene, MESH), **options, threads=threads) for threads in (1, 2)
     )
     assert first == second
 
@@ -335,50 +278,13 @@ def test_few_photos_of_the_scene_align_as_well(scene: Path) -> None:
     assert np.linalg.norm(error, axis=1).max() < 4 * NOISE
 
 
-def test_cameras_that_are_of_another_scene_are_refused(scene: Path) -> None:
-    rng = np.random.default_rng(0)
-    others = [
-        Camera(n, 4, 4, 4.0, 4.0, 2.0, 2.0, np.c_[np.eye(3), rng.normal(size=3) * 9])
-        for n in SCAN_NAMES
-    ]
-    with pytest.raises(DatasetError, match=r"match the trajectory|do not correspond"):
-        align_to_log(others, read_tanks(scene), seed=0)
-
-
-def test_thresholds_are_those_of_the_benchmark() -> None:
-    assert THRESHOLDS == {
-        "barn": 0.01, "caterpillar": 0.005, "courthouse": 0.025,
-        "ignatius": 0.003, "meetingroom": 0.01, "truck": 0.005,
-    }  # fmt: skip
-
-
-@pytest.fixture
-def copied(scene: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(scene, tmp_path / "Courthouse"))
-
-
-def test_a_scene_without_threshold_needs_one(copied: Path) -> None:
-    folder = copied.rename(copied.with_name("Shed"))
-    for path in list(folder.iterdir()):
-        path.rename(folder / path.name.replace("Courthouse", "Shed"))
-    with pytest.raises(UsageError, match="--distances"):
-        read_tanks(folder)
-    assert read_tanks(folder, 0.5).threshold == 0.5
-
-
-def test_a_missing_crop_is_named(copied: Path) -> None:
-    (copied / "Courthouse.json").unlink()
-    with pytest.raises(DatasetError, match=r"holds no Courthouse\.json") as caught:
-        read_tanks(copied)
-    assert caught.value.exit_code == 3
-
-
-def test_the_log_is_read_and_bad_lines_are_named(copied: Path) -> None:
-    path = copied / "Courthouse_COLMAP_SfM.log"
+def test_the_log_is_read_and_bad_lines_are_named(scene: Path, tmp_path: Path) -> None:
+    lines = (scene / "Courthouse_COLMAP_SfM.log").read_text().splitlines()
+    path = tmp_path / "a.log"
+    path.write_text("\n".join(lines))
     numbers, poses = read_trajectory(path)
     assert numbers.tolist() == list(range(21))
     assert poses.shape == (21, 4, 4)
-    lines = path.read_text().splitlines()
     for change, place in (
         (lines[:-1], "line 104.*cut off"),
         ([*lines[:7], "nan 0 0 0", *lines[8:]], "line 6.*not finite"),
@@ -391,51 +297,53 @@ def test_the_log_is_read_and_bad_lines_are_named(copied: Path) -> None:
             read_trajectory(path)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
+def test_bad_matrices_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "Barn_trans.txt"
+    for text, words in (
         ("1 0 0\n0 1 0\n0 0 1\n", "4x4 matrix was expected"),
         ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "mirrors"),
         ("1 0 0 0\n0 1 0 0\n0 0 5 0\n0 0 0 1\n", "not a rotation"),
         ("1 0 0 nan\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "not finite"),
         ("1 0 0 x\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "could not convert"),
-    ],
-)
-def test_bad_matrices_are_refused(text: str, words: str, tmp_path: Path) -> None:
-    path = tmp_path / "Barn_trans.txt"
-    path.write_text(text)
-    with pytest.raises(ParseError, match=words):
-        read_matrix(path)
+    ):
+        path.write_text(text)
+        with pytest.raises(ParseError, match=words):
+            read_matrix(path)
 
 
-def test_a_cut_cloud_is_refused(copied: Path) -> None:
-    path = copied / "Courthouse.ply"
-    path.write_bytes(path.read_bytes()[:-100])
+def test_a_scene_that_lacks_something_is_refused(scene: Path, tmp_path: Path) -> None:
+    copied = Path(shutil.copytree(scene, tmp_path / "Courthouse"))
+    cloud = copied / "Courthouse.ply"
+    whole = cloud.read_bytes()
+    cloud.write_bytes(whole[:-100])
     with pytest.raises(ParseError, match=r"Courthouse\.ply, byte .*cut off"):
         read_tanks(copied)
+    cloud.write_bytes(whole)
+    folder = copied.rename(tmp_path / "Shed")
+    for path in list(folder.iterdir()):
+        path.rename(folder / path.name.replace("Courthouse", "Shed"))
+    with pytest.raises(UsageError, match="--distances"):
+        read_tanks(folder)
+    assert read_tanks(folder, 0.5).threshold == 0.5
+    (folder / "Shed.json").unlink()
+    with pytest.raises(DatasetError, match=r"holds no Shed\.json") as caught:
+        read_tanks(folder, 0.5)
+    assert caught.value.exit_code == 3
 
 
 # The letter U, 3 wide and 3 high, with a gap of 1 from above.
 LETTER = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], float)
-
-
 PLANES = {"X": (1, 2, 0), "Y": (0, 2, 1), "Z": (0, 1, 2)}
 
 
-def volume(axis: str) -> PolygonVolume:
-    u, v, w = PLANES[axis]
-    corners = np.full((len(LETTER), 3), 99.0)
-    corners[:, u], corners[:, v] = LETTER[:, 0], LETTER[:, 1]
-    corners[:, w] = 7.0  # not used
-    return PolygonVolume(corners, axis, -1.0, 2.0)
-
-
 def stored(axis: str) -> dict:
-    crop = volume(axis)
+    u, v, _ = PLANES[axis]
+    corners = np.full((len(LETTER), 3), 7.0)  # not used along the axis
+    corners[:, u], corners[:, v] = LETTER[:, 0], LETTER[:, 1]
     return {
         "class_name": "SelectionPolygonVolume", "version_major": 1, "version_minor": 0,
-        "axis_max": crop.axis_max, "axis_min": crop.axis_min, "orthogonal_axis": axis,
-        "bounding_polygon": crop.polygon.tolist(),
+        "axis_max": 2.0, "axis_min": -1.0, "orthogonal_axis": axis,
+        "bounding_polygon": corners.tolist(),
     }  # fmt: skip
 
 
@@ -463,9 +371,11 @@ def test_borders_belong_to_one_side() -> None:
     assert not left.inside(np.array([[0.5, 0.5, 1.0 + 1e-9], [np.nan, 0.5, 0.5]])).any()
 
 
-@pytest.mark.parametrize(
-    ("change", "place"),
-    [
+def test_bad_files_are_refused_by_place(tmp_path: Path) -> None:
+    path = tmp_path / "crop.json"
+    with pytest.raises(ParseError, match=r"crop\.json"):
+        read_polygon_volume(path)
+    for change, place in (
         ({"orthogonal_axis": "W"}, "orthogonal_axis"),
         ({"axis_min": 5.0}, "axis_min"),
         ({"axis_max": None}, "axis_max"),
@@ -473,15 +383,7 @@ def test_borders_belong_to_one_side() -> None:
         ({"bounding_polygon": [[0, 0, 0], [1, 0], [1, 1, 0]]}, r"bounding_polygon\[1\]"),
         ({"version_major": 2}, "version_major"),
         ({"class_name": "Other"}, "class_name"),
-    ],
-)
-def test_bad_files_are_refused_by_place(change: dict, place: str, tmp_path: Path) -> None:
-    path = tmp_path / "crop.json"
-    path.write_text(json.dumps({**stored("Z"), **change}))
-    with pytest.raises(ParseError, match=place):
-        read_polygon_volume(path)
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ParseError, match=r"Barn\.json"):
-        read_polygon_volume(tmp_path / "Barn.json")
+    ):
+        path.write_text(json.dumps({**stored("Z"), **change}))
+        with pytest.raises(ParseError, match=place):
+            read_polygon_volume(path)

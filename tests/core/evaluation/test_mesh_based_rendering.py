@@ -21,39 +21,18 @@ from gaussian_wrapping_addon.core.evaluation.mesh_based_rendering import (
     mesh_based_rendering,
 )
 from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
+from tests.core.evaluation.surface_scenes import ball
 from tests.core.test_image_metrics import MeanDifference
 from tests.core.texture.texture_scenes import look_at, ring, shoot, sphere_hit
 
 TRAINING = 14
-
-
 AWAY = np.array([0.0, 0.0, 1e4])
-
-
-Mesh = tuple[np.ndarray, np.ndarray]
 
 
 def ripples(points: np.ndarray) -> np.ndarray:
     """Colours in [0, 255] with a period of 9 to 12 pixels of the photos below."""
     phase = points @ np.array([[11.0, -7.0, 3.0], [6.0, 12.0, -5.0], [-4.0, 6.0, 13.0]])
     return 127.5 + 100.0 * np.sin(phase + np.array([0.0, 1.0, 2.0]))
-
-
-def ball(subdivisions: int = 4) -> Mesh:
-    shape = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return np.array(shape.vertices), np.array(shape.faces)
-
-
-def finer(mesh: Mesh) -> Mesh:
-    """The same surface with four times the faces."""
-    shape = trimesh.Trimesh(*mesh, process=False).subdivide()
-    return np.array(shape.vertices), np.array(shape.faces)
-
-
-def pierced(mesh: Mesh, radius: float) -> Mesh:
-    """Without the faces near the ball's easternmost point, which some test views look at."""
-    middles = mesh[0][mesh[1]].mean(axis=1)
-    return mesh[0], mesh[1][np.linalg.norm(middles - [1.0, 0, 0], axis=1) > radius]
 
 
 def outline(camera: Camera, radius: float = 1.0) -> np.ndarray:
@@ -99,10 +78,15 @@ def test_a_true_mesh_with_its_photos_scores_high() -> None:
 
 def test_the_same_surface_with_four_times_the_faces_scores_the_same() -> None:
     flat = ball(3)  # its faces are planes: subdivision leaves the surface as it is
-    coarse, fine = (mesh_based_rendering(*m, *views()) for m in (flat, finer(flat)))
+    finer = trimesh.Trimesh(*flat, process=False).subdivide()
+    coarse = mesh_based_rendering(*flat, *views())
+    fine = mesh_based_rendering(finer.vertices, finer.faces, *views(), lpips=MeanDifference())
     for name in ("psnr", "covered_psnr", "inside_psnr"):
         assert coarse.mean(name) == pytest.approx(fine.mean(name), abs=0.02)
     assert coarse.mean("ssim") == pytest.approx(fine.mean("ssim"), abs=1e-3)
+    assert 0.0 < fine.to_json()["lpips"] < 1.0
+    assert "lpips" not in coarse.to_json()
+    assert mesh_based_rendering(*flat, *views(), threads=3) == coarse
 
 
 @pytest.mark.parametrize("outlined", [True, False])
@@ -136,47 +120,43 @@ def test_a_hole_costs_and_is_counted(outlined: bool) -> None:
     first, before = found.views[0], whole.views[0]
     assert first.name == "test-0"
     assert first.uncovered > before.uncovered + 0.05
-    small = mesh_based_rendering(*pierced(ball(), 0.3), *views(outlined))
+    near = np.linalg.norm(vertices[faces].mean(axis=1) - [1.0, 0, 0], axis=1) < 0.3
+    small = mesh_based_rendering(vertices, faces[~near], *views(outlined))
     assert small.views[0].scores.psnr < before.scores.psnr - 1.0
 
 
 def test_uncovered_pixels_are_black_and_compared() -> None:
     """A mesh out of sight leaves photos against black, whose PSNR is known."""
     vertices, faces = ball()
-    training, test = views(outlined=False)
-    found = mesh_based_rendering(vertices + AWAY, faces, training, test)
-    values = json.loads(json.dumps(found.to_json(), allow_nan=False))
-    assert (values["uncovered"], values["samples"], values["background"]) == (1.0, 0, "black")
-    assert "covered_psnr" not in values
-    for view, given in zip(found.views, test, strict=True):
-        mean = ((given.photo / 255.0) ** 2).mean()
-        assert view.scores.psnr == pytest.approx(-10 * math.log10(mean), abs=1e-4)
-    # Under outlines what lies beyond them is black as well.
-    found = mesh_based_rendering(
-        vertices + AWAY, faces, *views(), MeshBasedSettings(outline_margin=0.0)
-    )
-    for view, given in zip(found.views, views()[1], strict=True):
-        mean = ((given.photo[given.outline] / 255.0) ** 2).mean()
-        assert view.scores.psnr == pytest.approx(-10 * math.log10(mean), abs=1e-4)
-        assert view.uncovered == 1.0
+    for outlined in (False, True):
+        training, test = views(outlined)
+        found = mesh_based_rendering(
+            vertices + AWAY, faces, training, test, MeshBasedSettings(outline_margin=0.0)
+        )
+        # Under outlines what lies beyond them is black as well.
+        for view, given in zip(found.views, test, strict=True):
+            shown = given.photo[given.outline] if outlined else given.photo
+            mean = ((shown / 255.0) ** 2).mean()
+            assert view.scores.psnr == pytest.approx(-10 * math.log10(mean), abs=1e-4)
+            assert view.uncovered == 1.0
+        values = json.loads(json.dumps(found.to_json(), allow_nan=False))
+        assert (values["samples"], values["background"]) == (0, "black")
+        assert "covered_psnr" not in values
 
 
 def test_test_photos_are_never_used_for_the_fit() -> None:
     """Whatever the test photos show, what is rendered is bit for bit the same."""
     training, test = views()
-    shown: dict[str, list[np.ndarray]] = {}
-    for name, photos in (
-        ("true", test),
-        ("inverted", [dataclasses.replace(v, photo=255 - v.photo) for v in test]),
-    ):
-        shown[name] = []
+    inverted = [dataclasses.replace(v, photo=255 - v.photo) for v in test]
+    shown: list[list[np.ndarray]] = []
+    for photos in (test, inverted):
+        images: list[np.ndarray] = []
         found = mesh_based_rendering(
-            *ball(), training, photos,
-            on_view=lambda _, __, image, to=shown[name]: to.append(image),
-        )  # fmt: skip
+            *ball(), training, photos, on_view=lambda *given, to=images: to.append(given[2])
+        )
         assert found.training_psnr == of_ball().training_psnr
-    for one, other in zip(shown["true"], shown["inverted"], strict=True):
-        assert np.array_equal(one, other)
+        shown.append(images)
+    np.testing.assert_array_equal(*shown)
     # Training photos, on the other hand, decide everything.
     spoilt = [dataclasses.replace(v, photo=255 - v.photo) for v in training]
     assert mesh_based_rendering(*ball(), spoilt, test).mean("psnr") < 12.0
@@ -185,24 +165,23 @@ def test_test_photos_are_never_used_for_the_fit() -> None:
 def test_pixels_that_may_not_count_are_neither_fitted_nor_compared() -> None:
     training, test = views(outlined=False)
 
-    def spoilt(view: PhotoView, columns: slice) -> PhotoView:
-        photo, counted = view.photo.copy(), np.ones(view.photo.shape[:2], np.bool_)
-        photo[:, columns], counted[:, columns] = 0, False
-        return dataclasses.replace(view, photo=photo, counted=counted)
+    def counted(view: PhotoView, columns: slice, *, spoilt: bool) -> PhotoView:
+        photo, mask = view.photo.copy(), np.ones(view.photo.shape[:2], np.bool_)
+        mask[:, columns] = False
+        photo[~mask & spoilt] = 0
+        return dataclasses.replace(view, photo=photo, counted=mask)
 
+    right = slice(120, None)
     found = mesh_based_rendering(
         *ball(),
-        [training[0], *(spoilt(v, slice(0, 60)) for v in training[1:])],
-        [spoilt(v, slice(120, None)) for v in test],
+        [training[0], *(counted(v, slice(0, 60), spoilt=True) for v in training[1:])],
+        [counted(v, right, spoilt=True) for v in test],
     )
-    counted = [np.ones(v.photo.shape[:2], np.bool_) for v in test]
-    for mask in counted:
-        mask[:, 120:] = False
-    same = [dataclasses.replace(v, counted=m) for v, m in zip(test, counted, strict=True)]
+    same = [counted(v, right, spoilt=False) for v in test]
     whole = mesh_based_rendering(*ball(), training, same)
     assert found.mean("psnr") == pytest.approx(whole.mean("psnr"), abs=1.0)
     assert found.mean("uncovered") == whole.mean("uncovered")
-    nothing = [dataclasses.replace(v, counted=np.zeros_like(m)) for v, m in zip(test, counted)]  # noqa: B905
+    nothing = [counted(v, slice(None), spoilt=False) for v in test]
     values = mesh_based_rendering(*ball(), training, nothing).to_json()
     assert (values["left_out"], values["views"]) == (3, [])
     assert "psnr" not in values
@@ -235,17 +214,6 @@ def test_few_samples_are_enough_and_the_draw_has_a_seed() -> None:
     assert first.mean("psnr") == pytest.approx(of_ball().mean("psnr"), abs=1.5)
 
 
-def test_the_result_does_not_depend_on_threads() -> None:
-    one, many = (mesh_based_rendering(*ball(3), *views(), threads=n) for n in (1, 3))
-    assert one == many
-
-
-def test_lpips_is_measured_where_it_is_given() -> None:
-    found = mesh_based_rendering(*ball(3), *views(), lpips=MeanDifference())
-    assert 0.0 < found.to_json()["lpips"] < 1.0
-    assert "lpips" not in of_ball().to_json()
-
-
 def test_training_photos_are_refused_as_test_photos() -> None:
     training, test = views()
     with pytest.raises(UsageError, match="test photo train-0 has the camera of the training"):
@@ -260,18 +228,15 @@ def test_training_photos_are_refused_as_test_photos() -> None:
     assert found.views
 
 
-@pytest.mark.parametrize(
-    ("training", "test", "hint"),
-    [(0, 3, "photos of the reconstruction"), (14, 0, "Hold photos out")],
-)
-def test_without_photos_of_one_kind_there_is_no_figure(training: int, test: int, hint: str) -> None:
-    with pytest.raises(UsageError) as caught:
-        mesh_based_rendering(*ball(), views()[0][:training], views()[1][:test])
-    assert hint in caught.value.hint
-
-
-def test_pictures_of_other_sizes_are_refused() -> None:
+def test_absent_photos_and_pictures_of_other_sizes_are_refused() -> None:
     training, test = views()
+    for given, hint in (
+        (([], test), "photos of the reconstruction"),
+        ((training, []), "Hold photos out"),
+    ):
+        with pytest.raises(UsageError) as caught:
+            mesh_based_rendering(*ball(), *given)
+        assert hint in caught.value.hint
     for name, picture in (("photo", test[0].photo[::2]), ("counted", np.ones((5, 5), np.bool_))):
         wrong = dataclasses.replace(test[0], **{name: picture})
         with pytest.raises(UsageError, match="test-0: a picture of"):

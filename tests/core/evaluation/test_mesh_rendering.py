@@ -57,11 +57,6 @@ def globe_points(turn: np.ndarray, rise: np.ndarray) -> np.ndarray:
     return np.stack(np.broadcast_arrays(*parts), -1)
 
 
-def moved(textured: TexturedMesh, shift: tuple[float, float, float]) -> TexturedMesh:
-    mesh = dataclasses.replace(textured.mesh, vertices=textured.mesh.vertices + shift)
-    return dataclasses.replace(textured, mesh=mesh)
-
-
 def inside_of_ball(camera) -> np.ndarray:
     """Pixels that lie wholly within the ball's outline."""
     fine = camera.resized(3 * camera.width, 3 * camera.height)
@@ -100,34 +95,15 @@ def test_a_ball_is_rendered_as_an_exact_ray_caster_sees_it(masked: bool) -> None
         assert view.covered == pytest.approx(share, rel=0.01)
 
 
-def test_a_shifted_mesh_is_worse_the_farther_it_is() -> None:
-    ball, cameras = globe(48, 96, 256), ring(3, 3.5, 1.2)
-    photos = [shoot(camera, [(sphere_hit, waves)]) for camera in cameras]
-    masks = [inside_of_ball(camera) for camera in cameras]
-    for given in (masks, None):
-        figures = [
-            render_views(moved(ball, (0, 0, z)), cameras, photos, masks=given)
-            for z in (0.0, 0.02, 0.1)
-        ]
-        assert figures[0].mean("psnr") > figures[1].mean("psnr") + 8.0
-        assert figures[1].mean("psnr") > figures[2].mean("psnr") + 8.0
-        assert figures[0].mean("ssim") > figures[1].mean("ssim") > figures[2].mean("ssim")
-
-
 def test_a_hole_counts_under_a_mask_and_not_over_covered_pixels() -> None:
     textured, cameras, photos = flat_wall()
     mask = np.zeros((90, 120), bool)
     mask[5:85, 20:100] = True
     whole = render_views(textured, cameras, photos, masks=[mask])
-    assert (whole.mean("psnr"), whole.mean("ssim"), whole.mean("covered")) == (
-        PSNR_CAP_DB,
-        1.0,
-        1.0,
-    )
+    assert [whole.mean(name) for name in ("psnr", "ssim", "covered")] == [PSNR_CAP_DB, 1.0, 1.0]
     half = half_of(textured)
     covered = render_views(half, cameras, photos)
     assert (covered.mean("psnr"), covered.pixels) == (PSNR_CAP_DB, "covered")
-    assert covered.mean("covered") == pytest.approx(80 * 40 / (120 * 90))
     found = render_views(half, cameras, photos, masks=[mask])
     squares = (np.array(FLAT) - BACKGROUND) ** 2 / 255.0**2
     assert found.mean("psnr") == pytest.approx(-10 * math.log10(0.5 * squares.mean()), abs=1e-9)
@@ -148,11 +124,8 @@ def test_uncovered_pixels_are_counted_and_black_in_a_second_figure(masked: bool)
     error[5:85, 20:60] = 0.0
     assert found.mean("whole_psnr") == pytest.approx(-10 * math.log10(error.mean()), abs=1e-4)
     values = found.to_json()
-    assert (values["uncovered"], values["whole_psnr"]) == (
-        found.mean("uncovered"),
-        found.mean("whole_psnr"),
-    )
-    assert values["views"][0]["uncovered"] == found.mean("uncovered")
+    for name in ("uncovered", "whole_psnr"):
+        assert values[name] == values["views"][0][name] == found.mean(name)
 
 
 def test_pixels_that_may_not_count_do_not() -> None:
@@ -238,11 +211,12 @@ def test_the_result_does_not_depend_on_threads() -> None:
 
 def test_columns_of_other_lengths_and_sizes_are_refused() -> None:
     textured, cameras, photos = flat_wall()
-    with pytest.raises(UsageError, match="2 photos for 1 cameras"):
-        render_views(textured, cameras, photos * 2)
-    with pytest.raises(UsageError, match="masks"):
-        render_views(textured, cameras, photos, masks=[])
-    with pytest.raises(UsageError, match=r"\(45, 60\)"):
-        render_views(textured, cameras, [photos[0][::2, ::2]])
-    with pytest.raises(UsageError):
-        render_views(textured, cameras, photos, masks=[np.ones((45, 60), bool)])
+    small = np.ones((45, 60), bool)
+    for given, masks, words in (
+        (photos * 2, None, "2 photos for 1 cameras"),
+        (photos, [], "masks"),
+        ([photos[0][::2, ::2]], None, r"\(45, 60\)"),
+        (photos, [small], None),
+    ):
+        with pytest.raises(UsageError, match=words):
+            render_views(textured, cameras, given, masks=masks)

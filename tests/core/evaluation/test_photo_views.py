@@ -27,7 +27,6 @@ from gaussian_wrapping_addon.core.evaluation.photo_views import (
 )
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.evaluation.gradient_wall import CAMERAS, gradient_wall, wall_color, wall_hit
 from tests.core.texture.texture_scenes import FakePhotos, look_at, photograph, scene_of
 
@@ -81,7 +80,6 @@ def test_a_held_out_photo_is_judged_by_a_texture_without_it(tmp_path: Path) -> N
     assert max(scores.values()) < 12.0
     assert values["note"] == photo_views.NOTE_HELD_OUT
     assert values["texture_size_px"] == len(wall.albedo)
-    assert values["bake_s"] >= 0.0
     assert sorted(p.name for p in tmp_path.iterdir()) == values["pictures"]
     # The texture of the Gaussians holds nothing of the photos: it is judged as it is.
     values = compare_with_photos(
@@ -92,7 +90,7 @@ def test_a_held_out_photo_is_judged_by_a_texture_without_it(tmp_path: Path) -> N
     assert values["note"] == photo_views.NOTE_GAUSSIANS
 
 
-@pytest.mark.parametrize(("reduction", "size_px"), [(1, 1024), (3, 512), (4, 256), (99, 256)])
+@pytest.mark.parametrize(("reduction", "size_px"), [(1, 1024), (3, 512), (99, 256)])
 def test_the_texture_without_them_is_as_coarse_as_the_pictures(
     tmp_path: Path, reduction: int, size_px: int
 ) -> None:
@@ -169,49 +167,19 @@ def test_the_view_that_shows_the_front_large_and_whole_is_chosen() -> None:
     assert choose_view(gradient_wall(), photos, len(cameras)) == 2
 
 
-def test_the_file_holds_photo_and_mesh_side_by_side(tmp_path: Path) -> None:
+def test_the_preview_holds_photo_and_mesh_side_by_side(tmp_path: Path) -> None:
     photos = photograph(CAMERAS, [(wall_hit, wall_color)])
     path = tmp_path / "preview.png"
     write_preview(gradient_wall(), scene_of(photos), photos, path)
     picture = np.asarray(Image.open(path)).astype(int)
     width = (picture.shape[1] - GAP_PX) // 2
     left, right = picture[:, :width], picture[:, width + GAP_PX :]
-    assert left.shape == right.shape
     inside = (left[..., 2] == 0) & (right[..., 2] == 0)
     assert inside.mean() > 0.3
     assert np.abs(left - right)[inside].max() <= 6
     assert (picture[:, width : width + GAP_PX] == BACKGROUND).all()
-
-
-def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
-    photos = photograph(CAMERAS[:1], [(wall_hit, wall_color)])
     with pytest.raises(ResourceError, match="nowhere"):
         write_preview(gradient_wall(), scene_of(photos), photos, tmp_path / "nowhere" / "p.png")
-
-
-def render_textured(textured: TexturedMesh, camera: Camera, size: tuple[int, int]) -> np.ndarray:
-    return TexturedRenderer(textured).render(camera, size).image
-
-
-@pytest.mark.parametrize("index", [0, 1])
-def test_rendering_agrees_with_an_exact_picture(index: int) -> None:
-    camera = CAMERAS[index]
-    truth = photograph([camera], [(wall_hit, wall_color)]).images[0].astype(int)
-    got = render_textured(gradient_wall(), camera, (120, 90)).astype(int)
-    # Away from the outline, where only the wall (which has no blue) shows in both.
-    inside = truth[..., 2] == 0
-    assert inside.sum() > 800
-    assert (inside != (got[..., 2] == 0)).sum() < 0.03 * inside.sum()
-    inside &= got[..., 2] == 0
-    assert np.abs(got - truth)[inside].max() <= 4
-    outside = (truth == 30).all(axis=2)
-    assert (got[outside] == BACKGROUND).mean() > 0.99
-
-
-def test_size_is_free_and_the_mesh_may_be_out_of_sight() -> None:
-    assert render_textured(gradient_wall(), CAMERAS[0], (41, 33)).shape == (33, 41, 3)
-    away = look_at((0, -3.0, 0), (0, -6.0, 0))
-    assert (render_textured(gradient_wall(), away, (40, 30)) == BACKGROUND).all()
 
 
 def test_far_textures_are_averaged_not_sampled() -> None:
@@ -220,7 +188,8 @@ def test_far_textures_are_averaged_not_sampled() -> None:
     checker = np.indices((256, 256)).sum(axis=0) % 2 * 255
     image = np.repeat(checker[..., None], 3, axis=2).astype(np.uint8)
     far = look_at((0, -20.0, 0), width=60, height=60, focal=200.0)
-    got = render_textured(TexturedMesh(wall.mesh, wall.corner_uvs, image), far, (60, 60))
+    textured = TexturedMesh(wall.mesh, wall.corner_uvs, image)
+    got = TexturedRenderer(textured).render(far, (60, 60)).image
     middle = got[25:35, 25:35].astype(int)
     assert np.abs(middle - 128).max() <= 4
 
@@ -236,6 +205,7 @@ def test_coverage_is_the_share_of_rays_that_meet_the_mesh() -> None:
     eye = 0.4 * 3.0 / 120.0
     moved = look_at((eye, -3.0, 0.0), (eye, 0, 0), width=120, height=90, focal=120.0)
     expected[5:85, 19], expected[5:85, 99] = np.float32(1 / 3), np.float32(2 / 3)
+    assert wall.render(moved, (41, 33)).image.shape == (33, 41, 3)
     view = wall.render(moved)
     assert np.allclose(view.coverage, expected, atol=1e-7)
     assert view.covered.sum() == 80 * 79

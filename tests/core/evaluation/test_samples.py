@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -32,17 +33,11 @@ from tests.core.evaluation.surface_scenes import (
 )
 
 OFFSET = np.array([5e5, 4e6, -300.0])
-
-
 FAR = np.array([2.0**19, 2.0**22, -300.0])
-
-
 """Coordinates that are multiples of 2^-24 below 2 stay exact when this is added."""
 
 
 HALF_DIGIT = 2.0**-31
-
-
 """Rounding of a coordinate between 2^22 and 2^23."""
 
 
@@ -87,40 +82,40 @@ def test_samples_are_better_spread_over_a_face_than_random_ones() -> None:
     assert counts.std() < 4
 
 
-def test_degenerate_faces_get_no_samples() -> None:
+def test_faces_without_area_get_no_samples_and_alone_are_refused() -> None:
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [6, 0, 0], [7, 1e-14, 0]])
     faces = np.array([[3, 4, 5], [0, 1, 2], [3, 3, 4], [5, 5, 5]])
     samples = sample_uniformly(vertices, faces, 1000, seed=0)
     assert samples.points[:, 0].max() <= 1.0
     assert (samples.normals == [0, 0, 1]).all()
-
-
-@pytest.mark.parametrize("sample", ["uniform", "legacy", "scan"])
-def test_bad_meshes_are_refused(sample: str) -> None:
-    run = {
-        "uniform": lambda v, f: sample_uniformly(v, f, 10, seed=0),
-        "legacy": sample_legacy,
-        "scan": lambda v, f: scan_virtually(v, f, [camera_at((3, 0, 0))]),
-    }[sample]
-    vertices, faces = ONE_FACE
-    with pytest.raises(MeshingError, match="no faces"):
-        run(vertices, np.zeros((0, 3), int))
-    for bad in (np.nan, np.inf):
-        with pytest.raises(MeshingError, match="not finite"):
-            run(np.where(vertices == 1, bad, vertices), faces)
-    with pytest.raises(UsageError, match="outside 0 to 2"):
-        run(vertices, faces + 1)
-    # A vertex that no face uses does not matter.
-    run(np.concatenate([vertices, [[np.nan] * 3]]), faces)
-
-
-def test_impossible_numbers_are_refused() -> None:
     with pytest.raises(MeshingError, match="no area"):
-        sample_uniformly(ONE_FACE[0], np.array([[0, 0, 1]]), 10, seed=0)
+        sample_uniformly(vertices, faces[2:], 10, seed=0)
     with pytest.raises(UsageError):
-        sample_uniformly(*ONE_FACE, 0, seed=0)
+        sample_uniformly(vertices, faces, 0, seed=0)
     with pytest.raises(UsageError):
         scan_virtually(*ONE_FACE, [], step_px=0.5)
+
+
+@pytest.mark.parametrize(
+    "sample",
+    [
+        lambda v, f: sample_uniformly(v, f, 10, seed=0),
+        sample_legacy,
+        lambda v, f: scan_virtually(v, f, [camera_at((3, 0, 0))]),
+    ],
+)
+def test_bad_meshes_are_refused(sample: Callable) -> None:
+    vertices, faces = ONE_FACE
+    for given, error, words in (
+        ((vertices, np.zeros((0, 3), int)), MeshingError, "no faces"),
+        ((np.where(vertices == 1, np.nan, vertices), faces), MeshingError, "not finite"),
+        ((np.where(vertices == 1, np.inf, vertices), faces), MeshingError, "not finite"),
+        ((vertices, faces + 1), UsageError, "outside 0 to 2"),
+    ):
+        with pytest.raises(error, match=words):
+            sample(*given)
+    # A vertex that no face uses does not matter.
+    sample(np.concatenate([vertices, [[np.nan] * 3]]), faces)
 
 
 def test_legacy_samples_are_used_vertices_and_centres() -> None:
@@ -202,14 +197,8 @@ def test_samples_are_the_same_at_huge_coordinates() -> None:
     vertices, faces = exact(ball(3)[0]), ball(3)[1]
     there = vertices + FAR
     cameras = cameras_around()[:2]
-    pairs = [
-        (
-            sample_uniformly(vertices, faces, 2000, seed=0),
-            sample_uniformly(there, faces, 2000, seed=0),
-        ),
-        (sample_legacy(vertices, faces), sample_legacy(there, faces)),
-    ]
-    for here, far in pairs:
+    for sample in (lambda v, f: sample_uniformly(v, f, 2000, seed=0), sample_legacy):
+        here, far = sample(vertices, faces), sample(there, faces)
         # What a coordinate of this size can hold, and no error of calculation besides.
         assert np.abs(far.points - FAR - here.points).max() <= HALF_DIGIT
         assert (far.normals == here.normals).all()
@@ -232,8 +221,7 @@ def test_distances_are_exactly_the_same_at_huge_coordinates() -> None:
 
 def test_thinning_takes_the_mean_of_each_cell() -> None:
     rng = np.random.default_rng(0)
-    points = rng.uniform(-1, 1, (500, 3))
-    voxel = 0.4
+    points, voxel = rng.uniform(-1, 1, (500, 3)), 0.4
     cells: dict[tuple[int, ...], list[int]] = {}
     for row, point in enumerate(points):
         cell = np.floor((point - points.min(0) + voxel / 2) / voxel).astype(int)
@@ -242,9 +230,13 @@ def test_thinning_takes_the_mean_of_each_cell() -> None:
     thin = voxel_downsample(points, voxel)
     assert np.allclose(thin, expected, atol=1e-14)
     assert np.allclose(voxel_downsample(points[rng.permutation(500)], voxel), thin, atol=1e-14)
-    far = voxel_downsample(points + OFFSET, voxel)
-    assert len(far) == len(thin)
-    assert np.abs(far - OFFSET - thin).max() < 2e-9
+    assert np.abs(voxel_downsample(points + OFFSET, voxel) - OFFSET - thin).max() < 2e-9
+    assert len(voxel_downsample(np.zeros((0, 3)), 1.0)) == 0
+    apart = np.array([[0.0, 0, 0], [1, 1, 1]])
+    assert len(voxel_downsample(apart, 1e-3)) == 2
+    for size in (0.0, -1.0, np.nan, np.inf, 1e-9):
+        with pytest.raises(UsageError):
+            voxel_downsample(apart, size)
 
 
 def test_the_chosen_sample_is_the_nearest_to_the_mean_of_its_cell() -> None:
@@ -264,31 +256,16 @@ def test_the_chosen_sample_is_the_nearest_to_the_mean_of_its_cell() -> None:
     assert len(choose_per_cell(SurfaceSamples.empty(), 0.5)) == 0
 
 
-def test_thinning_at_the_ends_of_its_range() -> None:
-    assert len(voxel_downsample(np.zeros((0, 3)), 1.0)) == 0
-    assert voxel_downsample(np.zeros((2, 3)), 1.0).tolist() == [[0, 0, 0]]
-    apart = np.array([[0.0, 0, 0], [1, 1, 1]])
-    assert len(voxel_downsample(apart, 1e-3)) == 2
-    for voxel in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(UsageError):
-            voxel_downsample(apart, voxel)
-    with pytest.raises(UsageError, match="too small"):
-        voxel_downsample(apart, 1e-9)
-
-
 def test_distances_to_a_cube_match_the_closed_form() -> None:
     shape = trimesh.creation.box(extents=(2, 2, 2)).subdivide()
-    vertices, faces = np.array(shape.vertices), np.array(shape.faces)
     points = np.random.default_rng(0).uniform(-3, 3, (3000, 3))
     beyond = np.abs(points) - 1.0
     outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
     exact = np.where(beyond.max(1) > 0, outside, -beyond.max(1))
-    distances, face, closest = distances_to_mesh(points, vertices, faces)
+    distances, face, closest = distances_to_mesh(points, shape.vertices, shape.faces)
     assert np.abs(distances - exact).max() < 1e-14
     assert np.allclose(np.linalg.norm(points - closest, axis=1), exact, atol=1e-14)
-    far, _, _ = distances_to_mesh(points + OFFSET, vertices + OFFSET, faces)
-    assert np.abs(far - exact).max() < 4e-9
-    on_face = distances_to_mesh(closest, vertices, faces[np.unique(face)])[0]
+    on_face = distances_to_mesh(closest, shape.vertices, shape.faces[np.unique(face)])[0]
     assert on_face.max() < 1e-14
 
 

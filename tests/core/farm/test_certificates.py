@@ -68,22 +68,17 @@ def test_the_computers_of_a_farm_know_each_other_and_nobody_else(tmp_path: Path)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has other permissions")
-def test_the_key_is_for_its_owner_and_that_of_the_authority_is_gone(tmp_path: Path) -> None:
+def test_the_key_is_for_its_owner_and_stays_and_that_of_the_authority_is_gone(
+    tmp_path: Path,
+) -> None:
     make_certificates(tmp_path / "keys")
-    assert sorted(p.name for p in (tmp_path / "keys").iterdir()) == sorted(
-        [CA_NAME, CERTIFICATE_NAME, KEY_NAME]
-    )
-    assert {p.stat().st_mode & 0o777 for p in (tmp_path / "keys").iterdir()} == {0o600}
-    texts = [p.read_text() for p in (tmp_path / "keys").iterdir()]
-    assert sum("PRIVATE KEY" in text for text in texts) == 1
-
-
-def test_certificates_that_are_there_stay(tmp_path: Path) -> None:
-    make_certificates(tmp_path)
-    before = (tmp_path / KEY_NAME).read_bytes()
+    files = {path: path.read_text() for path in (tmp_path / "keys").iterdir()}
+    assert {path.name for path in files} == {CA_NAME, CERTIFICATE_NAME, KEY_NAME}
+    assert {path.stat().st_mode & 0o777 for path in files} == {0o600}
+    assert sum("PRIVATE KEY" in text for text in files.values()) == 1
     with pytest.raises(UsageError, match="already"):
-        make_certificates(tmp_path)
-    assert (tmp_path / KEY_NAME).read_bytes() == before
+        make_certificates(tmp_path / "keys")
+    assert {path: path.read_text() for path in files} == files
     (tmp_path / "file").write_text("")
     with pytest.raises(ResourceError):
         make_certificates(tmp_path / "file" / "keys")

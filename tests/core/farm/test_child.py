@@ -51,17 +51,17 @@ def test_a_killed_child_is_told_with_what_it_said_last(tmp_path: Path) -> None:
     assert result["lines"] == ['{"message": "at work"}']
 
 
-def test_long_output_is_cut(tmp_path: Path) -> None:
-    result = run("[print('x' * 99) for _ in range(5000)]", tmp_path)
-    assert result["code"] == 0
-    assert len(result["lines"]) == child.LAST_LINES
-
-
-def test_the_child_gets_module_folder_and_arguments(tmp_path: Path) -> None:
+def test_the_child_gets_module_folder_and_arguments_and_long_output_is_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     result = run("import sys; print(sys.argv[1:])", tmp_path)
     module, arguments = ast.literal_eval(result["lines"][0])
     assert module == "some.module"
     assert json.loads(arguments) == {"part": "a", "out": str(tmp_path)}
+    result = run("[print('x' * 99) for _ in range(5000)]", tmp_path)
+    assert (result["code"], len(result["lines"])) == (0, child.LAST_LINES)
+    monkeypatch.delenv(child.ENTRY_VARIABLE, raising=False)
+    assert "GW_ENTRY is not set" in run("", tmp_path, command=None)["error"]
 
 
 def test_the_shared_folder_is_that_of_this_computer(
@@ -82,13 +82,6 @@ def test_the_shared_folder_is_that_of_this_computer(
     told = child.run_child(request)
     assert told["code"] == 2
     assert "does not see" in told["error"]
-
-
-def test_the_entry_of_this_computer_is_needed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv(child.ENTRY_VARIABLE, raising=False)
-    assert "GW_ENTRY is not set" in run("", tmp_path, command=None)["error"]
 
 
 def test_it_needs_nothing_but_the_standard_library() -> None:

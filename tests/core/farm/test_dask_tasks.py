@@ -21,7 +21,7 @@ pytest.importorskip("distributed", reason="Dask is not installed: set-up-worker 
 
 
 pytestmark = [
-    pytest.mark.skipif(sys.platform == "win32", reason="processes are killed by a signal"),
+    pytest.mark.skipif(sys.platform == "win32", reason="processes are killed by a signal")
 ]
 
 
@@ -81,9 +81,7 @@ def test_what_kills_three_dask_workers_is_given_up(tasks: DaskTasks, tmp_path: P
     assert all_ended(tasks, 1)["next"].code == 0
 
 
-def test_a_worker_that_refuses_is_not_asked_again_while_there_is_another(
-    tmp_path: Path,
-) -> None:
+def test_a_worker_that_refuses_is_not_asked_again_while_there_is_another(tmp_path: Path) -> None:
     tasks = DaskTasks("local", 2)
     asked = (
         "import json,os,pathlib,sys,uuid; here = pathlib.Path(json.loads(sys.argv[2])['out']);"

@@ -37,14 +37,10 @@ GOOD = {
     "tcp://localhost:8786": Address("tcp", "localhost", 8786),
     "tcp://[::1]:8786": Address("tcp", "::1", 8786),
 }
-
-
 OPEN = (
     "tcp://10.0.0.7:8786", "tcp://0.0.0.0:8786", "tcp://[::]:8786", "tcp://farm.local:8786",
     "tcp://localhost.evil:1", "tcp://no.such.computer.invalid:8786",
 )  # fmt: skip
-
-
 BAD = (
     "", "local", "farm:8786", "http://farm:8786", "ucx://farm:8786", "tls://farm", "tls://farm:0",
     "tls://farm:65536", "tcp://farm:99999", "tcp://me:secret@farm:1", "tls://a@farm:8786",
@@ -76,18 +72,14 @@ def test_what_others_can_read_is_refused_without_looking_up_a_name(
     assert re.search("is not encrypted.*make-certificates", str(caught.value))
 
 
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("tls://farm:8786", "tls://0.0.0.0:8786"),
+def test_a_server_that_others_reach_listens_everywhere() -> None:
+    for text, wanted in (
         ("tls://10.0.0.7:1", "tls://0.0.0.0:1"),
         ("tls://[fe80::1]:8786", "tls://[::]:8786"),
         ("tcp://127.0.0.1:8786", "tcp://127.0.0.1:8786"),
         ("tls://localhost:8786", "tls://localhost:8786"),
-    ],
-)
-def test_a_server_that_others_reach_listens_everywhere(text: str, wanted: str) -> None:
-    assert str(scheduler_address(text).listening()) == wanted
+    ):
+        assert str(scheduler_address(text).listening()) == wanted
 
 
 def test_connections() -> None:
@@ -98,56 +90,31 @@ def test_connections() -> None:
         check_reachable(address)
 
 
-@pytest.mark.parametrize("text", ["everywhere", "tcp://", "Local", " local", "http://x:1"])
-def test_jobs_refuse_other_places(text: str) -> None:
-    with pytest.raises(SettingError, match="computers is out of range"):
-        JobSettings(computers=text).validated()
-
-
-@pytest.mark.parametrize("count", [0, 65])
-def test_jobs_refuse_other_numbers_of_processes(count: int) -> None:
-    with pytest.raises(SettingError, match="processes is out of range"):
-        JobSettings(processes=count).validated()
-
-
-def test_no_result_depends_on_where_it_is_made() -> None:
+def test_jobs_refuse_other_places_and_no_result_depends_on_them() -> None:
+    for text in ("everywhere", "tcp://", "Local", " local", "http://x:1"):
+        with pytest.raises(SettingError, match="computers is out of range"):
+            JobSettings(computers=text).validated()
+    for count in (0, 65):
+        with pytest.raises(SettingError, match="processes is out of range"):
+            JobSettings(processes=count).validated()
     here, there = JobSettings(), JobSettings(computers="tls://farm:8786", processes=4)
     assert key_values(there) == key_values(here)
 
 
 USUAL = Host("", "/mnt/farm", "/home/me/keys", "python3", "/opt/add on/batch.py")
+GOOD_NAMES = ("blade", "me@blade-2.farm.local", "10.0.0.7", "ssh://me@blade:2222", "[fe80::1]")
+BAD_NAMES = (
+    "", "-oProxyCommand=sh", "a b", "a;b", "$(id)", "a`b", "a@-oX=y/z", "me@", "ssh://", "a\nb",
+    "a@-b", "-a@b", "ssh://-b", "ssh://-a@b:22",
+)  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["blade", "me@blade-2.farm.local", "10.0.0.7", "ssh://me@blade:2222", "[fe80::1]", "a_b"],
-)
-def test_names_of_computers(name: str) -> None:
-    assert hosts_named([name], USUAL) == [Host(name, *list(vars(USUAL).values())[1:])]
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "",
-        "-oProxyCommand=sh",
-        "a b",
-        "a;b",
-        "$(id)",
-        "a`b",
-        "a@-oX=y/z",
-        "me@",
-        "ssh://",
-        "a\nb",
-        "a@-b",
-        "-a@b",
-        "ssh://-b",
-        "ssh://-a@b:22",
-    ],
-)
-def test_other_names_are_refused(name: str) -> None:
-    with pytest.raises(UsageError, match="is no name of a computer"):
-        hosts_named([name], USUAL)
+def test_names_of_computers() -> None:
+    for name in GOOD_NAMES:
+        assert hosts_named([name], USUAL) == [replace(USUAL, name=name)]
+    for name in BAD_NAMES:
+        with pytest.raises(UsageError, match="is no name of a computer"):
+            hosts_named([name], USUAL)
 
 
 def test_a_list_of_computers(tmp_path: Path) -> None:
@@ -162,25 +129,22 @@ def test_a_list_of_computers(tmp_path: Path) -> None:
     assert (second.python, second.batch) == ("/opt/py/bin/python3", "/opt/add on/batch.py")
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("a\n-b\n", "line 2: '-b' is no name"),
-        ("a share=/x", "line 1: 'share=/x' is unknown"),
-        ("a b", "line 1: 'b' is unknown"),
-        ("a slots=0", "line 1: slots is not from 1 to 64"),
-        ("a slots=x", "line 1: slots is not"),
-        ("a shared='/x", "line 1: No closing quotation"),
-        (b"\xff\xfe", "it is not text"),
-        ("#" * (MAX_FILE_BYTES + 1), "whole file"),
-    ],
-)
-def test_bad_lists_are_refused(text: str | bytes, says: str, tmp_path: Path) -> None:
+def test_bad_lists_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "hosts.txt"
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(ParseError) as caught:
-        read_hosts(path, USUAL)
-    assert says in str(caught.value)
+    for text, says in (
+        (b"a\n-b\n", "line 2: '-b' is no name"),
+        (b"a share=/x", "line 1: 'share=/x' is unknown"),
+        (b"a b", "line 1: 'b' is unknown"),
+        (b"a slots=0", "line 1: slots is not from 1 to 64"),
+        (b"a slots=x", "line 1: slots is not"),
+        (b"a shared='/x", "line 1: No closing quotation"),
+        (b"\xff\xfe", "it is not text"),
+        (b"#" * (MAX_FILE_BYTES + 1), "whole file"),
+    ):
+        path.write_bytes(text)
+        with pytest.raises(ParseError) as caught:
+            read_hosts(path, USUAL)
+        assert says in str(caught.value)
 
 
 def test_none_or_the_same_twice_is_refused() -> None:
@@ -217,43 +181,36 @@ SLURM = Wanted("slurm", 8, "32GB", "04:00:00", "gpu", "lab-7", ("--gres=gpu:1",)
 
 
 @pytest.mark.parametrize(
-    ("wanted", "head"),
+    ("changes", "head"),
     [
-        (
-            SLURM,
-            ["#SBATCH -J gaussian-wrapping", "#SBATCH -p gpu", "#SBATCH -A lab-7", "#SBATCH -n 1",
-             "#SBATCH --cpus-per-task=8", "#SBATCH --mem=30G", "#SBATCH -t 04:00:00",
-             "#SBATCH --gres=gpu:1"],
-        ),
-        (
-            replace(SLURM, system="pbs", directives=("-m n",)),
-            ["#PBS -N gaussian-wrapping", "#PBS -q gpu", "#PBS -A lab-7",
-             "#PBS -l select=1:ncpus=8:mem=30GB", "#PBS -l walltime=04:00:00", "#PBS -m n"],
-        ),
+        ({}, ["#SBATCH -J gaussian-wrapping", "#SBATCH -p gpu", "#SBATCH -A lab-7", "#SBATCH -n 1",
+              "#SBATCH --cpus-per-task=8", "#SBATCH --mem=30G", "#SBATCH -t 04:00:00",
+              "#SBATCH --gres=gpu:1"]),
+        ({"system": "pbs", "directives": ("-m n",)},
+         ["#PBS -N gaussian-wrapping", "#PBS -q gpu", "#PBS -A lab-7",
+          "#PBS -l select=1:ncpus=8:mem=30GB", "#PBS -l walltime=04:00:00", "#PBS -m n"]),
     ],
 )  # fmt: skip
 def test_the_script_of_a_job(
-    wanted: Wanted, head: list[str], monkeypatch: pytest.MonkeyPatch
+    changes: dict[str, Any], head: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("dask_jobqueue", reason="set-up-worker --add farm")
     monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
-    job = make_job(
-        wanted.validated(), "tls://head:8786", "worker-0", "python3 batch.py farm worker"
-    )
+    wanted = replace(SLURM, **changes).validated()
+    job = make_job(wanted, "tls://head:8786", "worker-0", "python3 batch.py farm worker")
     lines = [line for line in job.job_script().splitlines() if line]
     assert lines == ["#!/usr/bin/env bash", *head, "exec python3 batch.py farm worker"]
+    without = ("scancel", "qdel")
+    monkeypatch.setattr(shutil, "which", lambda name: None if name in without else name)
+    with pytest.raises(UsageError, match=r"There is no (scancel|qdel) on this computer"):
+        make_job(wanted, "tls://head:8786", "worker-0", "true")
 
 
-def test_without_the_commands_of_the_system(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("dask_jobqueue", reason="set-up-worker --add farm")
-    monkeypatch.setattr(shutil, "which", lambda name: None if name == "scancel" else name)
-    with pytest.raises(UsageError, match="There is no scancel on this computer"):
-        make_job(SLURM, "tls://head:8786", "worker-0", "true")
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
+def test_what_cannot_stand_in_a_script() -> None:
+    assert SLURM.validated() is SLURM
+    for time in ("30", "12:00:00", "2-12:00:00", "240:00:00"):
+        assert replace(SLURM, time=time).validated().time == time
+    for change, says in (
         ({"system": "sge"}, "is no batch system"),
         ({"cores": 0}, "--cores is out of range"),
         ({"memory": "32"}, "is no memory"),
@@ -265,15 +222,7 @@ def test_without_the_commands_of_the_system(monkeypatch: pytest.MonkeyPatch) -> 
         ({"directives": ("--a\nrm -r /",)}, "has a line break"),
         ({"directives": ("x" * 501,)}, "has a line break"),
         ({"logs": "/tmp/a\nrm -r x"}, "--logs has a line break"),
-    ],
-)
-def test_what_cannot_stand_in_a_script(change: dict[str, Any], says: str) -> None:
-    assert SLURM.validated() is SLURM
-    with pytest.raises(UsageError) as caught:
-        replace(SLURM, **change).validated()
-    assert says in str(caught.value)
-
-
-@pytest.mark.parametrize("time", ["30", "12:00:00", "2-12:00:00", "240:00:00"])
-def test_times(time: str) -> None:
-    assert replace(SLURM, time=time).validated().time == time
+    ):
+        with pytest.raises(UsageError) as caught:
+            replace(SLURM, **change).validated()
+        assert says in str(caught.value)

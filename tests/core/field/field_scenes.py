@@ -92,3 +92,14 @@ def around_shell(count: int, spread: float, seed: int = 0) -> np.ndarray:
     points = rng.normal(size=(count, 3))
     points /= np.linalg.norm(points, axis=1)[:, None]
     return points * (1.0 + spread * rng.normal(size=(count, 1)))
+
+
+def query_points(
+    arrays: GaussianArrays, count: int, near: float = 0.02, seed: int = 1
+) -> np.ndarray:
+    """Return points anywhere, points ``near`` Gaussians, and centres, ``count`` of each."""
+    rng = np.random.default_rng(seed)
+    means = arrays.means[rng.integers(0, len(arrays), count)]
+    return np.concatenate(
+        [rng.normal(size=(count, 3)), means + near * rng.normal(size=(count, 3)), means]
+    )

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -20,53 +22,53 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.cuda.device_renderer import DeviceRenderer, device_renderer
 from tests.core.device_kernels import DEVICES, kernels_of
 from tests.core.field.field_scenes import cameras_around
+from tests.core.render.scenes import isotropic
 from tests.core.training.small_scene import sphere_gaussians
 
 SIGMA, ALPHA = 0.4, 0.95
+RADIUS = SIGMA * np.sqrt(2 * np.log(2 * ALPHA))
 
 
 def one_ball() -> OrientedGaussians:
     """Return one round Gaussian; its isosurface is a sphere (docs/method.md, section 10.3)."""
-    return OrientedGaussians(
-        means=torch.zeros(1, 3),
-        log_scales=torch.full((1, 3), float(np.log(SIGMA))),
-        quats=torch.tensor([[1.0, 0, 0, 0]]),
-        opacity_logits=torch.tensor([float(np.log(ALPHA / (1 - ALPHA)))]),
-        sh=torch.zeros(1, 1, 3),
-        orientation=torch.zeros(1, 4),
-        filter_3d=torch.zeros(1),
-    )
+    return isotropic([(0.0, 0.0, 0.0)], [SIGMA], [ALPHA], torch.float32)
 
 
 def everywhere(points: np.ndarray) -> np.ndarray:
     return np.ones(len(points), bool)
 
 
+def sampled(
+    count: int, kept: Callable[[np.ndarray], np.ndarray] = everywhere, **options: int
+) -> DepthSamples:
+    """Return samples of the ball from so many sides."""
+    cameras = cameras_around(count)
+    return sample_depth_maps(one_ball(), cameras, kept, Progress(), threads=1, **options)
+
+
 def test_sightings_of_a_round_gaussian_lie_on_its_sphere_all_around() -> None:
-    radius = SIGMA * np.sqrt(2 * np.log(2 * ALPHA))
-    found = sample_depth_maps(one_ball(), cameras_around(12), everywhere, Progress(), threads=1)
+    found = sampled(12)
     distance = np.linalg.norm(found.points, axis=1)
     # At the outline a ray only grazes it; the final transmittance decides there.
-    assert np.abs(distance - radius).max() < 0.02 * radius
-    assert np.median(np.abs(distance - radius)) < 1e-4 * radius
-    towards = cameras_around(40)
-    facing = [(found.points @ c.center).max() / 4.0 for c in towards]
-    assert min(facing) > 0.98 * radius
+    assert np.abs(distance - RADIUS).max() < 0.02 * RADIUS
+    assert np.median(np.abs(distance - RADIUS)) < 1e-4 * RADIUS
+    facing = [(found.points @ c.center).max() / 4.0 for c in cameras_around(40)]
+    assert min(facing) > 0.98 * RADIUS
     np.testing.assert_allclose(np.linalg.norm(found.directions, axis=1), 1.0)
     assert ((found.points * found.directions).sum(1) < 0).mean() > 0.99  # from outside
 
 
 def test_only_what_lies_in_the_volume_is_kept() -> None:
-    above = lambda points: points[:, 2] > 0.1  # noqa: E731
-    found = sample_depth_maps(one_ball(), cameras_around(6), above, Progress(), threads=1)
+    found = sampled(6, lambda points: points[:, 2] > 0.1)
     assert len(found) > 100
     assert (found.points[:, 2] > 0.1).all()
+    nothing = sampled(3, lambda points: np.zeros(len(points), bool))
+    assert len(nothing) == 0
+    assert len(bracket_pairs(nothing, everywhere)[0]) == 0
 
 
 def test_the_number_is_bounded_and_what_is_left_is_even() -> None:
-    found = sample_depth_maps(
-        one_ball(), cameras_around(8), everywhere, Progress(), most=500, threads=1
-    )
+    found = sampled(8, most=500)
     assert 150 < len(found) <= 500
     near = np.linalg.norm(found.points[:, None] - cameras_around(60)[7].center * 0.11, axis=2)
     assert near.min() < 0.2
@@ -80,22 +82,14 @@ def test_thinning_keeps_both_sides_and_the_sharpest() -> None:
 
 
 def test_pairs_stand_on_both_sides_and_disagreement_is_left_out() -> None:
-    found = sample_depth_maps(one_ball(), cameras_around(8), everywhere, Progress(), threads=1)
-    radius = SIGMA * np.sqrt(2 * np.log(2 * ALPHA))
-    is_empty = lambda p: np.linalg.norm(p, axis=1) > radius  # noqa: E731
+    found = sampled(8)
+    is_empty = lambda p: np.linalg.norm(p, axis=1) > RADIUS  # noqa: E731
     outer, inner = bracket_pairs(found, is_empty)
     assert len(outer) == len(inner) > 0.8 * len(found)
     assert is_empty(outer).mean() > 0.99
     assert not is_empty(inner).any()
     outer, inner = bracket_pairs(found, everywhere)
     assert len(outer) == len(inner) == 0
-
-
-def test_no_camera_sees_anything() -> None:
-    nowhere = lambda points: np.zeros(len(points), bool)  # noqa: E731
-    found = sample_depth_maps(one_ball(), cameras_around(3), nowhere, Progress(), threads=1)
-    assert len(found) == 0
-    assert len(bracket_pairs(found, everywhere)[0]) == 0
 
 
 def test_cancelling_stops_before_the_next_view() -> None:

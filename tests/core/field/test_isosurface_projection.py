@@ -17,10 +17,7 @@ from gaussian_wrapping_addon.core.field.isosurface_projection import (
     ProjectionStatus,
     project_to_isosurface,
 )
-from gaussian_wrapping_addon.core.field.vacancy import (
-    VacancyField,
-    VacancyResult,
-)
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField, VacancyResult
 from gaussian_wrapping_addon.core.field.vector_field import VectorField, VectorFieldResult
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.scene.camera import Camera
@@ -40,13 +37,12 @@ class LineField:
     def __init__(
         self,
         vacancy: Callable[[np.ndarray], np.ndarray],
-        slope: Callable[[np.ndarray], np.ndarray],
-        sigma: float,
-        limit: float = np.inf,
+        slope: Callable[[np.ndarray], np.ndarray] = np.zeros_like,
+        sigma: float = 0.1,
         outward: float = 0.0,
     ) -> None:
-        self.of_x, self.slope, self.sigma, self.limit = vacancy, slope, sigma, limit
-        self.outward = outward
+        self.of_x, self.slope, self.sigma, self.outward = vacancy, slope, sigma, outward
+        self.limit = np.inf
         self.asked: list[np.ndarray] = []
 
     @property
@@ -90,70 +86,62 @@ def check_bookkeeping(result: ProjectionResult, tolerance: float) -> None:
     assert np.isfinite(result.points).all()
 
 
-def half_gaussian(sigma: float, alpha: float = 0.95) -> LineField:
+WALL = np.sqrt(2.0 * np.log(1.9))
+"""Where :func:`half_gaussian` is 0.5, in sigmas."""
+
+
+def half_gaussian(sigma: float = 0.1) -> LineField:
     """Return the field of one wall whose outward side is +x (docs/method.md, section 10.3)."""
 
     def vacancy(x: np.ndarray) -> np.ndarray:
-        return 1.0 - alpha * np.exp(-0.5 * (np.maximum(x, 0.0) / sigma) ** 2)
+        return 1.0 - 0.95 * np.exp(-0.5 * (np.maximum(x, 0.0) / sigma) ** 2)
 
     def slope(x: np.ndarray) -> np.ndarray:
         q = (x / sigma) ** 2
-        return np.where(x >= 0.0, x / sigma**2 / np.expm1(0.5 * q - np.log(alpha)), 0.0)
+        return np.where(x >= 0.0, x / sigma**2 / np.expm1(0.5 * q - np.log(0.95)), 0.0)
 
     return LineField(vacancy, slope, sigma, outward=1.0)
 
 
-@pytest.mark.parametrize("sigma", [1e-3, 1e-2, 1.0])
-def test_wall_of_any_size_converges_quickly(sigma: float) -> None:
+@pytest.mark.parametrize("sigma", [1e-3, 1.0])
+def test_wall_of_any_size_is_reached_quickly_and_from_everywhere_near(sigma: float) -> None:
     field = half_gaussian(sigma)
     start = sigma * np.sqrt(2.0 * np.log(0.95 / (1.0 - 0.5935)))
     result = field.project([start], tolerance=1e-6)
-    exact = sigma * np.sqrt(2.0 * np.log(1.9))
     assert result.on_surface.all()
-    assert abs(result.points[0, 0] - exact) < 2e-6 * sigma
+    assert abs(result.points[0, 0] - WALL * sigma) < 2e-6 * sigma
     assert len(field.asked) <= 7
     # The first step is Newton's on log v.
     first = field.of_x(field.asked[1][:, 0])[0]
     assert abs(abs(first - 0.5) - 1.3e-2) < 1e-3
-
-
-@pytest.mark.parametrize("sigma", [1e-3, 1.0])
-def test_wall_is_reached_from_everywhere_near(sigma: float) -> None:
-    starts = (sigma * np.linspace(-9.0, 9.0, 181)).tolist()
-    result = half_gaussian(sigma).project(starts)
-    exact = sigma * np.sqrt(2.0 * np.log(1.9))
+    result = half_gaussian(sigma).project((sigma * np.linspace(-9.0, 9.0, 181)).tolist())
     assert result.on_surface.all()
-    np.testing.assert_allclose(result.points[:, 0], exact, atol=5e-3 * sigma)
+    np.testing.assert_allclose(result.points[:, 0], WALL * sigma, atol=5e-3 * sigma)
 
 
 def test_vector_field_that_vanishes() -> None:
-    field = half_gaussian(0.1)
-    field.slope = np.zeros_like
     for outward in (1.0, 0.0):
-        field.outward = outward
-        field.asked.clear()
+        field = half_gaussian()
+        field.slope, field.outward = np.zeros_like, outward
         result = field.project([-0.3, 0.05, 0.2, 0.4])
         assert (result.status == ProjectionStatus.BISECTED).all()
-        np.testing.assert_allclose(result.points[:, 0], 0.1 * np.sqrt(2 * np.log(1.9)), atol=1e-3)
+        np.testing.assert_allclose(result.points[:, 0], 0.1 * WALL, atol=1e-3)
 
 
 def test_vector_field_opposed_to_the_slope() -> None:
     """V leads away; the ray of the camera leads back, and nothing runs off."""
-    field = half_gaussian(0.1)
+    field = half_gaussian()
     truth = field.slope
     field.slope = lambda x: -truth(x)
     result = field.project([0.02, 0.1, 0.2])
-    occupied = result.points[:2]
     assert result.on_surface[:2].all()
-    np.testing.assert_allclose(occupied[:, 0], 0.1 * np.sqrt(2.0 * np.log(1.9)), atol=1e-3)
+    np.testing.assert_allclose(result.points[:2, 0], 0.1 * WALL, atol=1e-3)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.3, 0.7, 1.0])
 def test_plateau_is_dropped_where_it_is(level: float) -> None:
     for slope in (0.0, 5.0, -5.0, 1e9, 1e-9):
-        field = LineField(
-            lambda x: np.full_like(x, level), lambda x, s=slope: np.full_like(x, s), 0.1
-        )
+        field = LineField(lambda x: np.full_like(x, level), lambda x, s=slope: np.full_like(x, s))
         result = field.project([0.0, 0.5])
         assert (result.status == ProjectionStatus.DROPPED).all()
         np.testing.assert_allclose(result.residual, abs(level - 0.5), atol=1e-6)
@@ -161,35 +149,40 @@ def test_plateau_is_dropped_where_it_is(level: float) -> None:
 
 
 def test_plateau_exactly_at_the_level_is_kept() -> None:
-    field = LineField(lambda x: np.full_like(x, 0.5), np.zeros_like, 0.1)
-    result = field.project([0.0])
-    assert result.status[0] == ProjectionStatus.CONVERGED
+    field = LineField(lambda x: np.full_like(x, 0.5))
+    assert field.project([0.0]).status[0] == ProjectionStatus.CONVERGED
     assert len(field.asked) == 1
 
 
-def test_jump_is_dropped_beside_the_jump() -> None:
-    field = LineField(lambda x: np.where(x > 0.013, 0.9, 0.1), np.zeros_like, 0.1, outward=1.0)
-    result = field.project([-0.05, 0.05])
+def test_jump_is_dropped_beside_the_jump_but_for_a_side_within_the_tolerance() -> None:
+    def jump(low: float, high: float) -> LineField:
+        return LineField(lambda x: np.where(x > 0.013, high, low), outward=1.0)
+
+    result = jump(0.1, 0.9).project([-0.05, 0.05])
     assert (result.status == ProjectionStatus.DROPPED).all()
     np.testing.assert_allclose(result.residual, 0.4, atol=1e-6)
+    result = jump(0.2, 0.508).project([-0.05, 0.05], tolerance=0.01)
+    assert result.on_surface.all()
+    np.testing.assert_allclose(result.residual, 0.008, atol=1e-6)
+    assert (result.points[:, 0] > 0.013).all()
 
 
 def test_unseen_and_nonfinite_fields_are_reported() -> None:
-    field = half_gaussian(0.1)
+    field = half_gaussian()
     field.limit = 0.15
     result = field.project([0.3, 0.02, -0.1])
     assert result.status[0] == ProjectionStatus.DROPPED
     assert result.camera[0] == -1
     assert result.points[0, 0] == 0.3
     assert result.on_surface[1:].all()
-    broken = half_gaussian(0.1)
+    broken = half_gaussian()
     truth = broken.slope
     broken.slope = lambda x: np.where(x > 0.15, np.inf, np.where(x > 0.1, np.nan, truth(x)))
     assert broken.project([0.2, 0.12, 0.01]).on_surface.all()
 
 
 def test_more_steps_than_allowed_are_dropped() -> None:
-    field = half_gaussian(0.1)
+    field = half_gaussian()
     result = project_to_isosurface(np.array([[-0.3, 0, 0]]), field, field, max_steps=3)
     assert len(field.asked) == 3
     assert result.status[0] == ProjectionStatus.DROPPED
@@ -198,7 +191,7 @@ def test_more_steps_than_allowed_are_dropped() -> None:
         project_to_isosurface(np.zeros((1, 3)), field, field, Progress(is_cancelled=lambda: True))
 
 
-@pytest.mark.parametrize("sigma", [1e-3, 1e-2, 1.0])
+@pytest.mark.parametrize("sigma", [1e-3, 1.0])
 def test_single_gaussian_gives_its_sphere(sigma: float) -> None:
     arrays = make_arrays(np.zeros(3), sigma, 0.95)
     cameras = cameras_around(12, radius=40.0 * sigma)
@@ -208,10 +201,10 @@ def test_single_gaussian_gives_its_sphere(sigma: float) -> None:
     check_bookkeeping(result, 1e-3)
     assert result.on_surface.all()
     radius = np.linalg.norm(result.points, axis=1) / sigma
-    np.testing.assert_allclose(radius, np.sqrt(2.0 * np.log(1.9)), atol=2.5e-3)
+    np.testing.assert_allclose(radius, WALL, atol=2.5e-3)
 
 
-@pytest.mark.parametrize(("alpha", "offset"), [(0.6, 1.76), (0.9, 2.09), (0.99, 2.17)])
+@pytest.mark.parametrize(("alpha", "offset"), [(0.6, 1.76), (0.99, 2.17)])
 def test_shell_lies_outside_its_centres(alpha: float, offset: float) -> None:
     """The known offsets of docs/method.md, section 10.3, in thicknesses of the Gaussians."""
     arrays = shell_arrays(alpha)
@@ -251,7 +244,7 @@ def test_projection_scales_with_the_scene_and_ignores_threads() -> None:
         assert gap[base.on_surface].max() < 0.5
 
 
-@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e4])
+@pytest.mark.parametrize("scale", [1.0, 1e4])
 def test_residuals_of_the_default_are_small_at_any_scale(scale: float) -> None:
     """99 % within 0.02 and the median within 0.002, from starts a sample apart (issue: PAM)."""
     arrays = shell_arrays(0.9, scale=scale)
@@ -266,12 +259,3 @@ def test_residuals_of_the_default_are_small_at_any_scale(scale: float) -> None:
     np.testing.assert_allclose(again, residual, atol=1e-6)
     assert np.quantile(residual, 0.99) <= 0.006
     assert np.median(residual) <= 0.002
-
-
-def test_points_between_aim_and_tolerance_are_kept() -> None:
-    """A jump over the aim: the closest side is within the tolerance, and the point stays there."""
-    field = LineField(lambda x: np.where(x > 0.013, 0.508, 0.2), np.zeros_like, 0.1, outward=1.0)
-    result = field.project([-0.05, 0.05], tolerance=0.01)
-    assert result.on_surface.all()
-    np.testing.assert_allclose(result.residual, 0.008, atol=1e-6)
-    assert (result.points[:, 0] > 0.013).all()

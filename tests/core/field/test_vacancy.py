@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Callable
+from typing import Any
 
 import mpmath
 import numba
@@ -19,15 +21,9 @@ from benchmarks.vacancy_scale import (
     log_transmittance,
 )
 from gaussian_wrapping_addon.core.errors import Cancelled, UsageError
-from gaussian_wrapping_addon.core.field.vacancy import (
-    SETTLED,
-    PackedMask,
-    VacancyField,
-)
-from gaussian_wrapping_addon.core.field.vacancy_kernels import (
-    transmittance_of_cells,
-)
-from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays, OrientedGaussians
+from gaussian_wrapping_addon.core.field.vacancy import SETTLED, PackedMask, VacancyField
+from gaussian_wrapping_addon.core.field.vacancy_kernels import transmittance_of_cells
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
 from tests.core.field.field_scenes import (
@@ -35,23 +31,19 @@ from tests.core.field.field_scenes import (
     camera_at,
     cameras_around,
     make_arrays,
+    query_points,
     random_arrays,
     shell_arrays,
     unit_sphere,
 )
 
-
-def query_points(arrays: GaussianArrays, count: int, seed: int = 1) -> np.ndarray:
-    """Return points anywhere and points inside or close to Gaussians."""
-    rng = np.random.default_rng(seed)
-    near = arrays.means[rng.integers(0, len(arrays), count)]
-    return np.concatenate(
-        [rng.normal(size=(count, 3)), near + 0.02 * rng.normal(size=(count, 3)), near]
-    )
+FieldMaker = Callable[..., VacancyField]
+FRONT = camera_at(np.array([0.0, -4.0, 0.0]))
+BALL = make_arrays(np.zeros(3), 0.1, 0.9)
 
 
 def difference(field: VacancyField, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return field minus brute force where the field resolves vacancy, and all field values."""
+    """Return field minus brute force, and the field, where the field resolves vacancy."""
     result = field.vacancy(points)
     exact, camera = brute_force_vacancy(field.arrays, field.cameras, points)
     np.testing.assert_array_equal(result.camera >= 0, camera >= 0)
@@ -59,7 +51,7 @@ def difference(field: VacancyField, points: np.ndarray) -> tuple[np.ndarray, np.
     # A settled point may stop at any camera, but never below what makes it settled.
     settled = (camera >= 0) & ~resolved
     assert (exact[settled] > SETTLED - 0.012).all()
-    return result.vacancy[resolved] - exact[resolved], result.vacancy
+    return result.vacancy[resolved] - exact[resolved], result.vacancy[resolved]
 
 
 def test_brute_force_is_the_integral_of_the_attenuation() -> None:
@@ -81,119 +73,115 @@ def test_brute_force_is_the_integral_of_the_attenuation() -> None:
     assert got == pytest.approx(expected, abs=1e-7)
 
 
-def test_field_equals_brute_force_up_to_the_dropped_tails() -> None:
+def test_field_equals_brute_force_up_to_the_dropped_tails(make_field: FieldMaker) -> None:
     arrays = random_arrays(400)
-    field = VacancyField(arrays, cameras_around(6), threads=2)
-    error, vacancy = difference(field, query_points(arrays, 1000))
-    assert len(error) > 1000
+    error, vacancy = difference(make_field(arrays, cameras_around(6)), query_points(arrays, 500))
+    assert len(error) > 500
     assert vacancy.min() < 0.05
-    assert vacancy.max() == 1.0
     # Dropping tails can only let more light through.
     assert error.min() > -5e-4  # float32, on Gaussians of a thousandth of a unit
     assert error.max() < 0.005
     assert np.median(np.abs(error)) < 5e-4
 
 
-def test_dense_shell_equals_brute_force_up_to_the_dropped_tails() -> None:
-    arrays = shell_arrays(0.9)
-    field = VacancyField(arrays, cameras_around(5), threads=2)
+def test_dense_shell_equals_brute_force_up_to_the_dropped_tails(make_field: FieldMaker) -> None:
+    field = make_field(shell_arrays(0.9), cameras_around(5))
     error, vacancy = difference(field, around_shell(400, 0.015))
-    surface = (vacancy[vacancy <= SETTLED] > 0.3) & (vacancy[vacancy <= SETTLED] < 0.7)
+    surface = np.abs(vacancy - 0.5) < 0.2
     assert surface.sum() > 20
     assert error.min() > -1e-4
     assert error[surface].max() < 0.012
     assert error.max() < 0.02
 
 
-def test_gaussians_without_tails_agree_to_float32() -> None:
-    """Well inside all footprints nothing is dropped, and what is left is rounding."""
-    arrays = make_arrays(0.05 * unit_sphere(40), [0.3, 0.2, 0.25], np.linspace(0.01, 0.3, 40))
-    rng = np.random.default_rng(0)
-    field = VacancyField(arrays, cameras_around(4), threads=1)
-    points = 0.1 * rng.normal(size=(500, 3))
-    exact, camera = brute_force_vacancy(arrays, field.cameras, points)
-    # 0.01 exp(-q / 2) passes 1/255 at q = 1.87; the faintest are dropped beyond.
-    bright = make_arrays(arrays.means[20:], arrays.scales[20:], np.exp(arrays.log_opacities[20:]))
-    field = VacancyField(bright, cameras_around(4), threads=1)
-    error, _ = difference(field, points)
-    assert len(error) == 500
+def test_gaussians_without_tails_agree_to_float32(make_field: FieldMaker) -> None:
+    # Well inside all footprints nothing is dropped, and what is left is rounding.
+    arrays = make_arrays(0.05 * unit_sphere(20), [0.3, 0.2, 0.25], np.linspace(0.15, 0.3, 20))
+    points = 0.1 * np.random.default_rng(0).normal(size=(300, 3))
+    error, _ = difference(make_field(arrays, cameras_around(4)), points)
+    assert len(error) == 300
     assert np.abs(error).max() < 2e-5
-    assert (camera >= 0).all()
-    assert exact.max() < 1.0
 
 
 def test_gaussians_fainter_than_the_cut_are_dropped_with_the_stated_bound() -> None:
     arrays = make_arrays(np.zeros((10, 3)), 0.2, 1.0 / 256.0)
-    point = np.array([[0.0, 0.0, 0.0]])
-    cameras = cameras_around(2)
+    point, cameras = np.zeros((1, 3)), cameras_around(2)
     value = VacancyField(arrays, cameras).vacancy(point).vacancy[0]
     exact, _ = brute_force_vacancy(arrays, cameras, point)
     assert value == 1.0
     assert 0.0 < value - exact[0] <= 1.0 - (1.0 - 1.0 / 255.0) ** 10
 
 
-@pytest.mark.parametrize("alpha", [0.55, 0.8, 0.95, 0.9999])
+@pytest.mark.parametrize("alpha", [0.55, 0.9999])
 @pytest.mark.parametrize("sigma", [1e-3, 0.1])
-def test_isosurface_of_one_gaussian_is_a_sphere(alpha: float, sigma: float) -> None:
+def test_isosurface_of_one_gaussian_is_a_sphere(
+    make_field: FieldMaker, alpha: float, sigma: float
+) -> None:
     arrays = make_arrays([0.1, -0.2, 0.15], sigma, alpha)
-    field = VacancyField(arrays, cameras_around(12))
-    radius = sigma * np.sqrt(2.0 * np.log(2.0 * alpha))
-    directions = unit_sphere(300)
-    vacancy = field.vacancy(arrays.means + radius * directions).vacancy
+    field = make_field(arrays, cameras_around(12))
+    offsets = sigma * np.sqrt(2.0 * np.log(2.0 * alpha)) * unit_sphere(300)
+    vacancy = field.vacancy(arrays.means + offsets).vacancy
     # A relative error of 1e-3 sigma in position is 1e-3 in vacancy: float32 pixels and depths.
     np.testing.assert_allclose(vacancy, 0.5, atol=1e-4 if sigma > 0.01 else 2e-3)
-    assert field.is_empty(arrays.means + 1.02 * radius * directions).all()
-    assert not field.is_empty(arrays.means + 0.98 * radius * directions).any()
+    assert field.is_empty(arrays.means + 1.02 * offsets).all()
+    assert not field.is_empty(arrays.means + 0.98 * offsets).any()
 
 
-@pytest.mark.parametrize("anisotropy", [1e2, 1e3, 1e4, 1e6])
-def test_thin_discs_seen_at_a_slant(anisotropy: float) -> None:
+@pytest.mark.parametrize("anisotropy", [1e2, 1e4, 1e6])
+def test_thin_discs_seen_at_a_slant(make_field: FieldMaker, anisotropy: float) -> None:
     """A disc's flank is at q = 2 ln(2 alpha) in front of it, however thin it is."""
     thin, alpha = 0.1 / anisotropy, 0.9
     turn = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
     turn[:, 2] *= -np.sign(turn[1, 2])  # towards the camera at -y
     arrays = make_arrays(np.zeros(3), [0.1, 0.1, thin], alpha, rotations=turn[None])
-    camera = camera_at(np.array([0.0, -4.0, 0.0]))
     # Pixels and depth are float32 at a distance of 4: about 1e-6 units.
     blur = 1e-6
     offset = thin * np.sqrt(2.0 * np.log(2.0 * alpha))
     heights = offset * np.array([0.5, 0.9, 1.1, 1.5]) + 10.0 * blur * np.array([-1, -1, 1, 1])
     points = heights[:, None] * turn[:, 2]
-    exact, _ = brute_force_vacancy(arrays, [camera], points)
-    got = VacancyField(arrays, [camera]).vacancy(points).vacancy
-    np.testing.assert_array_equal(exact > 0.5, [False, False, True, True])
-    np.testing.assert_array_equal(got > 0.5, exact > 0.5)
+    exact, _ = brute_force_vacancy(arrays, [FRONT], points)
+    got = make_field(arrays, [FRONT]).vacancy(points).vacancy
+    np.testing.assert_array_equal(got > 0.5, [False, False, True, True])
+    np.testing.assert_array_equal(exact > 0.5, got > 0.5)
     # The steepest slope of 1 - G is alpha exp(-1/2) / sigma.
     assert np.abs(got - exact).max() < 1e-3 + 0.55 * blur / thin
 
 
-def test_opaque_and_nearly_transparent_layers() -> None:
-    heights = np.linspace(-0.5, 0.5, 60)
-    layers = np.stack([np.zeros(60), heights, np.zeros(60)], 1)
-    camera = camera_at(np.array([0.0, -4.0, 0.0]))
-    points = np.stack([np.zeros(40), np.linspace(-0.8, 0.8, 40), np.zeros(40)], 1)
-    for alpha in (0.02, 0.999999):
-        arrays = make_arrays(layers, [0.5, 0.004, 0.5], alpha)
-        exact, _ = brute_force_vacancy(arrays, [camera], points)
-        got = VacancyField(arrays, [camera]).vacancy(points).vacancy
-        np.testing.assert_allclose(got, exact, atol=2e-3)
+@pytest.mark.parametrize("alpha", [0.02, 0.999999])
+def test_opaque_and_nearly_transparent_layers(make_field: FieldMaker, alpha: float) -> None:
+    layers = np.linspace(-0.5, 0.5, 60)[:, None] * [0.0, 1.0, 0.0]
+    points = np.linspace(-0.8, 0.8, 40)[:, None] * [0.0, 1.0, 0.0]
+    arrays = make_arrays(layers, [0.5, 0.004, 0.5], alpha)
+    exact, _ = brute_force_vacancy(arrays, [FRONT], points)
+    got = make_field(arrays, [FRONT]).vacancy(points).vacancy
+    np.testing.assert_allclose(got, exact, atol=2e-3)
 
 
-def test_is_empty_is_the_sign_of_vacancy() -> None:
-    arrays = random_arrays(400)
-    points = query_points(arrays, 1500)
-    cameras = cameras_around(7)
-    vacancy = VacancyField(arrays, cameras).vacancy(points).vacancy
+def test_gaussian_that_holds_the_camera_and_the_scene(make_field: FieldMaker) -> None:
+    """Wider than everything: its footprint is the whole image, from a centre in front."""
+    arrays = make_arrays([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]], [[60.0] * 3, [0.1] * 3], [0.3, 0.9])
+    points = np.array([[0.0, -0.2, 0.0], [0.5, 0.3, 0.4], [0.0, 0.2, 0.0]])
+    exact, _ = brute_force_vacancy(arrays, [FRONT], points)
+    got = make_field(arrays, [FRONT]).vacancy(points).vacancy
+    np.testing.assert_allclose(got, exact, atol=1e-3)
+
+
+def test_is_empty_is_the_sign_of_vacancy(make_field: FieldMaker) -> None:
+    arrays, cameras = random_arrays(400), cameras_around(7)
+    points = query_points(arrays, 400)
+    vacancy = make_field(arrays, cameras).vacancy(points).vacancy
     for level in (0.5, 0.2):
-        signs = VacancyField(arrays, cameras).is_empty(points, level=level)
+        field = make_field(arrays, cameras)
+        signs = field.is_empty(points, level=level)
         np.testing.assert_array_equal(signs, vacancy > np.float32(level))
         assert 0 < signs.sum() < len(signs)
+        assert field.evaluations == len(points)
 
 
-def test_vacancy_is_the_largest_transmittance() -> None:
+def test_vacancy_is_the_largest_transmittance(make_field: FieldMaker) -> None:
     arrays = random_arrays(300, seed=4)
-    field = VacancyField(arrays, cameras_around(5))
-    points = query_points(arrays, 300)
+    field = make_field(arrays, cameras_around(5))
+    points = query_points(arrays, 150)
     each = np.stack([field.transmittance(points, c) for c in range(5)])  # (5, n)
     result = field.vacancy(points)
     highest = np.nanmax(each, axis=0)
@@ -205,8 +193,7 @@ def test_vacancy_is_the_largest_transmittance() -> None:
 
 
 def test_threads_batches_and_resolution_change_nothing() -> None:
-    arrays = random_arrays(400)
-    cameras = cameras_around(5)
+    arrays, cameras = random_arrays(400), cameras_around(5)
     points = query_points(arrays, 800)
     one = VacancyField(arrays, cameras, threads=1).vacancy(points)
     three = VacancyField(arrays, cameras, threads=3).vacancy(points)
@@ -222,105 +209,102 @@ def test_threads_batches_and_resolution_change_nothing() -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e4])
-def test_scale_and_shift_change_nothing(scale: float) -> None:
-    arrays = random_arrays(200, scale=(1e-2, 0.1))
-    cameras = cameras_around(4)
-    points = query_points(arrays, 400)
+def test_scale_and_shift_change_nothing(make_field: FieldMaker, scale: float) -> None:
+    arrays, cameras = random_arrays(200, scale=(1e-2, 0.1)), cameras_around(4)
+    points = query_points(arrays, 150)
     shift = np.array([5e2, -4e3, 30.0]) * scale
     frame = Similarity(scale, np.eye(3), shift)
     moved = dataclasses.replace(
         arrays, means=scale * arrays.means + shift, scales=scale * arrays.scales
     )
-    moved_cameras = [camera.moved(frame) for camera in cameras]
-    base = VacancyField(arrays, cameras, near_z=0.2).vacancy(points).vacancy
-    other = VacancyField(moved, moved_cameras, near_z=0.2 * scale)
-    value = other.vacancy(scale * points + shift).vacancy
-    resolved = base <= SETTLED
+    base = make_field(arrays, cameras, near_z=0.2).vacancy(points).vacancy
+    other = make_field(moved, [camera.moved(frame) for camera in cameras], near_z=0.2 * scale)
     # A footprint's rim may round to the other side: a step of 1/255.
-    gap = np.abs(value - base)[resolved]
+    gap = np.abs(other.vacancy(scale * points + shift).vacancy - base)[base <= SETTLED]
     assert np.quantile(gap, 0.99) < 2e-4
     assert gap.max() < 5e-3
 
 
-def test_region_bounds_change_no_value_inside() -> None:
+def test_region_bounds_change_no_value_inside(make_field: FieldMaker) -> None:
     arrays = random_arrays(400, scale=(0.02, 0.3))
     cameras = [*cameras_around(5), camera_at(np.array([0.3, 0.2, 0.3]))]
     bounds = np.array([[-0.3, -0.2, 0.0], [0.4, 0.5, 0.6]])
-    rng = np.random.default_rng(2)
-    points = rng.uniform(bounds[0] - 0.05, bounds[1] + 0.05, (2000, 3))
+    points = np.random.default_rng(2).uniform(bounds[0] - 0.05, bounds[1] + 0.05, (800, 3))
     inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
-    full = VacancyField(arrays, cameras).vacancy(points)
-    part = VacancyField(arrays, cameras, region_bounds=bounds)
+    full = make_field(arrays, cameras).vacancy(points)
+    part = make_field(arrays, cameras, region_bounds=bounds)
     result = part.vacancy(points)
     resolved = inside & (full.vacancy <= SETTLED)
-    assert resolved.sum() > 300
+    assert resolved.sum() > 100
     np.testing.assert_array_equal(result.vacancy[resolved], full.vacancy[resolved])
     np.testing.assert_array_equal(result.camera[inside] >= 0, full.camera[inside] >= 0)
     assert (result.camera[~inside] == -1).all()
     np.testing.assert_array_equal(part.is_empty(points[inside]), full.vacancy[inside] > 0.5)
 
 
-def test_unseen_points_follow_the_policy() -> None:
-    arrays = make_arrays(np.zeros(3), 0.1, 0.9)
-    camera = camera_at(np.array([0.0, -4.0, 0.0]))
-    behind = np.array([[0.0, -5.0, 0.0], [0.0, -3.9, 0.0], [50.0, 0.0, 0.0], [0.0, -2.0, 0.0]])
-    for unseen, value in (("empty", 1.0), ("occupied", 0.0)):
-        field = VacancyField(arrays, [camera], unseen=unseen)  # type: ignore[arg-type]
-        result = field.vacancy(behind)
-        np.testing.assert_array_equal(result.camera, [-1, -1, -1, 0])
-        np.testing.assert_array_equal(result.vacancy[:3], value)
-        np.testing.assert_array_equal(field.is_empty(behind), [value > 0.5] * 3 + [True])
-        assert np.isnan(field.transmittance(behind, 0)[:3]).all()
-        nothing = field.vacancy(np.array([[np.nan, 0.0, 0.0]]))
-        assert nothing.camera[0] == -1
-        assert nothing.vacancy[0] == value
+@pytest.mark.parametrize(
+    ("unseen", "value", "filled"),
+    [("empty", 1.0, 1.0), ("occupied", 0.0, 0.0), ("invalid", np.nan, 1.0)],
+)
+def test_unseen_points_follow_the_policy(
+    make_field: FieldMaker, unseen: str, value: float, filled: float
+) -> None:
+    behind, near, aside = [0.0, -5.0, 0.0], [0.0, -3.9, 0.0], [50.0, 0.0, 0.0]
+    points = np.array([behind, near, aside, [np.nan, 0.0, 0.0], [0.0, -2.0, 0.0]])
+    field = make_field(BALL, [FRONT], unseen=unseen)
+    result = field.vacancy(points)
+    np.testing.assert_array_equal(result.camera, [-1, -1, -1, -1, 0])
+    np.testing.assert_array_equal(result.vacancy, [value] * 4 + [1.0])
+    np.testing.assert_array_equal(result.filled, [filled] * 4 + [1.0])
+    np.testing.assert_array_equal(field.is_empty(points), [filled > 0.5] * 4 + [True])
+    assert field.unseen_evaluations == 8
+    assert field.evaluations == 10
+    assert np.isnan(field.transmittance(points, 0)[:4]).all()
 
 
-def test_gaussian_that_holds_the_camera_and_the_scene() -> None:
-    """Wider than everything: its footprint is the whole image, from a centre in front."""
-    arrays = make_arrays([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]], [[60.0] * 3, [0.1] * 3], [0.3, 0.9])
-    camera = camera_at(np.array([0.0, -4.0, 0.0]))
-    points = np.array([[0.0, -0.2, 0.0], [0.5, 0.3, 0.4], [0.0, 0.2, 0.0]])
-    exact, _ = brute_force_vacancy(arrays, [camera], points)
-    got = VacancyField(arrays, [camera]).vacancy(points).vacancy
-    np.testing.assert_allclose(got, exact, atol=1e-3)
-
-
-def test_no_gaussians_and_no_points() -> None:
-    empty = make_arrays(np.zeros((0, 3)), 0.1, 0.5)
-    field = VacancyField(empty, cameras_around(2))
+def test_no_gaussians_and_no_points(make_field: FieldMaker) -> None:
+    field = make_field(make_arrays(np.zeros((0, 3)), 0.1, 0.5), cameras_around(2))
     assert (field.vacancy(np.zeros((3, 3))).vacancy == 1.0).all()
     assert len(field.vacancy(np.zeros((0, 3))).vacancy) == 0
     assert len(field.is_empty(np.zeros((0, 3)))) == 0
 
 
 def test_cameras_that_win_are_asked_first() -> None:
-    arrays = shell_arrays(0.9, count=300)
-    field = VacancyField(arrays, cameras_around(6), threads=1)
+    field = VacancyField(shell_arrays(0.9, count=300), cameras_around(6), threads=1)
     assert sorted(field.evaluation_order().tolist()) == list(range(6))
     target = field.cameras[4].center / 4.0
     field.vacancy(target + 0.05 * np.random.default_rng(0).normal(size=(200, 3)))
     assert field.wins.sum() == 200
     assert field.evaluation_order()[0] == np.argmax(field.wins)
-    assert field.evaluations == 200
 
 
-def test_bad_input_and_cancelling() -> None:
-    arrays = make_arrays(np.zeros(3), 0.1, 0.9)
-    cameras = cameras_around(2)
-    with pytest.raises(UsageError, match="at least one camera"):
-        VacancyField(arrays, [])
-    with pytest.raises(UsageError, match="unseen"):
-        VacancyField(arrays, cameras, unseen="solid")  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="bounds"):
-        VacancyField(arrays, cameras, region_bounds=np.array([[1.0, 1, 1], [0.0, 0, 0]]))
+def test_cancelling(make_field: FieldMaker) -> None:
+    field = make_field(BALL, [FRONT])
     with pytest.raises(Cancelled):
-        VacancyField(arrays, cameras).vacancy(np.zeros((5, 3)), Progress(is_cancelled=lambda: True))
+        field.vacancy(np.zeros((5, 3)), Progress(is_cancelled=lambda: True))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"unseen": "solid"}, "unseen"),
+        ({"region_bounds": np.array([[1.0, 1, 1], [0.0, 0, 0]])}, "bounds"),
+        ({"masks": [None]}, "2 cameras and 1 masks"),
+        ({"masks": [None, np.ones((3, 4, 3), bool)]}, "shape"),
+        ({"masks": [None, PackedMask.of(np.ones((0, 4), bool))]}, "shape"),
+        ({"mask_mode": "white"}, "mask mode"),
+    ],
+)
+def test_bad_input_is_named(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        VacancyField(BALL, cameras_around(2), **options)
+    with pytest.raises(UsageError, match="at least one camera"):
+        VacancyField(BALL, [])
 
 
 def test_transmittance_kernel_is_vectorised() -> None:
     """Losing packed instructions costs several times the speed without any other sign."""
-    VacancyField(make_arrays(np.zeros(3), 0.1, 0.9), cameras_around(1)).vacancy(np.zeros((1, 3)))
+    VacancyField(BALL, [FRONT]).vacancy(np.zeros((1, 3)))
     fresh = numba.njit(
         nogil=True, error_model="numpy", fastmath=transmittance_of_cells.targetoptions["fastmath"]
     )(transmittance_of_cells.py_func)
@@ -329,14 +313,6 @@ def test_transmittance_kernel_is_vectorised() -> None:
     # Packed float32 multiplications: mulps or fmadd...ps on x86, fmul/fmla v.4s on ARM.
     packed = re.findall(r"(?:v?mulps|vfn?m\w+ps|f(?:mul|mla|mls)\s+v\d+\.4s)", assembly)
     assert len(packed) >= 10
-
-
-def random_masks(cameras: list[Camera], divisor: int = 1, seed: int = 0) -> list[np.ndarray]:
-    """Return masks of blocks, about half of each left out."""
-    rng = np.random.default_rng(seed)
-    size = cameras[0].height // divisor, cameras[0].width // divisor
-    blocks = rng.random((len(cameras), 6, 8)) < 0.5
-    return [np.kron(b, np.ones((size[0] // 6, size[1] // 8), bool)) for b in blocks]
 
 
 def is_masked(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -353,22 +329,21 @@ def is_masked(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndarra
 
 @pytest.mark.parametrize("divisor", [1, 5])
 @pytest.mark.parametrize("mode", ["ignore", "background"])
-def test_masked_views_equal_the_definition(mode: str, divisor: int) -> None:
-    arrays = random_arrays(300)
-    cameras = cameras_around(5)
-    masks = random_masks(cameras, divisor)
-    rng = np.random.default_rng(1)
-    near = arrays.means[rng.integers(0, len(arrays), 2500)] + 0.01 * rng.normal(size=(2500, 3))
-    points = np.concatenate([near, rng.normal(size=(1500, 3))])
-    plain = VacancyField(arrays, cameras, near_z=0.2)
+def test_masked_views_equal_the_definition(make_field: FieldMaker, mode: str, divisor: int) -> None:
+    """About half of each view is left out in blocks; masks may come packed."""
+    arrays, cameras = random_arrays(300), cameras_around(5)
+    rng = np.random.default_rng(0)
+    height, width = 50 // divisor, 50 // divisor
+    masks = [np.kron(b, np.ones((height, width), bool)) for b in rng.random((5, 6, 8)) < 0.5]
+    points = np.concatenate([query_points(arrays, 400, 0.01), rng.normal(size=(700, 3))])
+    plain = make_field(arrays, cameras, near_z=0.2)
     each = np.stack([plain.transmittance(points, c) for c in range(5)])  # (5, n)
     for c in range(5):
         each[c, is_masked(cameras[c], masks[c], points)] = np.nan if mode == "ignore" else 1.0
     seen = ~np.isnan(each).all(0)
     expected = np.where(seen, np.where(np.isnan(each), -1.0, each).max(0), np.nan)
-    field = VacancyField(
-        arrays, cameras, near_z=0.2, masks=masks, mask_mode=mode, unseen="invalid"  # type: ignore[arg-type]
-    )  # fmt: skip
+    options = {"near_z": 0.2, "mask_mode": mode, "unseen": "invalid"}
+    field = make_field(arrays, cameras, masks=masks, **options)
     result = field.vacancy(points)
     np.testing.assert_array_equal(result.camera >= 0, seen)
     np.testing.assert_array_equal(np.isnan(result.vacancy), ~seen)
@@ -377,13 +352,15 @@ def test_masked_views_equal_the_definition(mode: str, divisor: int) -> None:
     np.testing.assert_array_equal(result.vacancy[resolved], expected[resolved].astype(np.float32))
     assert (result.vacancy[seen & ~resolved] > SETTLED).all()
     assert field.unseen_evaluations == (~seen).sum()
-    assert (mode == "ignore") == bool((~seen).sum() > 100)
+    assert (mode == "ignore") == bool((~seen).sum() > 50)
     np.testing.assert_array_equal(field.is_empty(points), ~(result.vacancy <= 0.5))
-    one = field.transmittance(points, 2)
-    np.testing.assert_array_equal(one, each[2])
+    np.testing.assert_array_equal(field.transmittance(points, 2), each[2])
+    packed = [PackedMask.of(mask) for mask in masks]
+    again = make_field(arrays, cameras, masks=packed, **options).vacancy(points)
+    np.testing.assert_array_equal(again.vacancy, result.vacancy)
 
 
-@pytest.mark.parametrize("width", [1, 7, 8, 9, 64])
+@pytest.mark.parametrize("width", [1, 8, 9])
 def test_a_packed_mask_takes_a_bit_a_pixel_and_is_the_same(width: int) -> None:
     mask = np.random.default_rng(width).random((5, width)) < 0.5
     packed = PackedMask.of(mask)
@@ -394,21 +371,11 @@ def test_a_packed_mask_takes_a_bit_a_pixel_and_is_the_same(width: int) -> None:
     assert PackedMask.of(None) is None
 
 
-def test_masks_may_come_packed() -> None:
-    arrays, cameras = random_arrays(300), cameras_around(5)
-    masks = random_masks(cameras, 5)
-    points = np.random.default_rng(0).normal(size=(3000, 3))
-    plain = VacancyField(arrays, cameras, masks=masks).vacancy(points)
-    packed = [PackedMask.of(mask) for mask in masks]
-    found = VacancyField(arrays, cameras, masks=packed).vacancy(points)
-    np.testing.assert_array_equal(plain.vacancy, found.vacancy)
-    np.testing.assert_array_equal(plain.camera, found.camera)
-
-
 def test_background_of_one_photo_empties_what_others_find_solid() -> None:
-    arrays, cameras = shell_arrays(0.95), cameras_around(4)
-    middle = np.array([[0.0, 0.0, 0.0]])
-    assert VacancyField(arrays, cameras).vacancy(middle).vacancy[0] < 0.1
+    arrays, cameras, middle = shell_arrays(0.95), cameras_around(4), np.zeros((1, 3))
+    full = [np.ones((7, 9), bool), None, np.ones((300, 400), bool), None]
+    for masks in (None, full):
+        assert VacancyField(arrays, cameras, masks=masks).vacancy(middle).vacancy[0] < 0.1
     nothing = np.zeros((30, 40), bool)
     for masks in ([None, nothing, None, None], [None, None, None, nothing]):
         field = VacancyField(arrays, cameras, masks=masks, mask_mode="background")
@@ -416,48 +383,6 @@ def test_background_of_one_photo_empties_what_others_find_solid() -> None:
         assert field.is_empty(middle)[0]
         ignoring = VacancyField(arrays, cameras, masks=masks)
         assert ignoring.vacancy(middle).vacancy[0] < 0.1
-
-
-def test_masks_that_leave_nothing_out_change_nothing() -> None:
-    arrays, cameras = random_arrays(100), cameras_around(3)
-    points = np.random.default_rng(0).normal(size=(500, 3))
-    full = [np.ones((7, 9), bool), None, np.ones((300, 400), bool)]
-    plain = VacancyField(arrays, cameras).vacancy(points)
-    masked = VacancyField(arrays, cameras, masks=full).vacancy(points)
-    np.testing.assert_array_equal(plain.vacancy, masked.vacancy)
-    np.testing.assert_array_equal(plain.camera, masked.camera)
-
-
-def test_invalid_points_are_nan_empty_and_counted() -> None:
-    arrays = shell_arrays(0.9, count=200)
-    field = VacancyField(arrays, [camera_at(np.array([0.0, -4.0, 0.0]))], unseen="invalid")
-    points = np.array([[0.0, -5.0, 0.0], [0.0, -2.0, 0.0], [50.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])
-    result = field.vacancy(points)
-    np.testing.assert_array_equal(np.isnan(result.vacancy), [True, False, True, True])
-    np.testing.assert_array_equal(result.camera, [-1, 0, -1, -1])
-    np.testing.assert_array_equal(result.filled, [1.0, 1.0, 1.0, 1.0])
-    assert field.unseen_evaluations == 3
-    assert field.is_empty(points).all()
-    assert field.unseen_evaluations == 6
-    assert field.evaluations == 8
-
-
-def test_bad_masks_are_named() -> None:
-    arrays, cameras = random_arrays(5), cameras_around(2)
-    with pytest.raises(UsageError, match="2 cameras and 1 masks"):
-        VacancyField(arrays, cameras, masks=[None])
-    with pytest.raises(UsageError, match="shape"):
-        VacancyField(arrays, cameras, masks=[None, np.ones((3, 4, 3), bool)])
-    with pytest.raises(UsageError, match="shape"):
-        VacancyField(arrays, cameras, masks=[None, PackedMask.of(np.ones((0, 4), bool))])
-    with pytest.raises(UsageError, match="mask mode"):
-        VacancyField(arrays, cameras, mask_mode="white")  # type: ignore[arg-type]
-
-
-LOGITS = [-30.0, -20.0, -5.0, -0.7, 0.0, 0.3, 2.0, 8.0, 15.0, 20.0, 30.0, 40.0]
-
-
-DISTANCES = [0.0, 1e-18, 1e-9, 1e-3, 0.5, 1.0, 1.3862943611198906, 4.0, 30.0, 120.0, 200.0]
 
 
 def relative(value: float, exact: mpmath.mpf) -> float:
@@ -474,8 +399,8 @@ def log_opacity(logit: float) -> np.float64:
     return np.float64(one.log_opacities().item())
 
 
-@pytest.mark.parametrize("logit", LOGITS)
-@pytest.mark.parametrize("q", DISTANCES)
+@pytest.mark.parametrize("logit", [-30.0, -0.7, 0.0, 8.0, 20.0, 40.0])
+@pytest.mark.parametrize("q", [0.0, 1e-18, 1e-3, 1.3862943611198906, 30.0, 200.0])
 def test_forms_keep_all_digits(logit: float, q: float) -> None:
     with mpmath.workdps(160):
         log_alpha = -mpmath.log(1 + mpmath.exp(-mpmath.mpf(logit)))

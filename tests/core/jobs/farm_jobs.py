@@ -66,6 +66,11 @@ def running(folder: JobFolder) -> Iterator[tuple[str, PartState]]:
             yield name, state
 
 
+def kind_of(name: str) -> str:
+    """Return the kind of a part."""
+    return name.partition("-")[0]
+
+
 def parent_of(pid: int) -> int:
     """Return the parent of a process; 0 if it has ended."""
     try:

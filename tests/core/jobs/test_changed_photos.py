@@ -99,16 +99,13 @@ def test_photos_that_are_the_same_say_nothing(
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
-def test_cameras_without_a_finished_training_are_not_taken(folder: JobFolder, job: JobFile) -> None:
-    os.utime(Path(job.source) / "a.jpg", (1, 1))
-    (trained,) = folder.stages.glob("train-*/done.json")
-    trained.unlink()
-    with pytest.raises(DatasetError, match="Loaded again"):
-        cameras_of(folder, replace(job, command="mesh"))
-
-
-def test_the_newest_training_counts(folder: JobFolder, job: JobFile) -> None:
+def test_the_newest_finished_training_counts(folder: JobFolder, job: JobFile) -> None:
     finish(folder, "cameras-other", 3.0)
     finish(folder, f"train-{training_keys('other', job)[0]}", 4.0)
     os.utime(Path(job.source) / "a.jpg", (1, 1))
-    assert cameras_of(folder, replace(job, command="mesh")).key == "other"
+    mesh = replace(job, command="mesh")
+    assert cameras_of(folder, mesh).key == "other"
+    for done in folder.stages.glob("train-*/done.json"):
+        done.unlink()
+    with pytest.raises(DatasetError, match="Loaded again"):
+        cameras_of(folder, mesh)

@@ -34,6 +34,7 @@ from gaussian_wrapping_addon.core.settings import (
 from gaussian_wrapping_addon.core.training import device_backend, estimate
 from gaussian_wrapping_addon.core.training import start as point_start
 from gaussian_wrapping_addon.core.training.splat_start import transform_gaussians
+from tests.core.jobs.transforms_file import write_transforms
 from tests.core.render.cuda.emulation import EmulatedKernels
 from tests.core.training.device_training import emulated_backend, perturbed_sphere
 from tests.core.training.small_scene import sphere_scene
@@ -108,27 +109,9 @@ def write_photos(folder: Path) -> Path:
     """Write the photos of a sphere of radius 1 with their cameras and sparse points."""
     scene, photos = sphere_scene(views=12, size_px=SIZE_PX)
     (folder / "images").mkdir(parents=True)
-    frames = []
     for camera, pixels in zip(scene.cameras, photos.photos, strict=True):
         Image.fromarray(pixels).save(folder / "images" / camera.name)
-        matrix = np.eye(4)
-        matrix[:3, :3] = camera.rotation.T @ np.diag([1.0, -1.0, -1.0])
-        matrix[:3, 3] = camera.center
-        frames.append(
-            {
-                "file_path": f"images/{camera.name}", "transform_matrix": matrix.tolist(),
-                "w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy,
-                "cx": camera.cx, "cy": camera.cy,
-            }
-        )  # fmt: skip
-    rows = [" ".join(map(repr, point)) for point in scene.points.tolist()]
-    properties = "".join(f"property double {axis}\n" for axis in "xyz")
-    (folder / "points.ply").write_text(
-        f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-        + "\n".join(rows) + "\n"
-    )  # fmt: skip
-    values = {"ply_file_path": "points.ply", "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(values))
+    write_transforms(folder, scene.cameras, scene.points)
     return folder
 
 

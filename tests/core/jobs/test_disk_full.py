@@ -4,10 +4,9 @@
 from __future__ import annotations
 
 import errno
-import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,12 +26,11 @@ from gaussian_wrapping_addon.core.texture.files import write_glb, write_textured
 from gaussian_wrapping_addon.core.texture.unwrap import charts
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
 from gaussian_wrapping_addon.core.training.state import load_checkpoint, save_checkpoint
+from tests.core.jobs.small_disk import mounted_disk
 from tests.core.texture.test_files import UTM, cube
 from tests.core.training.test_state import filled
 
 ROOT = Path(__file__).resolve().parents[3]
-DISK_BYTES = 512 * 1024
-
 WORKER = f"""
 import sys
 sys.path[:0] = [{str(ROOT)!r}]
@@ -55,28 +53,19 @@ sys.exit(worker.main(sys.argv[1:]))
 """
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    place = tmp_path / "disk"
-    place.mkdir()
-    mount = shutil.which("mount")
-    command = [mount or "", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", str(place)]
-    if mount is None or subprocess.run(command, check=False, capture_output=True).returncode:
-        pytest.skip("this user cannot mount a small disk (tmpfs)")
-    try:
-        yield place
-    finally:
-        subprocess.run(["umount", str(place)], check=True)
-
-
 def test_a_worker_on_a_full_disk_says_which_file_and_keeps_its_checkpoint(
-    small_disk: Path,
+    tmp_path: Path,
 ) -> None:
-    folder = JobFolder(small_disk)
+    with mounted_disk(tmp_path / "disk") as disk:
+        _fill_and_look(disk)
+
+
+def _fill_and_look(disk: Path) -> None:
+    folder = JobFolder(disk)
     folder.create()
     write_job(folder.job_path, JobFile("wrap", "/photos", JobSettings()))
     done = subprocess.run(
-        [sys.executable, "-c", WORKER, str(small_disk), "0"],
+        [sys.executable, "-c", WORKER, str(disk), "0"],
         cwd=ROOT, check=False, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == EXIT_RESOURCES, done.stderr
@@ -88,7 +77,7 @@ def test_a_worker_on_a_full_disk_says_which_file_and_keeps_its_checkpoint(
     kept = load_checkpoint(folder.stages / "train-a", "key")
     assert kept is not None
     assert kept.iteration == 1
-    assert not list(small_disk.rglob("*.writing.*"))
+    assert not list(disk.rglob("*.writing.*"))
     assert not folder.locked()
 
 

@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +18,15 @@ import trimesh
 from PIL import Image
 
 from gaussian_wrapping_addon.core.evaluation.report.figures import figure_rows
-from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.scene.camera import Similarity
 from tests.synthetic import BALL_RADIUS, BallScene, write_ball_scene
 
 BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"
 OFFSET, SCALE = (5e5, 4e6, 100.0), 20.0
-ITERATIONS = "500"
+Wrapped = tuple[BallScene, Path, str]
 
 
 def batch(*arguments: str, timeout_s: float = 240) -> subprocess.CompletedProcess[str]:
@@ -41,33 +40,26 @@ def write_box(
     path: Path, scene: BallScene, half: float, center: tuple[float, float, float]
 ) -> Path:
     """Write a region file: an axis-aligned box in world coordinates, given in ball units."""
-    corners = [[x, y, z] for x in (-half, half) for y in (-half, half) for z in (-half, half)]
-    vertices = scene.scale * (np.array(corners) + center) + scene.offset
-    path.write_text(
-        json.dumps(
-            {
-                "class_name": "GaussianWrappingBoundingVolume",
-                "version": 1,
-                "blender_object_name": path.stem,
-                "vertices": vertices.tolist(),
-                "hull_simplices": None,
-            }
-        )
-    )
+    low, high = (scene.scale * (np.array(center) + s) + scene.offset for s in (-half, half))
+    write_region(path, Region.box(path.stem, low, high))
     return path
 
 
+def wrap_words(root: Path, out: Path) -> list[str]:
+    return [
+        "wrap", str(root / "input"), "--out", str(out), "--preset", "draft", "--iterations", "500",
+        "--max-gaussians", "6000", "--region", str(root / "ball.json"), "--points", "4000",
+        "--texture-size", "512", "--export", "glb,obj,ply", "--no-blend",
+    ]  # fmt: skip
+
+
 @pytest.fixture(scope="module")
-def wrapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[BallScene, Path, str]:
+def wrapped(tmp_path_factory: pytest.TempPathFactory) -> Wrapped:
     """Train the ball scene once (far from the origin, scaled) and mesh a box around the ball."""
     root = tmp_path_factory.mktemp("ball")
     scene = write_ball_scene(root / "input", offset=OFFSET, scale=SCALE)
-    box = write_box(root / "ball.json", scene, 1.3, (0, 0, 0.35))
-    done = batch(
-        "wrap", str(root / "input"), "--out", str(root / "out"), "--preset", "draft",
-        "--iterations", ITERATIONS, "--max-gaussians", "6000", "--region", str(box),
-        "--points", "4000", "--texture-size", "512", "--export", "glb,obj,ply", "--no-blend",
-    )  # fmt: skip
+    write_box(root / "ball.json", scene, 1.3, (0, 0, 0.35))
+    done = batch(*wrap_words(root, root / "out"))
     assert done.returncode == 0, done.stdout + done.stderr
     return scene, root, done.stdout
 
@@ -81,7 +73,7 @@ def world_mesh(root: Path, region: str) -> trimesh.Trimesh:
     return trimesh.Trimesh(world, faces, process=False)
 
 
-def test_the_mesh_is_closed_and_lies_on_the_ball(wrapped: tuple[BallScene, Path, str]) -> None:
+def test_the_mesh_is_closed_and_lies_on_the_ball(wrapped: Wrapped) -> None:
     scene, root, _ = wrapped
     mesh = world_mesh(root, "ball")
     assert mesh.is_watertight
@@ -103,7 +95,7 @@ def test_the_mesh_is_closed_and_lies_on_the_ball(wrapped: tuple[BallScene, Path,
     assert np.percentile(gap / scene.scale, 95) < 0.08
 
 
-def test_result_files_are_there_and_agree(wrapped: tuple[BallScene, Path, str]) -> None:
+def test_result_files_are_there_and_agree(wrapped: Wrapped) -> None:
     _, root, output = wrapped
     result = root / "out" / "result"
     for name in ("gaussians.ply", "report.json", "report.md", "preview.png", "scene.json"):
@@ -128,35 +120,25 @@ def test_result_files_are_there_and_agree(wrapped: tuple[BallScene, Path, str]) 
     residuals = [provenance[f"level_error_{k}"] for k in ("median", "p95", "p99", "max")]
     assert residuals == sorted(residuals)
     ply = trimesh.load(result / "ball" / "mesh.ply", process=False)
-    assert np.abs(ply.vertices - world_mesh(root, "ball").vertices).max() < 1e-6 * SCALE
+    assert np.abs(ply.vertices - mesh.vertices).max() < 1e-6 * SCALE
     assert "PSNR" in output
     assert "warning (" in output or not report["warnings"]
-
-
-def test_every_picture_of_the_report_is_there(wrapped: tuple[BallScene, Path, str]) -> None:
-    _, root, _ = wrapped
-    result = root / "out" / "result"
     text = (result / "report.md").read_text(encoding="utf-8")
     links = re.findall(r"!\[[^\n]*?\]\(([^)\s]+)\)", text)
-    report = json.loads((result / "report.json").read_text())
-    pictures = report["training"]["pictures"]
-    comparisons = report["regions"]["ball"]["mesh_rendering"]["pictures"]
-    wanted = ["preview.png", "report/learning-curve.svg", "ball/preview.png"]
-    wanted += [f"report/{picture['file']}" for picture in pictures]
-    wanted += [f"ball/{name}" for name in comparisons]
+    pictures = [f"report/{picture['file']}" for picture in report["training"]["pictures"]]
+    comparisons = [f"ball/{name}" for name in figures["mesh_rendering"]["pictures"]]
     assert pictures
     assert comparisons
-    assert sorted(set(links)) == sorted(wanted)
+    wanted = ["preview.png", "report/learning-curve.svg", "ball/preview.png"]
+    assert sorted(set(links)) == sorted([*wanted, *pictures, *comparisons])
     for link in links:
         assert (result / link).stat().st_size > 0, link
     for picture in pictures:
-        with Image.open(result / "report" / picture["file"]) as image:
+        with Image.open(result / picture) as image:
             assert image.width <= 1500
 
 
-def test_another_region_and_resolution_needs_no_training(
-    wrapped: tuple[BallScene, Path, str],
-) -> None:
+def test_another_region_and_resolution_needs_no_training(wrapped: Wrapped) -> None:
     scene, root, _ = wrapped
     box = write_box(root / "cap.json", scene, 0.6, (0, 0, 1.0))
     before = {p: p.stat().st_mtime_ns for p in (root / "out" / "stages").glob("train-*/*")}
@@ -183,46 +165,7 @@ def test_another_region_and_resolution_needs_no_training(
     assert 0.02 < np.median(edges) < 0.08
 
 
-@pytest.mark.proof
-def test_each_region_of_one_job_has_its_own_edge_length(
-    wrapped: tuple[BallScene, Path, str],
-) -> None:
-    scene, root, _ = wrapped
-    fine, coarse = (
-        str(write_box(root / f"{name}.json", scene, 0.5, (0, 0, 1.0)))
-        for name in ("fine", "coarse")
-    )
-    earlier = read_job(root / "out" / "job.json")
-    settings = replace(
-        earlier.settings,
-        regions=(fine, coarse),
-        meshing=replace(earlier.settings.meshing, edge_length=0.12 * SCALE, points=0),
-        texture=replace(earlier.settings.texture, size_px=128),
-        export=("ply",),
-    )
-    job = make_job("mesh", Path(earlier.source), settings, {fine: 0.04 * SCALE})
-    status = JobClient.start(root / "out", job).wait(240)
-    assert status.state == "DONE", status.error
-    report = json.loads((root / "out" / "result" / "report.json").read_text())
-    reused = {s["name"]: s["reused"] for s in report["stages"]}
-    assert reused["train"]
-    medians = {}
-    for name, asked in (("fine", 0.04), ("coarse", 0.12)):
-        mesh = world_mesh(root, name)
-        assert mesh.is_watertight
-        medians[name] = float(np.median(mesh.edges_unique_length)) / scene.scale
-        assert 0.5 * asked < medians[name] < 2.0 * asked, name
-    assert medians["coarse"] > 1.8 * medians["fine"]
-    body = json.loads((root / "out" / "result" / "fine" / "region.json").read_text())
-    assert set(body) == {
-        "class_name", "version", "blender_object_name", "vertices", "hull_simplices",
-    }  # fmt: skip
-    assert body["version"] == 1
-
-
-def test_a_region_without_surface_leaves_the_finished_job_as_it_was(
-    wrapped: tuple[BallScene, Path, str],
-) -> None:
+def test_a_region_without_surface_leaves_the_finished_job_as_it_was(wrapped: Wrapped) -> None:
     scene, root, _ = wrapped
     folder = JobFolder(root / "out")
     box = write_box(root / "nothing.json", scene, 0.2, (0, 0, 3.0))
@@ -240,7 +183,7 @@ def test_a_region_without_surface_leaves_the_finished_job_as_it_was(
 
 
 @pytest.mark.proof
-def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str]) -> None:
+def test_a_mesh_of_pivots_open_at_its_region(wrapped: Wrapped) -> None:
     scene, root, _ = wrapped
     box = write_box(root / "open.json", scene, 0.6, (0, 0, 1.0))
     estimate = batch(
@@ -277,9 +220,7 @@ def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str
 
 
 @pytest.mark.proof
-def test_fewer_faces_get_a_normal_map_occlusion_and_levels(
-    wrapped: tuple[BallScene, Path, str],
-) -> None:
+def test_fewer_faces_get_a_normal_map_occlusion_and_levels(wrapped: Wrapped) -> None:
     scene, root, _ = wrapped
     box = write_box(root / "light.json", scene, 1.3, (0, 0, 0.35))
     done = batch(
@@ -322,21 +263,12 @@ def test_fewer_faces_get_a_normal_map_occlusion_and_levels(
 
 
 @pytest.mark.proof
-def test_a_region_is_estimated_and_meshed_in_tiles_by_two_processes(
-    wrapped: tuple[BallScene, Path, str],
-) -> None:
+def test_a_region_is_estimated_and_meshed_in_tiles_by_two_processes(wrapped: Wrapped) -> None:
     scene, root, _ = wrapped
     box = write_box(root / "tiled.json", scene, 1.3, (0, 0, 0.35))
     asked = (
-        "--out",
-        str(root / "out"),
-        "--region",
-        str(box),
-        "--points",
-        "3000",
-        "--set",
-        "tiles=3",
-    )
+        "--out", str(root / "out"), "--region", str(box), "--points", "3000", "--set", "tiles=3",
+    )  # fmt: skip
     estimate = batch("estimate-mesh", *asked)
     assert estimate.returncode == 0, estimate.stdout + estimate.stderr
     low, high = re.search(r"triangles: ([\d ]+) to ([\d ]+)\n", estimate.stdout).groups()
@@ -361,19 +293,12 @@ def test_a_region_is_estimated_and_meshed_in_tiles_by_two_processes(
 
 
 @pytest.mark.proof
-def test_a_killed_training_resumes_to_the_same_gaussians(
-    wrapped: tuple[BallScene, Path, str], tmp_path: Path
-) -> None:
+def test_a_killed_training_resumes_to_the_same_gaussians(wrapped: Wrapped, tmp_path: Path) -> None:
     _, root, _ = wrapped
-    arguments = [
-        "wrap", str(root / "input"), "--out", str(tmp_path / "out"), "--preset", "draft",
-        "--iterations", ITERATIONS, "--max-gaussians", "6000",
-        "--region", str(root / "ball.json"), "--points", "4000", "--texture-size", "512",
-        "--export", "glb,obj,ply", "--no-blend",
-    ]  # fmt: skip
     process = subprocess.Popen(
-        [sys.executable, str(BATCH), *arguments], stdout=subprocess.PIPE, text=True
-    )
+        [sys.executable, str(BATCH), *wrap_words(root, tmp_path / "out")],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
     folder = JobFolder(tmp_path / "out")
     deadline_s = time.monotonic() + 200
     while time.monotonic() < deadline_s:

@@ -68,6 +68,11 @@ def test_what_users_can_mend_is_said(error: Exception, code: int, words: str) ->
     assert words in told.error
     assert told.hint
     assert "bug" not in told.hint
+    # What it has caused is not told as something else.
+    other = ResourceError("No room is left.", "Make room there.")
+    other.__cause__ = error
+    is_full = isinstance(error, OSError) and error.errno == errno.ENOSPC
+    assert ("checkpoint is intact" in failure_of(other, ROOT).hint) == is_full
 
 
 @pytest.mark.parametrize(
@@ -84,11 +89,3 @@ def test_anything_else_asks_for_a_bug_report(error: Exception) -> None:
     assert (told.code, told.is_known) == (EXIT_OTHER, False)
     assert told.error.startswith(f"Unexpected {type(error).__name__}: ")
     assert "bug report" in told.hint
-
-
-def test_an_error_that_a_full_disk_caused_says_that_the_checkpoint_is_intact() -> None:
-    error = ResourceError("No room is left.", "Make room there.")
-    error.__cause__ = OSError(errno.ENOSPC, "full")
-    told = failure_of(error, ROOT)
-    assert told.code == EXIT_RESOURCES
-    assert "checkpoint is intact" in told.hint

@@ -15,17 +15,13 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from tests.core.jobs import farm_jobs
 from tests.core.jobs.block_jobs import row_job
-from tests.core.jobs.farm_jobs import kill, running, same_mesh, states
+from tests.core.jobs.farm_jobs import kill, kind_of, running, same_mesh, states
 from tests.core.training.test_trainer import assert_same
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="processes are killed by a signal"),
     pytest.mark.timeout(900),
 ]
-
-
-def kind_of(name: str) -> str:
-    return name.partition("-")[0]
 
 
 @pytest.fixture(scope="module")

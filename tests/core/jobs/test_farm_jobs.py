@@ -10,11 +10,19 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core.jobs.client import JobClient
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.settings import (
+    JobSettings,
+    MeshingSettings,
+    TextureSettings,
+    TrainingSettings,
+)
 from gaussian_wrapping_addon.core.worker.spawn import process_alive
 from tests.core.jobs import farm_jobs
 from tests.core.jobs.farm_jobs import (
     kill,
+    kind_of,
     parent_of,
     running,
     same_mesh,
@@ -23,6 +31,10 @@ from tests.core.jobs.farm_jobs import (
     wait,
     wait_until,
 )
+from tests.core.jobs.finished_sphere import write_cube
+from tests.core.jobs.small_disk import fill, mounted_disk
+from tests.synthetic import write_ball_scene
+from tools.version_comparison.contents import differences, read_contents
 
 pytest.importorskip("distributed", reason="Dask is not installed: set-up-worker --add farm")
 pytestmark = [
@@ -37,10 +49,6 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> JobFolder:
     folder, job = tiled_sphere(tmp_path_factory.mktemp("alone"))
     assert farm_jobs.run(folder, job).state == "DONE"
     return folder
-
-
-def kind_of(name: str) -> str:
-    return name.partition("-")[0]
 
 
 @pytest.mark.proof
@@ -148,3 +156,76 @@ def test_a_cancelled_job_leaves_nothing_running_and_resumes(
     wait_until(lambda: not list(running(folder)))
     assert wait(JobClient.resume(folder.root, python=sys.executable)).state == "DONE"
     assert same_mesh(folder, alone)
+
+
+@pytest.mark.proof
+@pytest.mark.parametrize("kind", ["points", "texture"])
+def test_a_shared_folder_without_room_ends_the_job_in_one_sentence(
+    kind: str, alone: JobFolder, tmp_path: Path
+) -> None:
+    with mounted_disk(tmp_path / "disk") as disk:
+        _fill_and_resume(kind, alone, disk)
+
+
+def _fill_and_resume(kind: str, alone: JobFolder, disk: Path) -> None:
+    folder, job = tiled_sphere(disk, computers="local", processes=2)
+    filler = disk / "filler"
+
+    def look() -> None:
+        if filler.exists() or any(name.startswith(kind) for name, _ in running(folder)):
+            fill(filler)  # again, as something may have been removed
+
+    status = farm_jobs.run(folder, job, look)
+    assert status.state == "FAILED", status
+    assert "No room" in status.error, status
+    assert "Make room on that disk" in status.hint, status
+    wait_until(lambda: not list(running(folder)))
+    assert not folder.locked()
+    assert not list(folder.root.rglob("*.writing.*"))
+    filler.unlink()
+    status = farm_jobs.run(folder, job)
+    assert status.state == "DONE", status
+    assert same_mesh(folder, alone)
+
+
+def small_wrap(root: Path, **changes: object) -> JobFile:
+    """Return the job that wraps a small scene with masks and in two tiles."""
+    photos = root / "photos"
+    if not photos.is_dir():
+        write_ball_scene(photos, photos=12, width=64, height=48)
+    settings = JobSettings(
+        training=TrainingSettings(
+            iterations=120, max_gaussians=1500, max_image_px=64
+        ),
+        meshing=MeshingSettings(points=300, tiles="2"), texture=TextureSettings(size_px=64),
+        regions=(str(write_cube(root / "ball.json", 1.3)),), make_masks="region",
+        export=("ply", "glb"), threads=1, **changes,
+    )  # fmt: skip
+    return make_job("wrap", photos, settings)
+
+
+@pytest.mark.proof
+def test_dask_workers_are_killed_in_the_parts_before_training(tmp_path: Path) -> None:
+    alone, farmed = JobFolder(tmp_path / "alone"), JobFolder(tmp_path / "farmed")
+    assert farm_jobs.run(alone, small_wrap(tmp_path)).state == "DONE"
+    killed: dict[str, tuple[int, int]] = {}
+
+    def look() -> None:
+        for name, state in running(farmed):
+            kind = kind_of(name)
+            if kind in ("cameras", "masks") and kind not in killed:
+                killed[kind] = (parent_of(state.pid), state.pid)
+                kill(parent_of(state.pid))
+
+    job = small_wrap(tmp_path, computers="local", processes=2)
+    status = farm_jobs.run(farmed, job, look)
+    assert status.state == "DONE", status
+    assert set(killed) == {"cameras", "masks"}
+    assert not any(process_alive(pid, 0) for pair in killed.values() for pid in pair)
+    assert not list(running(farmed))
+    made = read_contents(alone.result)
+    found = differences(made, read_contents(farmed.result))
+    # Only statistics of the mesh say how many processes there were.
+    statistics = ("report.json :", "report.md :", "ball/figures.json : provenance.")
+    assert [name for name, _ in found if not name.startswith(statistics)] == []
+    assert [name for name in made.items if name.endswith(".ply : content")]

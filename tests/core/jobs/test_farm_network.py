@@ -108,6 +108,14 @@ def descendants(pid: int) -> list[int]:
     return [d for child in children for d in [*descendants(child), child]]
 
 
+def older_package(root: Path) -> Path:
+    """Return a copy of the program that is another version."""
+    other = root / "older" / PACKAGE.name
+    shutil.copytree(PACKAGE, other, ignore=shutil.ignore_patterns("__pycache__"))
+    (other / "core" / "limits.py").open("a").write("\n# older\n")
+    return other
+
+
 @pytest.fixture
 def farm() -> Iterator[Farm]:
     made = Farm()
@@ -173,13 +181,12 @@ def test_a_scheduler_that_is_killed_ends_the_job_with_a_sentence_and_loses_nothi
 
 
 @pytest.mark.proof
-def test_a_worker_of_another_version_is_told(farm: Farm, tmp_path: Path) -> None:
-    other = tmp_path / "older" / PACKAGE.name
-    shutil.copytree(PACKAGE, other, ignore=shutil.ignore_patterns("__pycache__"))
-    (other / "core" / "limits.py").open("a").write("\n# older\n")
+def test_a_worker_of_another_version_is_told_and_beside_a_right_one_asked_once(
+    farm: Farm, alone: farm_jobs.JobFolder, tmp_path: Path
+) -> None:
     address = f"tcp://127.0.0.1:{free_port()}"
     farm.start("scheduler", address, says="listens at")
-    farm.start("worker", address, says="works for", package=other)
+    farm.start("worker", address, says="works for", package=older_package(tmp_path))
     folder, job = tiled_sphere(tmp_path / "job", 2, computers=address)
     status = farm_jobs.run(folder, job)
     assert status.state == "FAILED"
@@ -187,20 +194,8 @@ def test_a_worker_of_another_version_is_told(farm: Farm, tmp_path: Path) -> None
     assert "version" in status.error
     assert "Install the same version" in status.hint
     assert [state.state for state in states(folder).values()] == []
-
-
-@pytest.mark.proof
-def test_a_worker_of_another_version_beside_a_right_one_is_asked_once(
-    farm: Farm, alone: farm_jobs.JobFolder, tmp_path: Path
-) -> None:
-    other = tmp_path / "older" / PACKAGE.name
-    shutil.copytree(PACKAGE, other, ignore=shutil.ignore_patterns("__pycache__"))
-    (other / "core" / "limits.py").open("a").write("\n# older\n")
-    address = f"tcp://127.0.0.1:{free_port()}"
-    farm.start("scheduler", address, says="listens at")
-    farm.start("worker", address, says="works for", package=other)
     farm.start("worker", address, says="works for")
-    folder, job = tiled_sphere(tmp_path / "job", 2, computers=address)
+    folder, job = tiled_sphere(tmp_path / "second", 2, computers=address)
     status = farm_jobs.run(folder, job)
     assert status.state == "DONE", status
     assert same_mesh(folder, alone)
@@ -300,7 +295,6 @@ START = f"""
 import sys; sys.path[:0] = {sys.path!r}
 from pathlib import Path
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.store.job_file import write_job
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 root, job = map(Path, sys.argv[1:])
 JobClient.start(root, read_job(job), python=sys.executable)._process.wait()

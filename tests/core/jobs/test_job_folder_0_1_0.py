@@ -17,10 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.jobs.commands.export_files import result_of
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import read_done
 
 ROOT = Path(__file__).resolve().parents[3]
 STORED = ROOT / "tests" / "data" / "job-0.1.0"
@@ -66,19 +64,11 @@ def reused(job: JobFolder) -> dict[str, bool]:
     return {stage["name"]: stage["reused"] for stage in report(job)["stages"]}
 
 
-def test_it_is_read(job: JobFolder) -> None:
-    assert job.is_job()
-    assert job.read_status().state == "DONE"
+def test_it_is_read_and_its_files_are_exported(job: JobFolder, tmp_path: Path) -> None:
+    assert (job.is_job(), job.read_status().state) == (True, "DONE")
     described = read_job(job.job_path)
     assert (described.command, described.source) == ("wrap", "photos")
-    assert described.settings.training.iterations == ITERATIONS
     assert described.settings.meshing.points == 110
-    assert result_of(job.root) == job.result.resolve()
-    assert all(read_done(path) for path in job.stages.iterdir())
-    assert report(job)["regions"]["ball"]["statistics"]["closed"] is True
-
-
-def test_its_files_are_exported(job: JobFolder, tmp_path: Path) -> None:
     batch(job, "export", "job", "--out", str(tmp_path / "files"), "--format", "glb,splat")
     with np.load(job.result / "ball" / "mesh.npz", allow_pickle=False) as arrays:
         faces = len(arrays["faces"])

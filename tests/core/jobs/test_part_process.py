@@ -9,7 +9,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -28,7 +27,7 @@ from gaussian_wrapping_addon.core.jobs.parts.graph import (
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.worker.helper_process import child_command
 from tests.core.jobs import farm_jobs
-from tests.core.jobs.farm_jobs import mesh_in, same_mesh, states, tiled_sphere
+from tests.core.jobs.farm_jobs import mesh_in, same_mesh, states, tiled_sphere, wait_until
 from tests.core.jobs.small_disk import fill, mounted_disk
 
 
@@ -51,18 +50,35 @@ def run(folder: JobFolder, part: str, **changes: object) -> tuple[int, str]:
     return process.returncode, out
 
 
-@pytest.fixture
-def planned(tmp_path: Path) -> JobFolder:
+def plan_in(root: Path) -> JobFolder:
     """Return a job of two tiles whose parts are planned and not run."""
-    folder, job = tiled_sphere(tmp_path, 2)
+    folder, job = tiled_sphere(root, 2)
     prepare_job(folder.root, job)
     plan_if_missing(folder)
     return folder
 
 
+@pytest.fixture
+def planned(tmp_path: Path) -> JobFolder:
+    return plan_in(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> JobFolder:
+    """Run the job in one process."""
+    folder, job = tiled_sphere(tmp_path_factory.mktemp("whole"), 2)
+    assert farm_jobs.run(folder, job).state == "DONE"
+    return folder
+
+
+def wait_until_begun(folder: JobFolder, part: str) -> None:
+    """Wait until a part has a state, which is written as soon as it can be told to end."""
+    wait_until(lambda: read_state(folder.root, part) is not None, 60.0)
+
+
 @pytest.mark.proof
 @pytest.mark.timeout(900)
-def test_a_job_made_part_by_part_is_the_job(planned: JobFolder, tmp_path: Path) -> None:
+def test_a_job_made_part_by_part_is_the_job(planned: JobFolder, whole: JobFolder) -> None:
     names = [part.name for part in read_parts(planned.root).parts]
     assert len([name for name in names if name.startswith("faces")]) == 2
     assert run(planned, names[-1])[0] == 2, "what it needs is not done"
@@ -71,30 +87,23 @@ def test_a_job_made_part_by_part_is_the_job(planned: JobFolder, tmp_path: Path) 
         assert code == 0, said
         assert f"part {name} is done" in said
     assert planned.read_status().state == "DONE"
-    (tmp_path / "whole").mkdir()
-    whole, job = tiled_sphere(tmp_path / "whole", 2)
-    assert farm_jobs.run(whole, job).state == "DONE"
     assert same_mesh(planned, whole)
     assert run(planned, "plan-ball") == (0, '{"line": "part plan-ball was done before"}\n')
 
 
 @pytest.mark.proof
 @pytest.mark.timeout(900)
-def test_a_list_that_cannot_grow_makes_its_tiles_in_one_part(tmp_path: Path) -> None:
-    folder, job = tiled_sphere(tmp_path, 2)
-    prepare_job(folder.root, job)
-    plan_if_missing(folder)
-    graph = read_parts(folder.root)
+def test_a_list_that_cannot_grow_makes_its_tiles_in_one_part(
+    planned: JobFolder, whole: JobFolder
+) -> None:
+    graph = read_parts(planned.root)
     kept = [p for p in graph.parts if p.kind not in ("points", "gather", "faces")]
     kept = [dataclasses.replace(p, needs=("plan-ball",)) if p.kind == "mesh" else p for p in kept]
-    write_parts(folder.root, dataclasses.replace(graph, parts=tuple(kept)))
+    write_parts(planned.root, dataclasses.replace(graph, parts=tuple(kept)))
     for part in kept:
-        assert run(folder, part.name)[0] == 0
-    (tmp_path / "whole").mkdir()
-    whole, job = tiled_sphere(tmp_path / "whole", 2)
-    assert farm_jobs.run(whole, job).state == "DONE"
-    assert same_mesh(folder, whole)
-    assert len(mesh_in(folder)[1]) > 100
+        assert run(planned, part.name)[0] == 0
+    assert same_mesh(planned, whole)
+    assert len(mesh_in(planned)[1]) > 100
 
 
 def test_exit_codes_say_what_a_farm_may_do(planned: JobFolder) -> None:
@@ -128,10 +137,7 @@ def test_a_part_that_is_told_to_end_says_that_it_may_work_elsewhere(planned: Job
     for name in ("cameras", "train"):
         assert run(planned, name)[0] == 0
     process = start(planned, "plan-ball")
-    end_s = time.monotonic() + 60.0
-    while read_state(planned.root, "plan-ball") is None:  # written as soon as it can be told
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
+    wait_until_begun(planned, "plan-ball")
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=60)
     state = read_state(planned.root, "plan-ball")
@@ -145,9 +151,7 @@ def test_a_part_that_is_told_to_end_says_that_it_may_work_elsewhere(planned: Job
 @pytest.mark.skipif(sys.platform == "win32", reason="no small disk is mounted there")
 def test_a_part_on_a_full_disk_says_so_and_that_it_may_work_later(tmp_path: Path) -> None:
     with mounted_disk(tmp_path / "disk") as disk:
-        folder, job = tiled_sphere(disk, 2)
-        prepare_job(folder.root, job)
-        plan_if_missing(folder)
+        folder = plan_in(disk)
         assert run(folder, "cameras")[0] == 0
         fill(disk / "filler")
         code, said = run(folder, "train")  # not even its state can be written
@@ -156,10 +160,7 @@ def test_a_part_on_a_full_disk_says_so_and_that_it_may_work_later(tmp_path: Path
         (disk / "filler").unlink()
         assert run(folder, "train")[0] == 0
         process = start(folder, "plan-ball")
-        end_s = time.monotonic() + 60.0
-        while read_state(folder.root, "plan-ball") is None:
-            assert time.monotonic() < end_s
-            time.sleep(0.01)
+        wait_until_begun(folder, "plan-ball")
         while process.poll() is None:
             fill(disk / "filler")
         said, errors = process.communicate()

@@ -128,27 +128,6 @@ def test_jobs_run_side_by_side_though_two_workers_are_killed(tmp_path: Path) -> 
     assert not list((tmp_path / "jobs").rglob("lock*.json"))
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["queue", "none", "--out", "o"], "is not a folder"),
-        (["queue", "empty", "--out", "o"], "holds 0 folders"),
-        (["queue", "sets", "--out", "sets/o"], "lies inside"),
-        (["queue", "sets", "--out", "o"], "can be wrapped"),
-    ],
-)
-def test_folders_that_hold_no_photos_are_refused(
-    words: list[str], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "sets" / "a").mkdir(parents=True)
-    assert batch.main(words) == EXIT_USAGE
-    assert says in capsys.readouterr().out
-    assert not (tmp_path / "o").exists()
-
-
 ELSEWHERE = {"pid": 1, "started": 1, "place": "attic boot pid:[1]"}
 """Lock of a process on another computer."""
 
@@ -202,14 +181,26 @@ def test_a_worker_of_another_version_runs_no_job(tmp_path: Path) -> None:
     assert JobFolder(tmp_path / "jobs" / name).read_status().state == "NEW"
 
 
-def test_a_second_queue_is_told_and_jobs_run_their_parts_themselves(
+def test_what_is_no_queue_and_a_second_one_is_told_and_jobs_run_their_parts_themselves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked: list[dict[str, object]] = []
     monkeypatch.setattr(run_in_worker, "run_in_worker", lambda r, **_: asked.append(r) or 0)
     monkeypatch.setattr(client, "worker_python", lambda *_: sys.executable)
-    write_ball_scene(tmp_path / "sets" / "ball", photos=4, width=32, height=24)
     out = tmp_path / "jobs"
+    (tmp_path / "sets" / "a").mkdir(parents=True)
+    for sets, place, says in (
+        ("none", "jobs", "is not a folder"),
+        ("sets/a", "jobs", "holds 0 folders"),
+        ("sets", "sets/jobs", "lies inside"),
+        ("sets", "jobs", "can be wrapped"),
+    ):
+        words = ["queue", str(tmp_path / sets), "--out", str(tmp_path / place)]
+        assert batch.main(words) == EXIT_USAGE
+        assert says in capsys.readouterr().out
+        assert not (tmp_path / place).exists()
+    (tmp_path / "sets" / "a").rmdir()
+    write_ball_scene(tmp_path / "sets" / "ball", photos=4, width=32, height=24)
     words = ["queue", str(tmp_path / "sets"), "--out", str(out), "--computers", "local"]
     assert batch.main(words) == EXIT_DONE
     assert (asked[0]["jobs"], asked[0]["computers"]) == (["ball"], "local")

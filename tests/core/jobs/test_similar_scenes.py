@@ -18,6 +18,8 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.loading.load import load_scene
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.scene.camera import Similarity
 from gaussian_wrapping_addon.core.scene.frames import CENTER_STEP, POINT_STEP
 from gaussian_wrapping_addon.core.scene.scene import Scene
@@ -27,6 +29,7 @@ from gaussian_wrapping_addon.core.settings import (
     TextureSettings,
     TrainingSettings,
 )
+from tests.core.jobs.transforms_file import write_transforms
 from tests.synthetic import BallScene, write_ball_scene
 
 SIMILARITIES = {
@@ -38,37 +41,6 @@ SIMILARITIES = {
 }
 SHARE = 1e-4
 """Largest distance of two meshes as a share of their size."""
-
-
-def write_transforms(scene: BallScene) -> Path:
-    """Write the cameras as transforms.json and the points as an ASCII PLY of doubles."""
-    frames = []
-    for camera in scene.cameras:
-        matrix = np.eye(4)
-        matrix[:3, :3] = camera.rotation.T @ np.diag([1.0, -1.0, -1.0])
-        matrix[:3, 3] = camera.center
-        frames.append(
-            {"file_path": f"images/{camera.name}", "transform_matrix": matrix.tolist()}
-        )  # fmt: skip
-    first = scene.cameras[0]
-    rows = [
-        " ".join(line.split()[1:4])
-        for line in (scene.folder / "sparse" / "0" / "points3D.txt").read_text().splitlines()
-    ]
-    (scene.folder / "points.ply").write_text(
-        f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\nproperty double x\n"
-        "property double y\nproperty double z\nend_header\n" + "\n".join(rows) + "\n"
-    )
-    path = scene.folder / "transforms.json"
-    path.write_text(
-        json.dumps(
-            {
-                "w": first.width, "h": first.height, "fl_x": first.fx, "fl_y": first.fy,
-                "cx": first.cx, "cy": first.cy, "ply_file_path": "points.ply", "frames": frames,
-            }
-        )
-    )  # fmt: skip
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +55,10 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, BallScene]:
     }
 
 
+def points_of(scene: BallScene) -> np.ndarray:
+    return np.loadtxt(scene.folder / "sparse" / "0" / "points3D.txt", usecols=(1, 2, 3))
+
+
 def loaded(source: Path, work: Path) -> Scene:
     return load_scene(source, work, Progress(), seed=0, threads=1)
 
@@ -93,7 +69,10 @@ def test_scenes_are_loaded_with_the_same_bits(
 ) -> None:
     scenes = {
         name: loaded(
-            scene.folder if kind == "COLMAP text" else write_transforms(scene), tmp_path / name
+            scene.folder
+            if kind == "COLMAP text"
+            else write_transforms(scene.folder, scene.cameras, points_of(scene)),
+            tmp_path / name,
         )
         for name, scene in inputs.items()
     }
@@ -117,17 +96,8 @@ def meshed(inputs: dict[str, BallScene]) -> dict[str, Path]:
     results = {}
     for name, scene in inputs.items():
         box = scene.folder.parent / "ball.json"
-        corners = [[x, y, z] for x in (-1.3, 1.3) for y in (-1.3, 1.3) for z in (-0.95, 1.65)]
-        vertices = scene.scale * np.array(corners) + scene.offset
-        box.write_text(
-            json.dumps(
-                {
-                    "class_name": "GaussianWrappingBoundingVolume", "version": 1,
-                    "blender_object_name": "ball", "vertices": vertices.tolist(),
-                    "hull_simplices": None,
-                }
-            )
-        )  # fmt: skip
+        low, high = np.array([[-1.3, -1.3, -0.95], [1.3, 1.3, 1.65]]) * scene.scale + scene.offset
+        write_region(box, Region.box("ball", low, high))
         settings = JobSettings(
             regions=(str(box),),
             training=TrainingSettings(iterations=80, max_gaussians=2500),

@@ -24,7 +24,6 @@ from gaussian_wrapping_addon.core.worker import worker_main
 from gaussian_wrapping_addon.core.worker.spawn import process_start_ticks
 
 posix = pytest.mark.skipif(os.name == "nt", reason="the interpreters are scripts")
-
 WITHOUT = """#!{python}
 import runpy, sys
 for name in {missing!r}:
@@ -62,8 +61,13 @@ def estimate(folder: Path, python: str) -> int:
 
 
 @posix
-@pytest.mark.parametrize("missing", ["numpy", "PIL"])  # at the import of the worker, and later
-def test_a_job_names_the_package_that_is_missing(tmp_path: Path, missing: str) -> None:
+@pytest.mark.parametrize(
+    ("missing", "of_command"),
+    [("numpy", "numpy"), ("PIL", "numba")],  # at the import of the worker, and later
+)
+def test_a_job_names_the_package_that_is_missing(
+    tmp_path: Path, missing: str, of_command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     status = wrap(tmp_path, without(tmp_path, missing))
     assert (status.state, status.exit_code) == ("FAILED", EXIT_OTHER)
     assert "The worker's Python, " in status.error
@@ -71,6 +75,12 @@ def test_a_job_names_the_package_that_is_missing(tmp_path: Path, missing: str) -
     assert missing in status.error
     assert "Set Up Worker" in status.hint
     assert "bug" not in status.hint
+    told: list[str] = []
+    monkeypatch.setattr(calls._logger, "error", lambda text, *values: told.append(text % values))
+    assert estimate(tmp_path, without(tmp_path, of_command)) == EXIT_OTHER
+    (said,) = told
+    assert "lacks a package" in said
+    assert of_command in said
 
 
 @posix
@@ -78,21 +88,6 @@ def test_a_missing_module_of_our_own_is_no_missing_package(tmp_path: Path) -> No
     status = wrap(tmp_path, without(tmp_path, "gaussian_wrapping_addon.core.jobs.runner"))
     assert status.error.startswith("Unexpected ModuleNotFoundError")
     assert "bug report" in status.hint
-
-
-@posix
-@pytest.mark.parametrize("missing", ["numpy", "numba"])
-def test_a_command_names_the_package_that_is_missing(
-    tmp_path: Path,
-    missing: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    told: list[str] = []
-    monkeypatch.setattr(calls._logger, "error", lambda text, *values: told.append(text % values))
-    assert estimate(tmp_path, without(tmp_path, missing)) == EXIT_OTHER
-    (said,) = told
-    assert "lacks a package" in said
-    assert missing in said
 
 
 @posix

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,7 @@ from PIL import Image
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.files import resolve_inside
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
-from gaussian_wrapping_addon.core.loading.check import Finding, check_input
+from gaussian_wrapping_addon.core.loading.check import check_input
 from gaussian_wrapping_addon.core.loading.load import load_scene
 from gaussian_wrapping_addon.core.photos.finder import find_mask, resolve_photo
 from gaussian_wrapping_addon.core.progress import Progress
@@ -32,20 +34,15 @@ from tests.core.readers.model_writers import (
 )
 
 
-def turned_photo(source: Path) -> None:
-    write_project(source)
-    Image.new("RGB", (HEIGHT, WIDTH)).save(source / "images" / "p03.png")
+def photos_of(width: int, height: int, count: int) -> Callable[[Path], None]:
+    """Return a writer of a set in which the first photos have another size."""
 
+    def make(source: Path) -> None:
+        write_project(source)
+        for path in sorted((source / "images").iterdir())[:count]:
+            Image.new("RGB", (width, height)).save(path)
 
-def cut_photo(source: Path) -> None:
-    write_project(source)
-    Image.new("RGB", (WIDTH, WIDTH)).save(source / "images" / "p03.png")
-
-
-def icons(source: Path) -> None:
-    write_project(source)
-    for path in (source / "images").iterdir():
-        Image.new("RGB", (8, 6)).save(path)
+    return make
 
 
 def far_points(source: Path) -> None:
@@ -58,9 +55,9 @@ def far_points(source: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (turned_photo, "rotated by 90 degrees"),
-        (cut_photo, "its camera 64 x 48"),
-        (icons, "of 5 photos cannot be read"),
+        (photos_of(HEIGHT, WIDTH, 1), r"p00.png .*rotated by 90 degrees"),
+        (photos_of(WIDTH, WIDTH, 1), r"p00.png .*its camera 64 x 48"),
+        (photos_of(8, 6, 5), "of 5 photos cannot be read"),
         (far_points, "from nearly one place"),
     ],
 )
@@ -72,7 +69,7 @@ def test_the_check_refuses_what_loading_refuses(
     with pytest.raises(DatasetError, match=words):
         load_scene(source, tmp_path / "work", Progress(), threads=1)
     (error,) = [found for found in check_input(source) if found.severity == "error"]
-    assert words in error.message
+    assert re.search(words, error.message)
     assert error.hint
 
 
@@ -95,17 +92,8 @@ def test_paths_that_are_too_long_are_told_shortly_and_with_a_next_step(path: str
     assert finding.hint == "Use shorter names."
 
 
-needs_links = pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
-
-
 LONG = f"{'x' * 300}.png"
-
-
 """Longer than any file system stores."""
-
-
-def errors(findings: list[Finding]) -> list[str]:
-    return [finding.message for finding in findings if finding.severity == "error"]
 
 
 def make_circle(path: Path) -> None:
@@ -116,37 +104,35 @@ def make_circle(path: Path) -> None:
     other.symlink_to(path)
 
 
-def write_transforms(root: Path, extra: str) -> None:
+def write_transforms(root: Path, names: list[str]) -> None:
+    """Write cameras on a ring for photos of these names."""
     frames = []
-    for number, pose in enumerate(ring_poses(6)):
-        matrix = np.eye(4)
-        matrix[:3] = pose
-        world = np.linalg.inv(matrix) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        name = extra if number == 5 else f"images/{number}.png"
+    for name, pose in zip(names, ring_poses(len(names)), strict=True):
+        world = np.linalg.inv(np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])) @ np.diag([1, -1, -1, 1])
         frames.append({"file_path": name, "transform_matrix": world.tolist()})
-        if number < 5:
-            (root / "images").mkdir(parents=True, exist_ok=True)
-            pixels = np.random.default_rng(number).integers(0, 255, (48, 64, 3))
-            Image.fromarray(pixels.astype(np.uint8)).save(root / name)
     values = {"fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
     (root / "transforms.json").write_text(json.dumps({**values, "frames": frames}))
 
 
-@needs_links
+def write_set(root: Path, kind: str, last: str) -> None:
+    """Write five photos, and a camera more, whose photo has a name that cannot be used."""
+    model, rest = ring_model(6), ring_model(6)
+    rest.images.pop()
+    write_photos(rest, root / "images")
+    model.images[-1].name = last
+    if kind == "transforms":
+        names = [f"images/{image.name}" for image in rest.images]
+        write_transforms(root, [*names, last if len(last) > 60 else f"images/{last}"])
+    elif kind != "photos":
+        (write_text if kind == "text" else write_binary)(model, root / "sparse" / "0")
+
+
 @pytest.mark.parametrize("kind", ["photos", "transforms", "colmap"])
 def test_links_in_a_circle_among_photos_are_left_out(tmp_path: Path, kind: str) -> None:
-    model = ring_model(6)
     make_circle(tmp_path / "images" / "p05.png")
-    if kind == "transforms":
-        write_transforms(tmp_path, "images/p05.png")
-    else:
-        rest = ring_model(6)
-        rest.images.pop()
-        write_photos(rest, tmp_path / "images")
-    if kind == "colmap":
-        write_binary(model, tmp_path / "sparse" / "0")
+    write_set(tmp_path, kind, "p05.png")
     findings = check_input(tmp_path)
-    assert errors(findings) == []
+    assert not [found for found in findings if found.severity == "error"]
     assert any("p05.png" in finding.message for finding in findings)
     assert not any("p05" in name for name, _, _ in source_fingerprint(tmp_path))
     assert resolve_inside(tmp_path, "images/p05.png") in (None, tmp_path / "images" / "p05.png")
@@ -155,18 +141,9 @@ def test_links_in_a_circle_among_photos_are_left_out(tmp_path: Path, kind: str) 
 @pytest.mark.parametrize("kind", ["transforms", "binary", "text"])
 @pytest.mark.parametrize("name", [LONG, f"{'x' * 2000}.png", f"{'y/' * 400}{'x' * 300}.png"])
 def test_an_over_long_name_is_left_out_and_named(tmp_path: Path, kind: str, name: str) -> None:
-    model = ring_model(6)
-    if kind == "transforms":
-        write_transforms(tmp_path, name)
-    else:
-        rest = ring_model(6)
-        rest.images.pop()
-        write_photos(rest, tmp_path / "images")
-        model.images[-1].name = name
-        write = write_binary if kind == "binary" else write_text
-        write(model, tmp_path / "sparse" / "0")
+    write_set(tmp_path, kind, name)
     findings = check_input(tmp_path)
-    assert errors(findings) == []
+    assert not [found for found in findings if found.severity == "error"]
     assert any(name[:60] in finding.message for finding in findings)
     assert len(load_scene(tmp_path, tmp_path / "work", Progress()).views) == 5
 
@@ -183,27 +160,16 @@ def test_a_name_that_only_its_mask_makes_too_long_has_no_mask(tmp_path: Path) ->
 
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
-
-
 COUNT = 6
-
-
-def colmap(root: Path) -> None:
-    write_project(root, COUNT)
 
 
 def transforms(root: Path) -> None:
     model = write_project(root, COUNT)
     shutil.rmtree(root / "sparse")
-    frames = []
-    for image, pose in zip(model.images, ring_poses(COUNT), strict=True):
-        world = np.linalg.inv(np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])) @ np.diag([1, -1, -1, 1])
-        frames.append({"file_path": f"images/{image.name}", "transform_matrix": world.tolist()})
-    size = {"w": 64, "h": 48, "fl_x": 60.0, "fl_y": 60.0}
-    (root / "transforms.json").write_text(json.dumps({**size, "frames": frames}))
+    write_transforms(root, [f"images/{image.name}" for image in model.images])
 
 
-@pytest.mark.parametrize("write", [colmap, transforms])
+@pytest.mark.parametrize("write", [partial(write_project, count=COUNT), transforms])
 @pytest.mark.parametrize("names", ["flat", "below"])
 def test_a_linked_folder_of_photos_is_taken(
     tmp_path: Path, write: Callable[[Path], None], names: str
@@ -220,9 +186,7 @@ def test_a_linked_folder_of_photos_is_taken(
             (root / "images" / f"p{number:02d}.png").rename(root / "images" / side / f"{name}.png")
     (root / "images").rename(elsewhere)
     (root / "images").symlink_to(elsewhere)
-    findings = check_input(root)
-    assert [finding for finding in findings if finding.severity == "error"] == []
-    (tmp_path / "work").mkdir()
+    assert not [found for found in check_input(root) if found.severity == "error"]
     scene = load_scene(root, tmp_path / "work", Progress(), seed=0, threads=1)
     assert len(scene.views) == COUNT
 

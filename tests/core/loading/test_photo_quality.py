@@ -123,16 +123,13 @@ def test_the_same_again_is_named(tmp_path: Path) -> None:
     photos = walk()
     noise = np.random.default_rng(0).normal(0, 2, photos[0].shape)
     photos += [photos[2], 0.8 * photos[4] + noise, view(COUNT)]
-    folder = save(tmp_path / "set", photos)
-    (finding,) = found(folder, "the same as another")
+    (finding,) = found(save(tmp_path / "set", photos), "the same as another")
     assert finding.message == (
         "2 photos are the same as another one: p12.jpg (as p02.jpg), p13.jpg (as p04.jpg)."
     )
-
-
-def test_a_step_of_half_a_percent_is_another_photo(tmp_path: Path) -> None:
+    # A step of half a percent is another photo.
     photos = [wall()[:, 4 * k : 4 * k + 640] for k in range(COUNT)]
-    assert found(save(tmp_path / "set", photos), "the same") == []
+    assert found(save(tmp_path / "steps", photos), "the same") == []
 
 
 @pytest.mark.parametrize("orientation", [1, 6])
@@ -160,29 +157,6 @@ def test_photos_are_compared_with_those_beside() -> None:
     assert np.isfinite(around).all()
 
 
-def test_a_look_can_be_cancelled(tmp_path: Path) -> None:
-    folder = save(tmp_path / "set", walk())
-    with pytest.raises(Cancelled):
-        photo_findings(folder, Progress(is_cancelled=lambda: True), threads=1)
-
-
-def test_the_worker_writes_findings_and_errors(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    photos = walk()
-    photos[3] = gaussian_filter(photos[3], 3)
-    request = {"source": str(save(tmp_path / "set", photos)), "threads": 1}
-    assert photo_check_command.main([json.dumps(request)]) == EXIT_DONE
-    said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    told = [values["finding"] for values in said if "finding" in values]
-    assert [f["severity"] for f in told] == ["warning", "fact"]
-    assert "p03.jpg" in told[0]["message"]
-    assert any(values.get("line", "").startswith("warning: 1 photo is much") for values in said)
-    request["source"] = str(tmp_path / "none")
-    assert photo_check_command.main([json.dumps(request)]) == EXIT_BAD_DATA
-    assert "does not exist" in capsys.readouterr().out
-
-
 def test_inputs_without_photos_are_not_looked_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -198,13 +172,25 @@ def test_inputs_without_photos_are_not_looked_at(
     assert "All photos were looked at" not in said
 
 
-def test_the_command_line_says_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_worker_and_the_command_line_say_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     photos = walk()
     photos[3] = gaussian_filter(photos[3], 3)
     folder = save(tmp_path / "set", photos)
+    request = {"source": str(folder), "threads": 1}
+    assert photo_check_command.main([json.dumps(request)]) == EXIT_DONE
+    said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    told = [values["finding"] for values in said if "finding" in values]
+    assert [f["severity"] for f in told] == ["warning", "fact"]
+    line = "warning: 1 photo is much less sharp than the photos beside: p03.jpg."
+    assert any(values.get("line", "").startswith(line) for values in said)
+    request["source"] = str(tmp_path / "none")
+    assert photo_check_command.main([json.dumps(request)]) == EXIT_BAD_DATA
+    assert "does not exist" in capsys.readouterr().out
     assert batch.main(["check", str(folder), "--threads", "1"]) == EXIT_DONE
-    assert "warning: 1 photo is much less sharp than the photos beside: p03.jpg." in (
-        capsys.readouterr().out
-    )
+    assert line in capsys.readouterr().out
     assert batch.main(["check", str(folder), "--quick"]) == EXIT_DONE
     assert "less sharp" not in capsys.readouterr().out
+    with pytest.raises(Cancelled):
+        photo_findings(folder, Progress(is_cancelled=lambda: True), threads=1)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError, WorkerError
+from gaussian_wrapping_addon.core.errors import DatasetError, UsageError, WorkerError
 from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.jobs.commands.export_files import frames_of
 from gaussian_wrapping_addon.core.jobs.stages.cameras import write_scene_summary
@@ -38,17 +38,9 @@ from gaussian_wrapping_addon.core.worker import environment
 from tests.poses import look_at_pose
 
 PLACE = GeoPoint(47.2, 8.6, 430.0)
-
-
 UNIT_M = 7.0
-
-
 """Metres of a unit of the cameras' frame."""
-
-
 WIDTH, HEIGHT = 64, 48
-
-
 LOCAL_ORIGIN = np.array([1000.0, 2000.0, 50.0])
 
 
@@ -177,24 +169,6 @@ def test_bad_gps_is_refused_or_noted(tmp_path: Path) -> None:
         loaded(bare, georeference="on")
 
 
-def test_photos_without_gps_are_refused_before_cameras_are_solved(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def never(*_: object, **__: object) -> None:
-        raise AssertionError("cameras are solved")
-
-    monkeypatch.setattr(load, "solve_poses", never)
-    folder = write_set(tmp_path / "set", gps=False)
-    (folder / "transforms.json").unlink()
-    words = "GPS does not place the scene: 0 of 12 photos have a GPS position; 5 are needed"
-    with pytest.raises(DatasetError, match=words) as refused:
-        loaded(folder, georeference="on")
-    assert "leave --set georeference out" in refused.value.hint
-    UnitsRequest("on", control_points="x").check_gps([])  # control points place it
-    with pytest.raises(AssertionError, match="cameras are solved"):
-        loaded(folder)
-
-
 @pytest.mark.parametrize("format", ["ply", "glb", "obj"])
 def test_the_sidecar_leads_from_the_mesh_to_the_gps_positions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str
@@ -257,10 +231,8 @@ def test_far_coordinates_are_placed_near_the_origin() -> None:
     record = {"metric_from_world": Similarity().to_json(), "applied": True, "z_up": True}
     far = Similarity(2.0, np.eye(3), np.array([512345.6, 5200000.4, 300.2]))
     start = blender_start(record, far)
-    assert start is not None
     np.testing.assert_allclose(start.translation, [-0.4, 0.4, 0.2], atol=1e-6)
     level = blender_start({**record, "z_up": False}, far)
-    assert level is not None
     assert (level.scale, *level.translation) == (2.0, 0.0, 0.0, 0.0)
     skewed = {**Similarity().to_json(), "rotation": [[1, 0, 0], [0, 1, 0], [0, 0.1, 1]]}
     mirrored = {**Similarity().to_json(), "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}
@@ -270,8 +242,8 @@ def test_far_coordinates_are_placed_near_the_origin() -> None:
         assert blender_start(broken, far) is None
 
 
-def control_text(count: int, *, wrong: int = -1) -> tuple[str, np.ndarray]:
-    """Return a file of local control points with exact pixels, and their places."""
+def control_text(count: int, *, wrong: int = -1) -> str:
+    """Return a file of local control points with exact pixels."""
     marks = np.random.default_rng(2).uniform(-6, 6, (count, 3)) + np.array([0, 0, 2.0])  # ENU
     local = marks + LOCAL_ORIGIN
     lines = ["LOCAL"]
@@ -282,14 +254,13 @@ def control_text(count: int, *, wrong: int = -1) -> tuple[str, np.ndarray]:
             x, y = pixel[0]
             if 0 < x < WIDTH and 0 < y < HEIGHT:
                 lines.append(f"{place[0]} {place[1]} {place[2]} {x} {y} {camera.name} mark{i}")
-    return "\n".join(lines) + "\n", local
+    return "\n".join(lines) + "\n"
 
 
 def test_control_points_give_their_frame(tmp_path: Path) -> None:
     folder = write_set(tmp_path / "set", gps=False)
     path = tmp_path / "gcp.txt"
-    text, _ = control_text(6, wrong=2)
-    path.write_text(text)
+    path.write_text(control_text(6, wrong=2))
     scene = loaded(folder, control_points=str(path))
     record = scene.facts["georeference"]
     assert record["frame"] == "local coordinates of the control points"
@@ -301,61 +272,61 @@ def test_control_points_give_their_frame(tmp_path: Path) -> None:
     assert "mark2 by 3 m" in warning.text
 
 
-def test_control_points_that_name_no_photo(tmp_path: Path) -> None:
-    folder = write_set(tmp_path / "set", gps=False)
-    path = tmp_path / "gcp.txt"
-    path.write_text("LOCAL\n0 0 0 5 5 p00.jpg a\n0 0 0 5 5 other.jpg a\n")
-    with pytest.raises(ParseError, match=r"gcp.txt, line 3: there is no photo other.jpg"):
-        loaded(folder, control_points=str(path))
-    path.write_text("LOCAL\n0 0 0 5 500 p00.jpg a\n")
-    with pytest.raises(ParseError, match=r"gcp.txt, line 2: the pixel lies outside of p00.jpg"):
-        loaded(folder, control_points=str(path))
-    path.write_text("LOCAL\n0 0 0 5 5 p00.jpg a\n")
-    with pytest.raises(DatasetError, match="0 control points are seen in two placed photos"):
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ("5 5 p00.jpg a\n0 0 0 5 5 other.jpg", "gcp.txt, line 3: there is no photo other.jpg"),
+        ("5 500 p00.jpg", "gcp.txt, line 2: the pixel lies outside of p00.jpg"),
+        ("5 5 p00.jpg", "0 control points are seen in two placed photos"),
+    ],
+)
+def test_control_points_that_fit_no_photo(tmp_path: Path, lines: str, words: str) -> None:
+    folder, path = write_set(tmp_path / "set", gps=False), tmp_path / "gcp.txt"
+    path.write_text(f"LOCAL\n0 0 0 {lines} a\n")
+    with pytest.raises(DatasetError, match=words):
         loaded(folder, control_points=str(path))
 
 
-def markers_of(scale: float, error: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = MarkerScale(scale, error, {"markers": {"used": 3}})
+@pytest.mark.parametrize("scale", [1.004, 1.3])
+def test_markers_decide_the_scale_and_gps_the_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scale: float
+) -> None:
+    found = MarkerScale(scale * UNIT_M, 5e-4, {"markers": {"used": 3}})
     monkeypatch.setattr(real_world, "find_markers", lambda *_args, **_more: {})
     monkeypatch.setattr(real_world, "scale_from_markers", lambda *_args: found)
     monkeypatch.setattr(real_world, "load_extra", lambda *_args: None)
-
-
-def test_markers_decide_the_scale_and_gps_the_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    markers_of(1.004 * UNIT_M, 5e-4, monkeypatch)
     scene = solved(write_set(tmp_path / "set"), monkeypatch, markers="4x4_50:0.1")
-    record = scene.facts["georeference"]
-    assert record["sources"] == ["gps", "markers"]
-    assert record["world_from_input"]["scale"] == pytest.approx(1.004 * UNIT_M)
-    assert (record["scale_error"], record["z_up"]) == (5e-4, True)
-    assert not [w for w in scene.warnings if w.code == "scales-contradict"]
-
-
-def test_contradicting_scales_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    markers_of(1.3 * UNIT_M, 5e-4, monkeypatch)
-    scene = solved(write_set(tmp_path / "set"), monkeypatch, markers="4x4_50:0.1")
-    (warning,) = [w for w in scene.warnings if w.code == "scales-contradict"]
-    assert "The scale by markers is +29 % off that by gps" in warning.text
-    given = loaded(write_set(tmp_path / "given"), markers="4x4_50:0.1")
-    record = given.facts["georeference"]
+    told = [w.text for w in scene.warnings if w.code == "scales-contradict"]
+    assert len(told) == (scale == 1.3)
+    assert all("The scale by markers is +29 % off that by gps" in text for text in told)
+    given = loaded(write_set(tmp_path / "given"), markers="4x4_50:0.1").facts["georeference"]
     # Given cameras keep their axes: GPS only checks.
-    assert (record["sources"], record["z_up"]) == (["markers", "gps"], False)
-    assert record["world_from_input"]["rotation"] == np.eye(3).tolist()
+    assert (given["sources"], given["z_up"]) == (["markers", "gps"], False)
+    assert given["world_from_input"]["rotation"] == np.eye(3).tolist()
+    if scale < 1.3:
+        record = scene.facts["georeference"]
+        assert record["sources"] == ["gps", "markers"]
+        assert record["world_from_input"]["scale"] == pytest.approx(scale * UNIT_M)
+        assert (record["scale_error"], record["z_up"]) == (5e-4, True)
 
 
 def test_what_is_wrong_is_told_before_cameras_are_solved(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = write_set(tmp_path / "set")
+    folder = write_set(tmp_path / "set", gps=False)
 
     def solve(*_arguments: Any, **_more: Any) -> Any:
-        raise AssertionError("cameras were solved")
+        raise AssertionError("cameras are solved")
 
     monkeypatch.setattr(load, "solve_poses", solve)
     (folder / "transforms.json").unlink()
+    words = "GPS does not place the scene: 0 of 12 photos have a GPS position; 5 are needed"
+    with pytest.raises(DatasetError, match=words) as refused:
+        loaded(folder, georeference="on")
+    assert "leave --set georeference out" in refused.value.hint
+    UnitsRequest("on", control_points="x").check_gps([])  # control points place it
+    with pytest.raises(AssertionError, match="cameras are solved"):
+        loaded(folder)
     with pytest.raises(DatasetError, match="cannot be read"):
         loaded(folder, control_points=str(tmp_path / "none.txt"))
     with pytest.raises(UsageError, match="no marker dictionary '9x9'"):

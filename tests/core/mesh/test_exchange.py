@@ -26,11 +26,7 @@ from gaussian_wrapping_addon.core.scene.frames import FileFrame
 from gaussian_wrapping_addon.core.texture.files import write_glb, write_obj
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 0], [0, 0, 3]], float)
-
-
 FACES = np.array([[0, 1, 2], [0, 2, 3], [0, 1, 4]])
-
-
 UVS = np.array(
     [[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]], [[1.25, 0.5], [1.5, 0.5], [1.5, 1.0]]]
 )
@@ -104,8 +100,6 @@ def test_broken_files_are_refused_by_place(
 
 
 WORLD_FROM_SCENE = Similarity(2.0, np.eye(3)[[1, 2, 0]], np.array([500_000.0, 4e6, 30.0]))
-
-
 SCENE = VERTICES + 0.25
 
 
@@ -182,27 +176,24 @@ def test_sidecars_that_are_none_are_refused(values: object, tmp_path: Path) -> N
 
 def test_what_blender_hands_over_comes_back_bit_for_bit(tmp_path: Path) -> None:
     world = WORLD_FROM_SCENE.points(SCENE)
-    for uvs in (None, UVS):
-        write_handed_over(tmp_path / "m.npz", FileMesh(world, FACES, uvs))
+    polygons = Polygons(np.zeros(len(FACES), np.int64), np.arange(3 * len(FACES)).reshape(-1, 3))
+    for mesh in (
+        FileMesh(world, FACES),
+        FileMesh(world, FACES, UVS),
+        FileMesh(world, FACES, polygons=polygons),
+        FileMesh(world, FACES, polygons=polygons, is_new=True),
+    ):
+        write_handed_over(tmp_path / "m.npz", mesh)
         found = read_handed_over(tmp_path / "m.npz")
         assert np.array_equal(found.vertices, world)
         assert np.array_equal(found.faces, FACES)
-        assert (found.corner_uvs is None) == (uvs is None)
-        assert uvs is None or np.array_equal(found.corner_uvs, uvs)
-        assert found.polygons is None
-        assert not found.is_new
-
-
-@pytest.mark.parametrize("is_new", [True, False])
-def test_polygons_are_handed_over(is_new: bool, tmp_path: Path) -> None:
-    polygons = Polygons(np.zeros(len(FACES), np.int64), np.arange(3 * len(FACES)).reshape(-1, 3))
-    mesh = FileMesh(VERTICES, FACES, polygons=polygons, is_new=is_new)
-    write_handed_over(tmp_path / "m.npz", mesh)
-    found = read_handed_over(tmp_path / "m.npz")
-    assert found.polygons is not None
-    assert np.array_equal(found.polygons.of_faces, polygons.of_faces)
-    assert np.array_equal(found.polygons.loops, polygons.loops)
-    assert found.is_new == is_new
+        assert (found.corner_uvs is None) == (mesh.corner_uvs is None)
+        assert mesh.corner_uvs is None or np.array_equal(found.corner_uvs, UVS)
+        assert (found.polygons is None) == (mesh.polygons is None)
+        if found.polygons is not None:
+            assert np.array_equal(found.polygons.of_faces, polygons.of_faces)
+            assert np.array_equal(found.polygons.loops, polygons.loops)
+        assert found.is_new == mesh.is_new
 
 
 @pytest.mark.parametrize(

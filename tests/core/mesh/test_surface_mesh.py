@@ -13,11 +13,7 @@ from gaussian_wrapping_addon.core.mesh.surface_mesh import (
     area_vectors,
     edge_keys,
     edge_lengths,
-    faces_per_edge,
-    half_edges,
-    next_half_edges,
     normals_and_areas,
-    vertices_of_half_edges,
 )
 from gaussian_wrapping_addon.core.mesh.textured_mesh import (
     FIRST_UDIM,
@@ -32,78 +28,35 @@ from gaussian_wrapping_addon.core.mesh.textured_mesh import (
 
 # A right triangle with legs 3 and 4 in z = 1, one without area, and a neighbour of the first.
 VERTICES = np.array([[0, 0, 1], [3, 0, 1], [0, 4, 1], [6, 0, 1], [3, 4, 1]], np.float64)
-
-
 FACES = np.array([[0, 1, 2], [0, 3, 1], [2, 1, 4]])
 
 
-def test_normals_are_unit_and_zero_without_area() -> None:
+def test_normals_areas_and_edges() -> None:
     normals, areas = normals_and_areas(VERTICES, FACES)
     np.testing.assert_array_equal(normals, [[0, 0, 1], [0, 0, 0], [0, 0, 1]])
     np.testing.assert_array_equal(areas, [6, 0, 6])
-    np.testing.assert_array_equal(area_vectors(VERTICES, FACES)[:, 2], [12, 0, 12])
-
-
-def test_a_reversed_face_has_the_opposite_normal() -> None:
-    normals, areas = normals_and_areas(VERTICES, FACES[:1, ::-1])
-    assert normals[0, 2] == -1
-    assert areas[0] == 6
-
-
-def test_precision_is_that_of_the_vertices() -> None:
-    assert area_vectors(VERTICES.astype(np.float32), FACES).dtype == np.float32
-    assert area_vectors(VERTICES, FACES).dtype == np.float64
-
-
-def test_edge_lengths_start_at_their_corner() -> None:
+    np.testing.assert_array_equal(area_vectors(VERTICES, FACES[:, ::-1])[:, 2], [-12, 0, -12])
     np.testing.assert_array_equal(edge_lengths(VERTICES, FACES[:1]), [[3, 5, 4]])
+    for dtype in (np.float32, np.float64):
+        assert area_vectors(VERTICES.astype(dtype), FACES).dtype == dtype
 
 
-def test_half_edges_follow_one_another_around_a_face() -> None:
-    begin, end = half_edges(FACES)
-    np.testing.assert_array_equal(begin, [0, 1, 2, 0, 3, 1, 2, 1, 4])
-    half = np.arange(FACES.size)
-    np.testing.assert_array_equal(begin[next_half_edges(half)], end)
-    np.testing.assert_array_equal(next_half_edges(half), [1, 2, 0, 4, 5, 3, 7, 8, 6])
-
-
-@pytest.mark.parametrize("dtype", [np.int32, np.int64])
-def test_edge_keys_have_no_direction_and_do_not_overflow(dtype: type) -> None:
-    begin, end = np.array([7, 2_000_000], dtype), np.array([1_999_999, 3], dtype)
-    keys = edge_keys(begin, end, 3_000_000)
-    assert keys.dtype == np.int64
-    np.testing.assert_array_equal(keys, edge_keys(end, begin, 3_000_000))
-    np.testing.assert_array_equal(keys // 3_000_000, [7, 3])
-    np.testing.assert_array_equal(keys % 3_000_000, [1_999_999, 2_000_000])
-
-
-def test_open_edges_have_one_face() -> None:
-    count = faces_per_edge(FACES, 5)
-    np.testing.assert_array_equal(count, [2, 2, 1, 1, 1, 2, 2, 1, 1])
-    np.testing.assert_array_equal(
-        vertices_of_half_edges(count == 2, FACES, 5), [True, True, True, False, False]
-    )
+def test_edge_keys_have_no_direction_and_do_not_overflow() -> None:
+    for dtype in (np.int32, np.int64):
+        begin, end = np.array([7, 2_000_000], dtype), np.array([1_999_999, 3], dtype)
+        keys = edge_keys(begin, end, 3_000_000)
+        assert keys.dtype == np.int64
+        np.testing.assert_array_equal(keys, edge_keys(end, begin, 3_000_000))
+        np.testing.assert_array_equal(np.divmod(keys, 3_000_000), [[7, 3], [1_999_999, 2_000_000]])
 
 
 # A pentagon, a quad and a triangle in a row; the pentagon's triangles begin at different loops.
 CORNERS = [[0, 1, 2, 3, 4], [2, 1, 5, 6], [6, 5, 7]]
-
-
 LOOPS = np.array([[0, 1, 2], [4, 0, 2], [2, 3, 4], [5, 6, 7], [7, 8, 5], [9, 10, 11]])
-
-
 OF_FACES = np.array([0, 0, 0, 1, 1, 2])
-
-
 VERTEX_OF_LOOP = np.concatenate(CORNERS)
-
-
 FACES_OF_SIX = VERTEX_OF_LOOP[LOOPS]
-
-
 UV_OF_LOOP = np.arange(24, dtype=np.float32).reshape(12, 2) / 24.0
-
-
 CORNER_UVS = UV_OF_LOOP[LOOPS]
 
 
@@ -143,30 +96,22 @@ def test_polygons_wound_the_other_way_stay_triangles() -> None:
     assert corners_of(joined) == faces.tolist()
 
 
-def test_a_file_comes_back(tmp_path: Path) -> None:
+def test_a_file_comes_back_and_one_of_another_mesh_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "polygons.npz"
     write_polygons(path, Polygons(OF_FACES, LOOPS))
     found = read_polygons(path, len(FACES_OF_SIX))
     assert np.array_equal(found.of_faces, OF_FACES)
     assert np.array_equal(found.loops, LOOPS)
-
-
-@pytest.mark.parametrize(
-    ("polygons", "loops"),
-    [
+    for polygons, loops in (
         (OF_FACES[:-1], LOOPS),
         (OF_FACES, LOOPS[:-1]),
         (OF_FACES.astype(float), LOOPS),
         (OF_FACES, LOOPS - 1),
         (OF_FACES + 10**9, LOOPS),
-    ],
-)
-def test_a_file_of_another_mesh_is_refused(
-    polygons: np.ndarray, loops: np.ndarray, tmp_path: Path
-) -> None:
-    write_polygons(tmp_path / "polygons.npz", Polygons(polygons, loops))
-    with pytest.raises(ParseError, match="not of this mesh"):
-        read_polygons(tmp_path / "polygons.npz", len(FACES_OF_SIX))
+    ):
+        write_polygons(path, Polygons(polygons, loops))
+        with pytest.raises(ParseError, match="not of this mesh"):
+            read_polygons(path, len(FACES_OF_SIX))
 
 
 def test_uvs_move_to_the_tiles_of_their_atlases() -> None:
@@ -175,8 +120,4 @@ def test_uvs_move_to_the_tiles_of_their_atlases() -> None:
     assert moved.dtype == np.float32
     assert np.array_equal(np.floor(moved).mean(1), [[0, 0], [9, 99], [2, 1]])
     assert np.abs(moved - np.floor(moved) - uvs).max() < 1e-5
-
-
-def test_one_atlas_needs_no_index() -> None:
-    uvs = np.full((2, 3, 2), 0.5, np.float32)
     assert np.array_equal(udim_uvs(uvs, None, (1002,)), uvs + np.float32([1, 0]))

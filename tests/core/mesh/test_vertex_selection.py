@@ -22,14 +22,19 @@ from tests.core.field.field_scenes import unit_sphere
 from tests.core.meshing.meshing_scenes import assert_closed_manifold, torus
 
 
-@functools.lru_cache(maxsize=1)
-def ball() -> tuple[np.ndarray, np.ndarray]:
-    points = unit_sphere(3000)
+def hull(points: np.ndarray) -> np.ndarray:
+    """Return the faces of the convex hull of points around 0, outward."""
     faces = ConvexHull(points).simplices.astype(np.int64)
     a, b, c = (points[faces[:, k]] for k in range(3))
     inward = (np.cross(b - a, c - a) * a).sum(1) < 0
     faces[inward] = faces[inward][:, [0, 2, 1]]
-    return points, faces
+    return faces
+
+
+@functools.lru_cache(maxsize=1)
+def ball() -> tuple[np.ndarray, np.ndarray]:
+    points = unit_sphere(3000)
+    return points, hull(points)
 
 
 def ring(around: int, across: int) -> tuple[np.ndarray, np.ndarray]:
@@ -70,19 +75,6 @@ def test_small_sphere_gets_the_share_of_its_curvature() -> None:
     # Edges go with the third root of the radius, so a tenth of it gets 4.6 times the density.
     small = (mesh.vertices[:, 0] > 2).sum()
     assert small == pytest.approx(600 * 0.1 ** (4 / 3) / (1 + 0.1 ** (4 / 3)), rel=0.3)
-
-
-def test_flat_sides_of_a_box_need_few_vertices() -> None:
-    points, faces = ball()
-    box = points / np.abs(points).max(1)[:, None]
-    onto_edge = np.sort(np.abs(box), 1)[:, 1] > 0.96
-    box[onto_edge] = np.where(
-        np.abs(box[onto_edge]) > 0.96, np.sign(box[onto_edge]), box[onto_edge]
-    )
-    mesh = selected(box, faces, 300)
-    inner = np.sort(np.abs(mesh.vertices), 1)[:, 1] < 0.9
-    whole = np.sort(np.abs(box), 1)[:, 1] < 0.9
-    assert inner.mean() < 0.25 < 0.7 < whole.mean()
 
 
 def test_long_edges_are_not_made() -> None:

@@ -29,8 +29,6 @@ from tests.core.meshing.meshing_scenes import (
 )
 
 REGION = Region.box("cut", [-1.5, -1.5, -1.5], [1.5, 1.5, 0.2])
-
-
 FIELD = ShapeField(torus(), 0.02)
 
 
@@ -47,18 +45,11 @@ def cleaned(mesh: SurfaceMesh, **changes: int) -> SurfaceMesh:
     return clean_up(mesh, REGION, MeshingSettings(**changes), FIELD, Progress()).mesh
 
 
-def test_off_means_untouched(mesh: SurfaceMesh) -> None:
-    assert cleaned(mesh) is mesh
-
-
 @pytest.mark.parametrize(("steps", "share"), [(0, 0.3), (4, 0.0), (4, 0.3)])
 def test_what_was_asked_for_is_done_and_told(mesh: SurfaceMesh, steps: int, share: float) -> None:
     target = round(share * len(mesh.faces))
     result = cleaned(mesh, smooth_steps=steps, target_faces=target)
-    before, after = (
-        validate_manifold(mesh.vertices, mesh.faces),
-        validate_manifold(result.vertices, result.faces),
-    )
+    before, after = (validate_manifold(m.vertices, m.faces) for m in (mesh, result))
     assert before.good
     assert after.good, after.defects()
     assert [p.genus for p in after.parts] == [p.genus for p in before.parts] == [1]
@@ -86,26 +77,26 @@ def test_the_dense_mesh_is_kept_where_faces_went(mesh: SurfaceMesh) -> None:
     assert kept is not None
     assert (kept.vertices == mesh.vertices).all()
     assert (kept.faces == mesh.faces).all()
-    assert dense() is None
-    assert dense(smooth_steps=2) is None
-    assert dense(target_faces=10**6) is None
+    for changes in ({}, {"smooth_steps": 2}, {"target_faces": 10**6}):
+        assert dense(**changes) is None
     # Smoothing comes first: the light mesh is to look like the smooth one.
     smooth = dense(target_faces=500, smooth_steps=2)
     assert smooth is not None
     assert (smooth.vertices == cleaned(mesh, smooth_steps=2).vertices).all()
 
 
-def test_more_faces_than_there_are_is_said(mesh: SurfaceMesh) -> None:
-    result = cleaned(mesh, target_faces=10**6)
-    np.testing.assert_array_equal(result.faces, mesh.faces)
-    assert any("1000000 requested" in note["text"] for note in result.provenance["notes"])
-
-
 def test_a_target_out_of_reach_is_said(mesh: SurfaceMesh) -> None:
-    result = cleaned(mesh, target_faces=4)
-    assert validate_manifold(result.vertices, result.faces).good
-    assert len(result.faces) > 4
-    assert any("4 requested" in note["text"] for note in result.provenance["notes"])
+    assert cleaned(mesh) is mesh, "nothing asked for is nothing done"
+    many, few = (cleaned(mesh, target_faces=target) for target in (10**6, 4))
+    np.testing.assert_array_equal(many.faces, mesh.faces)
+    assert validate_manifold(few.vertices, few.faces).good
+    assert len(few.faces) > 4
+    for result, words in ((many, "1000000 requested"), (few, "4 requested")):
+        assert any(words in note["text"] for note in result.provenance["notes"])
+
+
+FLAT = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1e-3]])
+"""Corners of a tetrahedron too coarse for the filter."""
 
 
 def smoothed(mesh: Mesh, steps: int, region: Region | None = None) -> np.ndarray:
@@ -123,7 +114,8 @@ def test_noise_on_a_ball_goes_and_the_ball_stays() -> None:
 @pytest.mark.parametrize("steps", [1, 10, 40])
 @pytest.mark.parametrize(
     "make", [lambda: noisy(ring(), 0.01), wire, lambda: slab((1, 1, 0.005), 0.1),
-             lambda: joined(ball(2), (wire()[0] + 3, wire()[1])), lambda: ball(0)],
+             lambda: joined(ball(2), (wire()[0] + 3, wire()[1])), lambda: ball(0),
+             lambda: (FLAT, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))],
 )  # fmt: skip
 def test_every_part_keeps_its_volume_and_the_mesh_stays_good(
     make: Callable[[], Mesh], steps: int
@@ -134,16 +126,6 @@ def test_every_part_keeps_its_volume_and_the_mesh_stays_good(
     for first, second in zip(before.parts, after.parts, strict=True):
         assert second.genus == first.genus
         assert second.volume == pytest.approx(first.volume, rel=0.0101)
-
-
-def test_a_part_too_coarse_for_the_filter_stays_as_it_was() -> None:
-    tetrahedron = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
-    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-    flat = tetrahedron * [1, 1, 1e-3]
-    after = smoothed((flat, faces), 30)
-    check = validate_manifold(after, faces)
-    assert check.good
-    assert check.volume == pytest.approx(validate_manifold(flat, faces).volume, rel=0.0101)
 
 
 def test_caps_stay_in_their_planes_and_the_mesh_in_its_region() -> None:
@@ -252,59 +234,48 @@ def test_a_small_arch_becomes_a_bump(scale: float) -> None:
     assert all(tuple(face) in rows for face in faces[far].tolist())
 
 
-def test_a_pinhole_through_a_plate_and_an_opening_stay() -> None:
-    """Neither lies in a small box: around the hole's other loop the whole plate would have to."""
-    plate = np.ones((20, 20, 2), np.bool_)
-    plate[4, 4] = False
-    plate[10:16, 10:16] = False
-    vertices, faces = surface_of(plate)
-    assert checked(vertices, faces).parts[0].genus == 2
-    closed = without_small_handles(vertices, faces, 1.0)
-    assert (closed.closed, closed.left) == (0, 0)
-    np.testing.assert_array_equal(closed.faces, faces)
+def cells_of(shape: tuple[int, int, int], *boxes: tuple[slice | int, ...]) -> np.ndarray:
+    """Fill boxes of cells, one after another; every second one is emptied again."""
+    cells = np.zeros(shape, np.bool_)
+    for number, box in enumerate(boxes):
+        cells[box] = number % 2 == 0
+    return cells
 
 
-def test_a_ring_of_thin_wire_stays() -> None:
-    ring = np.zeros((12, 12, 1), np.bool_)
-    ring[0], ring[-1], ring[:, 0], ring[:, -1] = True, True, True, True
-    vertices, faces = surface_of(ring)
-    closed = without_small_handles(vertices, faces, 1.0)
-    assert closed.closed == 0
-    assert checked(vertices, closed.faces).parts[0].genus == 1
+EVERYTHING = (slice(None),)
+WIRE = cells_of((30, 3, 4), (slice(None), 1, 0))
+HANDLES = {  # cells, length of an edge, handles closed, genus left
+    # Neither lies in a small box: around the hole's other loop the whole plate would have to.
+    "pinhole and opening of a plate": (
+        cells_of((20, 20, 2), EVERYTHING, (4, 4)) & cells_of(
+            (20, 20, 2), EVERYTHING, (slice(10, 16), slice(10, 16))), 1.0, 0, 2,
+    ),
+    "ring of thin wire": (
+        cells_of((12, 12, 1), EVERYTHING, (slice(1, -1), slice(1, -1))), 1.0, 0, 1,
+    ),
+    # Closing it would cut off a ring that stands out: a thing of its own, not noise.
+    "ring around a wire": (
+        cells_of((9, 9, 20), (slice(3, 6), 4, slice(14)))
+        | cells_of((9, 9, 20), (slice(2, 7), 4, slice(14, 19)), (slice(3, 6), 4, slice(15, 18))),
+        1.2, 0, 1,
+    ),
+    "arch on a wire": (with_arch(WIRE, 13, 1, 1), 1.0, 1, 0),
+    "tiny ring": (cells_of((12, 12, 3), (slice(4, 7), slice(4, 7), 0), (5, 5, 0)), 1.0, 1, 0),
+}  # fmt: skip
 
 
-def test_a_wire_is_not_cut_where_an_arch_stands_on_it() -> None:
-    wire = np.zeros((30, 3, 4), np.bool_)
-    wire[:, 1, 0] = True
-    vertices, faces = surface_of(with_arch(wire, 13, 1, 1))
-    closed = without_small_handles(vertices, faces, 1.0)
-    assert (closed.closed, closed.left) == (1, 0)
-    part = checked(vertices, closed.faces).parts[0]
-    assert part.genus == 0
-    assert 30.0 < part.volume < 37.0
-
-
-def test_a_tiny_ring_becomes_a_lump() -> None:
-    cells = np.zeros((12, 12, 3), np.bool_)
-    cells[4:7, 4:7, 0] = True
-    cells[5, 5, 0] = False
+@pytest.mark.parametrize("name", HANDLES)
+def test_handles_of_things_stay_and_small_ones_go(name: str) -> None:
+    cells, edge, count, genus = HANDLES[name]
     vertices, faces = surface_of(cells)
-    closed = without_small_handles(vertices, faces, 1.0)
-    assert closed.closed == 1
-    assert checked(vertices, closed.faces).parts[0].genus == 0
-
-
-def test_a_ring_around_a_wire_is_left() -> None:
-    """Closing it would cut off a ring that stands out: a thing of its own, not noise."""
-    cells = np.zeros((9, 9, 20), np.bool_)
-    cells[3:6, 4, :14] = True
-    ring = np.zeros((9, 9, 20), np.bool_)
-    ring[2:7, 4, 14:19] = True
-    ring[3:6, 4, 15:18] = False
-    vertices, faces = surface_of(cells | ring)
-    closed = without_small_handles(vertices, faces, 1.2)
-    assert closed.closed == 0
-    assert checked(vertices, closed.faces).parts[0].genus == 1
+    closed = without_small_handles(vertices, faces, edge)
+    assert closed.closed == count
+    (part,) = checked(vertices, closed.faces).parts
+    assert part.genus == genus
+    if count == 0:
+        np.testing.assert_array_equal(closed.faces, faces)
+    if name == "arch on a wire":  # which is not cut
+        assert 30.0 < part.volume < 37.0
 
 
 def test_what_cannot_be_closed_is_left_and_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -19,7 +20,6 @@ from gaussian_wrapping_addon.core.meshing.pivots import (
     gaussians_reaching,
     nine_pivots,
     nine_pivots_gof,
-    normal_bases,
     pivot_rule,
     three_pivots,
     two_pivots,
@@ -35,7 +35,6 @@ from gaussian_wrapping_addon.core.meshing.spacing import (
     dense_request,
     footprint_spacing,
     footprints,
-    times_longer,
 )
 from gaussian_wrapping_addon.core.meshing.surface_points import (
     halo_bounds,
@@ -65,18 +64,6 @@ def test_outer_pivots_lie_three_sigmas_out() -> None:
     )
 
 
-def test_nine_gof_pivots_are_the_centre_and_the_corners_of_the_box_of_the_axes() -> None:
-    arrays = random_arrays(40, 4)
-    index = np.array([7, 3, 30])
-    pivots = nine_pivots_gof(arrays, index)
-    np.testing.assert_array_equal(pivots[:3], arrays.means[index])
-    offset = pivots[3:].reshape(3, 8, 3) - arrays.means[index][:, None]
-    white = np.einsum("nij,nci->ncj", arrays.rotations[index], offset)
-    white /= arrays.scales[index][:, None]
-    np.testing.assert_allclose(np.abs(white), 3.0, rtol=1e-9)
-    assert all(len(np.unique(np.sign(corners), axis=0)) == 8 for corners in white)
-
-
 def test_gaussians_that_reach_a_region() -> None:
     means = np.array([[0, 0, 0], [1.2, 0, 0], [1.4, 0, 0], [9, 0, 0], [0.5, 0, 0], [0, 0, 1.25]])
     scales = np.tile([0.1, 0.01, 0.01], (6, 1))
@@ -86,8 +73,7 @@ def test_gaussians_that_reach_a_region() -> None:
     assert gaussians_reaching(arrays, cube(1.0), 0.25).tolist() == [0, 1, 2, 5]
     assert gaussians_reaching(arrays, cube(1.0), 0.0, faint=True).tolist() == [0, 1, 4]
     np.testing.assert_allclose(
-        directional_sigma(arrays, np.array([0]), np.array([[0.6, 0.8, 0.0]])),
-        np.hypot(0.06, 0.008),
+        directional_sigma(arrays, np.array([0]), np.array([[0.6, 0.8, 0.0]])), np.hypot(0.06, 0.008)
     )
 
 
@@ -108,34 +94,23 @@ def as_set(points: np.ndarray) -> set[tuple[float, ...]]:
 
 
 def test_pivots_of_an_ellipsoid_by_hand() -> None:
-    # The normal in the plane of the first two axes: sigma is the root of 0.36 0.09 + 0.64 0.04.
+    # The normal lies in the plane of the first two axes, whose third is the one least aligned with
+    # it: sigma is the root of 0.36 0.09 + 0.64 0.04. Across both lies (0.8, -0.6, 0).
     arrays = ellipsoid([0.3, 0.4, 0.0])
-    sigma = np.sqrt(0.0324 + 0.0256)
-    step = 3 * sigma * np.array([0.6, 0.8, 0.0])
-    center = np.array([1.0, 2.0, 3.0])
-    np.testing.assert_allclose(two_pivots(arrays, ONLY), [center, center + step], rtol=1e-14)
-    np.testing.assert_allclose(
-        three_pivots(arrays, ONLY), [center, center + step, center - step], rtol=1e-14
-    )
-
-
-def test_nine_pivots_of_an_ellipsoid_by_hand() -> None:
-    # The third axis is the one least aligned with the normal; across both lies (0.8, -0.6, 0),
-    # whose sigma is the root of 0.64 0.09 + 0.36 0.04.
-    found = nine_pivots(ellipsoid([0.3, 0.4, 0.0]), ONLY)
-    center = np.array([1.0, 2.0, 3.0])
-    steps = 3.0 * np.array(
-        [
-            np.sqrt(0.0324 + 0.0256) * np.array([0.6, 0.8, 0.0]),
-            [0.0, 0.0, 0.1],
-            np.sqrt(0.0576 + 0.0144) * np.array([0.8, -0.6, 0.0]),
-        ]
-    )
-    corners = [
-        center + a * steps[0] + b * steps[1] + c * steps[2]
-        for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)
-    ]  # fmt: skip
+    center, axes = np.array([1.0, 2.0, 3.0]), 3.0 * np.array([
+        np.sqrt(0.0324 + 0.0256) * np.array([0.6, 0.8, 0.0]),
+        [0.0, 0.0, 0.1],
+        np.sqrt(0.0576 + 0.0144) * np.array([0.8, -0.6, 0.0]),
+    ])  # fmt: skip
+    outer = center + axes[0]
+    for number, expected in ((2, [center, outer]), (3, [center, outer, 2 * center - outer])):
+        found = pivot_rule(number, "normal")(arrays, ONLY)
+        np.testing.assert_allclose(found, expected, rtol=1e-14)
+    corners = [center + axes.T @ signs for signs in itertools.product((-1, 1), repeat=3)]
+    found = pivot_rule(9, "normal")(arrays, ONLY)
     assert as_set(found) == as_set(np.array([center, *corners]))
+    assert pivot_rule(9, "gof") is nine_pivots_gof
+    assert pivot_rule(2, "gof") is two_pivots
 
 
 def test_the_boxes_agree_where_the_normal_is_an_axis_and_differ_elsewhere() -> None:
@@ -147,18 +122,6 @@ def test_the_boxes_agree_where_the_normal_is_an_axis_and_differ_elsewhere() -> N
     across = ellipsoid([0.5, 0.5, 0.5], turned)
     boxes = [rule(across, ONLY)[1:] for rule in (nine_pivots, nine_pivots_gof)]
     assert not as_set(boxes[0]) & as_set(boxes[1])
-
-
-def test_bases_are_orthonormal_and_begin_with_the_normal() -> None:
-    arrays = random_arrays(200, 6)
-    arrays.normals[:20] = 0.0
-    bases = normal_bases(arrays, np.arange(200))
-    identity = np.tile(np.eye(3), (200, 1, 1))
-    np.testing.assert_allclose(np.einsum("kij,kil->kjl", bases, bases), identity, atol=1e-12)
-    oriented = np.linalg.norm(arrays.normals, axis=1) >= 0.05
-    unit = arrays.normals[oriented]
-    unit /= np.linalg.norm(unit, axis=1)[:, None]
-    np.testing.assert_allclose(bases[oriented, :, 0], unit, atol=1e-12)
 
 
 @pytest.mark.parametrize("rule", [nine_pivots, nine_pivots_gof, three_pivots, two_pivots])
@@ -174,14 +137,6 @@ def test_pivots_turn_and_scale_with_the_scene(rule) -> None:  # type: ignore[no-
     np.testing.assert_allclose(
         rule(moved, index), 50.0 * rule(arrays, index) @ turn.T + 7.0, rtol=1e-9, atol=1e-7
     )
-
-
-def test_the_settings_name_the_rule() -> None:
-    assert [pivot_rule(number, "normal") for number in PIVOTS] == [
-        two_pivots, three_pivots, nine_pivots,
-    ]  # fmt: skip
-    assert pivot_rule(9, "gof") is nine_pivots_gof
-    assert pivot_rule(2, "gof") is two_pivots
 
 
 @pytest.mark.parametrize("number", PIVOTS)
@@ -237,34 +192,24 @@ def test_edges_are_not_shorter_than_half_a_pixel_and_change_slowly(scale: float)
     assert (steps <= GRADING * apart + 0.02 * resolved.max()).all()
 
 
-def test_coarse_edges_and_absent_cameras_leave_the_spacing_uniform() -> None:
+def test_spacing_is_uniform_where_photos_tell_nothing_and_grows_away_from_what_is_known() -> None:
     camera = camera_at(np.array([0.0, -4.0, 0.0]))
     points = unit_sphere(500)
     for cameras, radius in (([camera], 0.1), ([], 1e-4)):
         spacing = footprint_spacing(points, cameras, radius)
         assert spacing.limited == 0.0
         np.testing.assert_array_equal(spacing.at(points), radius)
-
-
-def test_spacing_grows_away_from_where_it_is_known() -> None:
     spacing = Spacing(np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([0.1, 0.1]), 0.1, 0.0)
     at = spacing.at(np.array([[0.0, 0, 0], [0.0, 2.0, 0]]))
-    assert at[0] == pytest.approx(0.1)
-    assert at[1] == pytest.approx(0.1 + GRADING / EDGE_PER_RADIUS * 1.9)
+    assert at == pytest.approx([0.1, 0.1 + GRADING / EDGE_PER_RADIUS * 1.9])
 
 
-SIDE = 2.0
-
-
-@pytest.mark.parametrize("edge_length", [5e-324, 1e-320, 1e-30, 1e-7])
-def test_edges_that_no_mesh_has_are_refused(edge_length: float) -> None:
-    with pytest.raises(ResourceError, match="edges long: too many") as refused:
-        checked_request(edge_length, 0, cube(SIDE))
-    assert "a thousandth of the region's diagonal" in refused.value.hint
-
-
-def test_edges_that_the_refusal_asks_for_are_accepted() -> None:
-    region = cube(SIDE)
+def test_edges_that_no_mesh_has_are_refused_and_those_asked_for_accepted() -> None:
+    region = cube(2.0)
+    for edge_length in (5e-324, 1e-320, 1e-30, 1e-7):
+        with pytest.raises(ResourceError, match="edges long: too many") as refused:
+            checked_request(edge_length, 0, region)
+        assert "a thousandth of the region's diagonal" in refused.value.hint
     request = checked_request(1e-3 * region.diagonal, 0, region)
     assert request.notes == ()
     # A surface as large as the region's own, which few things have.
@@ -272,14 +217,11 @@ def test_edges_that_the_refusal_asks_for_are_accepted() -> None:
     checked_request(FINEST_SHARE * region.diagonal, 0, region)
 
 
-@pytest.mark.parametrize("points", [5.01e6, 5.2e6, 7.3e6, 1.04e7, 9.9e8, 3.3e12])
+@pytest.mark.parametrize("points", [5.01e6, 7.3e6, 1.04e7, 3.3e12])
 def test_longer_edges_that_a_refusal_asks_for_are_accepted(points: float) -> None:
-    area = 10.0
-    edge_length = EDGE_PER_RADIUS * math.sqrt(POINTS_PER_SQUARE * area / points)
+    edge_length = EDGE_PER_RADIUS * math.sqrt(POINTS_PER_SQUARE * 10.0 / points)
     with pytest.raises(ResourceError) as refused:
         check_expected_points(points, ResolutionRequest(edge_length, 0))
     factor = float(refused.value.hint.split("edges ")[1].split(" times")[0])
-    longer = ResolutionRequest(edge_length * factor, 0)
-    check_expected_points(points / factor**2, longer)
+    check_expected_points(points / factor**2, ResolutionRequest(edge_length * factor, 0))
     assert factor < 1.2 * math.sqrt(points / limits.MAX_MESH_POINTS)
-    assert factor == float(times_longer(points, limits.MAX_MESH_POINTS))

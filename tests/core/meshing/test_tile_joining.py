@@ -25,7 +25,7 @@ from gaussian_wrapping_addon.core.meshing.primal_adaptive import (
 )
 from gaussian_wrapping_addon.core.meshing.surface_points import Field
 from gaussian_wrapping_addon.core.meshing.tiles.store import load_surface, save_surface
-from gaussian_wrapping_addon.core.meshing.tiles.tile import BorderFaces, tile_faces
+from gaussian_wrapping_addon.core.meshing.tiles.tile import tile_faces
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
@@ -40,7 +40,7 @@ from tests.core.meshing.meshing_scenes import (
     torus,
 )
 from tests.core.meshing.test_tiles import SHAPES, points_on_sheet
-from tests.core.meshing.tiled_meshing import LabelledTiles, labelled_tiles
+from tests.core.meshing.tiled_meshing import LabelledTiles, labelled_tiles, mesh_in_tiles
 from tests.proofs import first_then_proofs
 
 SIGMA = 0.02
@@ -132,11 +132,10 @@ def test_vertices_of_removed_parts_are_not_missed() -> None:
     settings = MeshingSettings(points=800, most_parts=1)
     field, region = ShapeField(distance, SIGMA), cube(1.4)
     arrays = gaussians_on(distance, region, 1500, SIGMA)
-    tiles = labelled_tiles(
+    mesh = mesh_in_tiles(
         field, field, arrays, some_cameras(), region, settings, Progress(), tiles=3, seed=0,
         threads=1,
     )  # fmt: skip
-    mesh = tiles.join(settings)
     whole = mesh_region(
         Field(field, field, 1), arrays, some_cameras(), region, settings, Progress(), seed=0
     )
@@ -173,9 +172,6 @@ def test_memory_is_that_of_the_simplified_mesh(tmp_path: Path) -> None:
         def __getitem__(self, tile: int) -> Any:
             return load_surface(paths[tile])
 
-        def __len__(self) -> int:
-            return len(paths)
-
     held: Any = Stored()
     mesh = tiles.join(ALL_PARTS, surfaces=held)  # compiles, too
     whole = at_once(tiles)
@@ -208,21 +204,6 @@ def test_labels_that_contradict_each_other_are_told() -> None:
     tiles = dataclasses.replace(tiles, parts=[tiles.parts[0], wrong, tiles.parts[2]])
     with pytest.raises(MeshingError, match="do not agree"):
         tiles.join(ALL_PARTS)
-
-
-def test_a_face_is_of_the_surface_where_one_side_of_it_is_solid() -> None:
-    face, turned = np.array([[4, 7, 9]]), np.array([[7, 4, 9]])
-    yes, no = np.array([True]), np.array([False])
-    for first, second, expected in ((yes, no, face), (no, yes, turned), (yes, yes, None)):
-        border = BorderFaces()
-        assert len(border.add(face, first)) == 0
-        settled = border.add(turned, second)
-        np.testing.assert_array_equal(settled, np.zeros((0, 3)) if expected is None else expected)
-        assert len(border.close(np.array([9]))) == 0
-    border = BorderFaces()
-    border.add(face, yes)
-    assert len(border.close(np.array([1, 5]))) == 0
-    np.testing.assert_array_equal(border.close(np.array([1, 7])), face)  # the region's boundary
 
 
 @pytest.mark.parametrize("share", first_then_proofs([0.2, 1.0]))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -26,7 +27,6 @@ from gaussian_wrapping_addon.core.meshing.tiles.plan import (
     steiner_lattice,
 )
 from gaussian_wrapping_addon.core.meshing.tiles.tile import (
-    BorderFaces,
     GatheredPoints,
     gather,
     local_tetrahedra,
@@ -61,17 +61,16 @@ def mesh_tiles(
     points: int,
     *,
     sigma: float = SIGMA,
-    seed: int = 0,
     threads: int = 1,
     spacing: str = "uniform",
-    edge: float = 0.0,
+    around: Distance | None = None,
 ) -> SurfaceMesh:
     field = ShapeField(distance, sigma)
-    arrays = gaussians_on(distance, region, 800, sigma)
+    arrays = gaussians_on(around or distance, region, 800, sigma)
     settings = MeshingSettings(points=points, spacing=spacing)
     return mesh_in_tiles(
         field, field, arrays, some_cameras(), region, settings, Progress(), tiles=tiles,
-        seed=seed, threads=threads, edge_length_scene=edge,
+        seed=0, threads=threads,
     )  # fmt: skip
 
 
@@ -82,14 +81,11 @@ def with_tiling(monkeypatch: pytest.MonkeyPatch, tiling: Tiling) -> None:
 
 
 def test_pieces_cover_the_part_of_the_surface_in_a_box() -> None:
-    vertices = np.array(
-        [[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [10, 10, 0], [50, 50, 0], [60, 50, 0]]
-    )
-    faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 5]])
+    vertices = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [10, 10, 0], [50, 50, 0]])
+    faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 1]])
     low, high = np.array([2.0, 3.0, -1.0]), np.array([4.0, 6.0, 1.0])
     corners, pieces = pieces_in_box(vertices, faces, low, high, 0.5)
-    rng = np.random.default_rng(0)
-    samples = rng.uniform(low, high, (300, 3))[:, :2]
+    samples = np.random.default_rng(0).uniform(low, high, (300, 3))[:, :2]
     a, b, c = (corners[pieces[:, k]][:, :2] for k in range(3))
 
     def side(p: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -106,11 +102,12 @@ def test_pieces_cover_the_part_of_the_surface_in_a_box() -> None:
     assert len(none) == len(nothing) == 0
 
 
-def test_a_request_for_too_few_points_is_said() -> None:
+def test_too_few_points_and_no_surface_are_told() -> None:
     mesh = mesh_tiles(sphere(), cube(1.3), 2, 40, spacing="adaptive")
-    assert "surface points; 40 were requested" in " ".join(
-        n["text"] for n in mesh.provenance["notes"]
-    )
+    notes = " ".join(n["text"] for n in mesh.provenance["notes"])
+    assert "surface points; 40 were requested" in notes
+    with pytest.raises(MeshingError, match="holds no surface"):
+        mesh_tiles(lambda p: np.full(len(p), 1.0), cube(1.3), 2, 500, around=sphere())
 
 
 def plan_around(region: Region, tiling: Tiling, radius: float, side: float) -> TilePlan:
@@ -154,34 +151,37 @@ def circumradii(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(offsets, axis=1))
 
 
+def tetrahedra_of(
+    plan: TilePlan, gathered: GatheredPoints, tile: int, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return numbers of a tile's points, its tetrahedra, and which of their corners are inner."""
+    numbers, tetrahedra = local_tetrahedra(plan, gathered, tile, seed, Progress())
+    inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
+    return numbers, tetrahedra, inner[tetrahedra]
+
+
 def test_halo_is_a_small_part_and_no_empty_ball_is_larger_than_stated() -> None:
     region, _, gathered, plan = points_on_sheet()
     assert plan.halo < 0.15 * region.diagonal
-    whole = TilePlan(**{**plan.__dict__, "tiling": Tiling(())})
-    numbers, tetrahedra = local_tetrahedra(whole, gathered, 0, 0, Progress())
+    whole = replace(plan, tiling=Tiling(()))
+    numbers, tetrahedra, inner = tetrahedra_of(whole, gathered, 0, 0)
     shifted = np.concatenate([gathered.shifted[numbers], np.full((8, 3), np.nan)])
-    inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
-    touching = inner[tetrahedra].any(1)
-    radii = circumradii(shifted, tetrahedra[touching])
+    radii = circumradii(shifted, tetrahedra[inner.any(1)])
     assert not np.isnan(radii).any()  # none reaches a far point
     assert radii.max() <= plan.ball_radius
 
 
 def test_tiles_know_the_same_tetrahedra_as_the_whole() -> None:
     _, tiling, gathered, plan = points_on_sheet()
-    whole = TilePlan(**{**plan.__dict__, "tiling": Tiling(())})
-    numbers, tetrahedra = local_tetrahedra(whole, gathered, 0, 0, Progress())
-    inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
-    tetrahedra = tetrahedra[inner[tetrahedra].all(1)]
+    numbers, tetrahedra, inner = tetrahedra_of(replace(plan, tiling=Tiling(())), gathered, 0, 0)
+    tetrahedra = tetrahedra[inner.all(1)]
     expected = {tuple(row) for row in np.sort(numbers[tetrahedra], 1).tolist()}
     found: list[tuple[int, ...]] = []
     fewest = len(gathered.inner)
     for tile in range(len(tiling)):
-        numbers, tetrahedra = local_tetrahedra(plan, gathered, tile, 7, Progress())
+        numbers, tetrahedra, inner = tetrahedra_of(plan, gathered, tile, 7)
         fewest = min(fewest, len(numbers))
-        inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
-        tetrahedra = np.sort(tetrahedra[inner[tetrahedra].all(1)], 1)
-        tetrahedra = numbers[tetrahedra]
+        tetrahedra = numbers[np.sort(tetrahedra[inner.all(1)], 1)]
         own = tiling.owner(gathered.cloud.points[tetrahedra[:, 0]]) == tile
         found += [tuple(row) for row in tetrahedra[own].tolist()]
     assert fewest < 0.5 * len(gathered.inner)
@@ -213,23 +213,6 @@ def test_faces_are_closed_whatever_the_labels() -> None:
     assert (forward == back).all()
 
 
-def test_tiles_that_do_not_fit_are_told() -> None:
-    yes, no = np.array([True]), np.array([False])
-    with pytest.raises(MeshingError, match="agree"):
-        settled([[0, 1, 2]], yes, [[1, 2, 0]], no)
-    assert len(settled([[0, 1, 2]], yes, [[0, 2, 1]], no)) == 1
-    assert len(settled([[0, 1, 2]], yes, [[0, 2, 1]], yes)) == 0
-    with pytest.raises(MeshingError, match="agree"):
-        settled([[0, 1, 2]], yes, [[0, 2, 1]], no, [[0, 2, 1]], yes)
-
-
-def settled(*parts: list[list[int]] | np.ndarray) -> np.ndarray:
-    """Join border faces; pairs of the faces of a tile and which of them are solid."""
-    border = BorderFaces()
-    pairs = zip(parts[::2], parts[1::2], strict=True)
-    return np.concatenate([border.add(np.array(faces), np.array(solid)) for faces, solid in pairs])
-
-
 @cache
 def untiled_volume(name: str, points: int) -> float:
     return float(assert_closed_manifold(mesh_tiles(*SHAPES[name], 1, points)).volume)
@@ -254,13 +237,11 @@ def test_shape_stays_the_same(name: str, euler: int, tiles: int) -> None:
     assert mesh.provenance["vertices_of_fillers"] == 0
 
 
-def mesh_whole(
-    distance: Distance, region: Region, points: int, *, edge: float = 0.0
-) -> SurfaceMesh:
+def mesh_whole(distance: Distance, region: Region, points: int) -> SurfaceMesh:
     field = ShapeField(distance, SIGMA)
     return mesh_region(
         Field(field, field, 1), gaussians_on(distance, region, 800, SIGMA), some_cameras(), region,
-        MeshingSettings(points=points), Progress(), seed=0, edge_length_scene=edge,
+        MeshingSettings(points=points), Progress(), seed=0,
     )  # fmt: skip
 
 
@@ -291,17 +272,6 @@ def test_adaptive_spacing_is_that_of_the_whole(name: str, euler: int) -> None:
     room = 1.3 if name == "plate" else 1.1
     assert here.mean() < room * there.mean()
     assert np.quantile(here, 0.99) < 1.1 * room * np.quantile(there, 0.99)
-
-
-def test_adaptive_edge_length_keeps_as_many_as_the_whole() -> None:
-    distance, region = SHAPES["torus"]
-    uniform = mesh_tiles(distance, region, 3, 0, edge=0.15)
-    adaptive = mesh_tiles(distance, region, 3, 0, edge=0.15, spacing="adaptive")
-    assert_closed_manifold(adaptive)
-    whole = mesh_whole(distance, region, 0, edge=0.15)
-    assert len(adaptive.vertices) == pytest.approx(len(whole.vertices), rel=0.03)
-    assert len(adaptive.vertices) < 0.65 * len(uniform.vertices)
-    assert away(adaptive, distance).mean() < 1.1 * away(whole, distance).mean()
 
 
 def test_surface_that_lies_in_a_border(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -343,13 +313,3 @@ def test_scale_invariance() -> None:
     first, second = assert_closed_manifold(small), assert_closed_manifold(large)
     assert second.euler == first.euler
     assert second.volume / scale**3 == pytest.approx(first.volume, rel=2e-3)
-
-
-def test_region_without_surface_is_told() -> None:
-    field = ShapeField(lambda p: np.full(len(p), 1.0), SIGMA)
-    arrays = gaussians_on(sphere(), cube(1.3), 100, SIGMA)
-    with pytest.raises(MeshingError, match="holds no surface"):
-        mesh_in_tiles(
-            field, field, arrays, some_cameras(), cube(1.3), MeshingSettings(points=500),
-            Progress(), tiles=2, seed=0, threads=1,
-        )  # fmt: skip

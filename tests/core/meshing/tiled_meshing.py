@@ -75,19 +75,12 @@ def mesh_in_tiles(
     region: Region,
     settings: MeshingSettings,
     progress: Progress,
-    *,
-    tiles: int,
-    seed: int,
-    threads: int,
-    edge_length_scene: float = 0.0,
-    depth_samples: DepthSamples | None = None,
+    **options: Any,
 ) -> SurfaceMesh:
-    """Mesh a region in ``tiles`` tiles, one after the other."""
+    """Mesh a region tile by tile; options are those of ``labelled_tiles``."""
     labelled = labelled_tiles(
-        vacancy, vectors, arrays, cameras, region, settings, progress.span(0.0, 0.9), tiles=tiles,
-        seed=seed, threads=threads, edge_length_scene=edge_length_scene,
-        depth_samples=depth_samples,
-    )  # fmt: skip
+        vacancy, vectors, arrays, cameras, region, settings, progress.span(0.0, 0.9), **options
+    )
     return labelled.join(settings, progress.span(0.9, 1.0))
 
 

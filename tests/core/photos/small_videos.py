@@ -13,11 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 WIDTH, HEIGHT = 320, 240
-
-
 FPS = 30
-
-
 BLUR_PX = 9
 
 

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-import io
+import struct
 import time
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +32,6 @@ pytest.importorskip("rawpy")
 
 
 HEIC_ERROR = 6
-
-
 """Levels of 255 that the codec may be away from flat colours."""
 
 
@@ -63,13 +62,10 @@ def write_modern(path: Path, pixels: np.ndarray, orientation: int = 1, **options
 
 
 def worst(a: np.ndarray, b: np.ndarray) -> int:
+    """Largest difference, apart from the edges between the quarters, which the codec blurs."""
     assert a.shape == b.shape
-    inside = np.ones(a.shape[:2], bool)
-    for axis, size in ((0, a.shape[0]), (1, a.shape[1])):  # the codec blurs the edges
-        band = [slice(None), slice(None)]
-        band[axis] = slice(size // 2 - 4, size // 2 + 4)
-        inside[tuple(band)] = False
-    return int(np.abs(a.astype(int) - b)[inside].max())
+    y, x = (np.abs(np.arange(n) - n // 2 + 0.5) > 4 for n in a.shape[:2])
+    return int(np.abs(a.astype(int) - b)[np.ix_(y, x)].max())
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -105,14 +101,9 @@ def test_the_exif_of_heic_does_not_turn_it_again(tmp_path: Path, orientation: in
 
 
 def test_heic_is_known_by_its_content(tmp_path: Path) -> None:
-    path = write_modern(tmp_path / "a.heic", quarters())
-    renamed = path.rename(tmp_path / "a.jpg")
+    renamed = write_modern(tmp_path / "a.heic", quarters()).rename(tmp_path / "a.jpg")
     assert formats.photo_kind(renamed) == "heif"
     assert worst(read_photo(renamed).color, quarters()) <= HEIC_ERROR
-    Image.fromarray(quarters()).save(tmp_path / "b.png")
-    for name in ("b.heic", "b.dng"):
-        (tmp_path / name).write_bytes((tmp_path / "b.png").read_bytes())
-        np.testing.assert_array_equal(read_photo(tmp_path / name).color, quarters())
 
 
 def test_colours_of_a_display_become_srgb(tmp_path: Path) -> None:
@@ -120,12 +111,10 @@ def test_colours_of_a_display_become_srgb(tmp_path: Path) -> None:
     srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     swapped = srgb.replace(b"rXYZ", b"xxxx", 1).replace(b"gXYZ", b"rXYZ", 1)
     swapped = swapped.replace(b"xxxx", b"gXYZ", 1)
-    path = write_modern(tmp_path / "a.heic", quarters(), icc_profile=srgb)
-    assert worst(read_photo(path).color, quarters()) <= HEIC_ERROR
-    path = write_modern(tmp_path / "b.heic", quarters(), icc_profile=swapped)
-    assert worst(read_photo(path).color, quarters()[..., [1, 0, 2]]) <= 2 * HEIC_ERROR
-    path = write_modern(tmp_path / "c.heic", quarters(), icc_profile=b"no profile")
-    assert worst(read_photo(path).color, quarters()) <= HEIC_ERROR
+    for profile, order in ((srgb, [0, 1, 2]), (swapped, [1, 0, 2]), (b"no profile", [0, 1, 2])):
+        path = write_modern(tmp_path / "a.heic", quarters(), icc_profile=profile)
+        wanted = HEIC_ERROR * (2 if profile == swapped else 1)
+        assert worst(read_photo(path).color, quarters()[..., order]) <= wanted
 
 
 def test_heic_masks_and_transparency(tmp_path: Path) -> None:
@@ -138,7 +127,6 @@ def test_heic_masks_and_transparency(tmp_path: Path) -> None:
     assert found[:, 52:].all()
     Image.fromarray(np.dstack([quarters(), mask])).save(tmp_path / "a.heic", quality=95)
     photo = read_photo(tmp_path / "a.heic")
-    assert photo.alpha is not None
     assert (photo.alpha[:, :44] < 9).all()
     assert (photo.alpha[:, 52:] > 246).all()
 
@@ -168,21 +156,14 @@ def test_raw_comes_upright(tmp_path: Path, orientation: int) -> None:
     assert read_photo(path, enough_px=49).color.shape == wanted.shape
 
 
-@pytest.mark.parametrize("neutral", [(1.0, 1.0, 1.0), (0.5, 1.0, 0.7), (0.9, 1.0, 0.35)])
-def test_raw_has_the_white_balance_of_the_camera(
-    tmp_path: Path, neutral: tuple[float, float, float]
-) -> None:
-    path = write_dng(tmp_path / "a.dng", linear_quarters(0.8), neutral=neutral)
-    assert worst(read_photo(path).color, to_srgb(linear_quarters(0.8))) <= 1
-
-
-def test_raw_exposures_stay_comparable(tmp_path: Path) -> None:
+def test_raw_has_the_white_balance_and_the_exposure_of_the_camera(tmp_path: Path) -> None:
     """One and two stops less light give one and two stops less, whatever else is in the photo."""
-    for stops in range(5):
-        path = write_dng(tmp_path / f"{stops}.dng", linear_quarters(0.5**stops))
-        assert worst(read_photo(path).color, to_srgb(linear_quarters(0.5**stops))) <= 1
-    almost_white = write_dng(tmp_path / "w.dng", np.full((64, 96, 3), 0.85))
-    assert worst(read_photo(almost_white).color, to_srgb(np.full((64, 96, 3), 0.85))) <= 1
+    made = [(linear_quarters(0.5**stops), (1.0, 1.0, 1.0)) for stops in range(5)]
+    made += [(linear_quarters(0.8), neutral) for neutral in ((0.5, 1.0, 0.7), (0.9, 1.0, 0.35))]
+    made.append((np.full((64, 96, 3), 0.85), (1.0, 1.0, 1.0)))  # almost white
+    for number, (linear, neutral) in enumerate(made):
+        path = write_dng(tmp_path / f"{number}.dng", linear, neutral=neutral)
+        assert worst(read_photo(path).color, to_srgb(linear)) <= 1
 
 
 def test_lenses_of_raw_and_heic(tmp_path: Path) -> None:
@@ -218,13 +199,10 @@ def test_sixteen_bits_are_scaled_without_wrapping(tmp_path: Path, kind: str, cha
 
 def png_of_16_bits(pixels: np.ndarray) -> bytes:
     """Return a PNG of 16-bit colours, which Pillow reads but does not write."""
-    import struct
-    import zlib
 
     def chunk(kind: bytes, body: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-        )
+        size, check = struct.pack(">I", len(body)), struct.pack(">I", zlib.crc32(kind + body))
+        return size + kind + body + check
 
     height, width = pixels.shape[:2]
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
@@ -236,7 +214,7 @@ def png_of_16_bits(pixels: np.ndarray) -> bytes:
 
 
 @pytest.mark.parametrize("suffix", ["heic", "avif", "dng"])
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.7, 0.95])
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.95])
 def test_damaged_files_are_named(tmp_path: Path, suffix: str, share: float) -> None:
     path = tmp_path / f"a.{suffix}"
     if suffix == "dng":
@@ -308,8 +286,6 @@ def test_without_the_packages_the_files_are_named_at_once(tmp_path: Path, no_ext
 
 
 def test_a_jpeg_needs_no_package(tmp_path: Path, no_extras: None) -> None:
-    out = io.BytesIO()
-    Image.fromarray(quarters()).save(out, "JPEG", quality=97)
     for name in ("a.jpg", "b.heic", "c.dng"):
-        (tmp_path / name).write_bytes(out.getvalue())
+        Image.fromarray(quarters()).save(tmp_path / name, "JPEG", quality=97)
         assert worst(read_photo(tmp_path / name).color, quarters()) <= HEIC_ERROR

@@ -31,11 +31,7 @@ from gaussian_wrapping_addon.core.photos.formats import (
 from gaussian_wrapping_addon.core.photos.photo_file import read_mask, read_photo
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="Ghostscript is stood for by a script")
-
-
 PACKAGE = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon"
-
-
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n(x) run\nshowpage\n%%EOF\n"
 
 
@@ -80,16 +76,11 @@ def test_postscript_named_as_a_photo_starts_nothing(
 @pytest.mark.parametrize("format", IMAGE_FORMATS)
 def test_all_formats_of_photos_are_read(tmp_path: Path, format: str) -> None:
     path = tmp_path / "a.jpg"  # the content counts
-    Image.fromarray(np.full((9, 12, 3), 200, np.uint8)).save(path, format=format)
+    first, second = (Image.new("RGB", (12, 9), (value,) * 3) for value in (200, 50))
+    # Telephones and stereo cameras write several pictures into one file.
+    more = {"save_all": True, "append_images": [second]} if format == "MPO" else {}
+    first.save(path, format=format, **more)
     assert abs(int(read_photo(path).color.mean()) - 200) < 3
-
-
-def test_a_jpeg_of_several_pictures_is_read(tmp_path: Path) -> None:
-    """As telephones and stereo cameras write them."""
-    path = tmp_path / "a.jpg"
-    first, second = (Image.new("RGB", (12, 9), (value, 9, 9)) for value in (200, 50))
-    first.save(path, format="MPO", save_all=True, append_images=[second])
-    assert abs(int(read_photo(path).color[..., 0].mean()) - 200) < 3
 
 
 @pytest.mark.parametrize("format", ["GIF", "PPM", "TGA"])
@@ -137,23 +128,18 @@ def glb_with_texture(texture: bytes) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-@pytest.mark.parametrize("suffix", ["glb", "ply"])
 def test_the_texture_of_a_mesh_to_evaluate_starts_nothing(
-    tmp_path: Path, ghostscript: Path, suffix: str
+    tmp_path: Path, ghostscript: Path
 ) -> None:
-    if suffix == "glb":
-        (tmp_path / "a.glb").write_bytes(glb_with_texture(EPS))
-    else:
-        head = "ply\nformat ascii 1.0\ncomment TextureFile a.eps\nelement vertex 3\n"
-        head += "".join(f"property float {name}\n" for name in ("x", "y", "z", "s", "t"))
-        head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-        (tmp_path / "a.ply").write_text(head + "0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n")
-        (tmp_path / "a.eps").write_bytes(EPS)
-    if suffix == "glb":  # trimesh cannot leave its textures out
-        with pytest.raises(ParseError, match=r"a\.glb.*Ghostscript"):
-            read_mesh(tmp_path / "a.glb")
-    else:
-        assert len(read_mesh(tmp_path / "a.ply")[1]) == 1
+    (tmp_path / "a.glb").write_bytes(glb_with_texture(EPS))
+    with pytest.raises(ParseError, match=r"a\.glb.*Ghostscript"):
+        read_mesh(tmp_path / "a.glb")  # trimesh cannot leave its textures out
+    head = "ply\nformat ascii 1.0\ncomment TextureFile a.eps\nelement vertex 3\n"
+    head += "".join(f"property float {name}\n" for name in ("x", "y", "z", "s", "t"))
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_text(head + "0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n")
+    (tmp_path / "a.eps").write_bytes(EPS)
+    assert len(read_mesh(tmp_path / "a.ply")[1]) == 1
     assert not ghostscript.exists()
     assert not EpsImagePlugin.has_ghostscript(), "a later look at the texture would start it"
 
@@ -211,11 +197,16 @@ def test_a_photo_keeps_its_position(tmp_path: Path) -> None:
     }  # fmt: skip
     Image.new("RGB", (8, 8)).save(path, exif=exif)
     found = read_gps_exif(path)
-    assert found is not None
-    assert found.latitude_deg == pytest.approx(-33.857)
-    assert found.longitude_deg == pytest.approx(-70.5)
+    place = (found.latitude_deg, found.longitude_deg)
+    assert place == pytest.approx((-33.857, -70.5))
     assert (found.altitude_m, found.altitude_reference) == (-12.5, "sea level")
     assert (found.dop, found.error_m) == (1.8, 4.2)
+    short = gps_of_tags({1: b"N\0", 2: (47.51,), 3: "e", 4: (8.0, 45.0)})
+    assert (short.latitude_deg, short.longitude_deg) == (47.51, 8.75)
+    Image.new("RGB", (8, 8)).save(tmp_path / "plain.png")
+    (tmp_path / "b.jpg").write_bytes(b"no photo")
+    for name in ("plain.png", "b.jpg", "missing.jpg"):
+        assert read_gps_exif(tmp_path / name) is None
 
 
 @pytest.mark.parametrize(
@@ -234,7 +225,6 @@ def test_a_photo_keeps_its_position(tmp_path: Path) -> None:
 )
 def test_altitudes(changes: dict[int, Any], altitude: float | None, reference: str) -> None:
     found = gps_of_tags({**NORTH_EAST, **changes})
-    assert found is not None
     assert (found.altitude_m, found.altitude_reference) == (altitude, reference)
 
 
@@ -249,21 +239,6 @@ def test_altitudes(changes: dict[int, Any], altitude: float | None, reference: s
 )  # fmt: skip
 def test_what_is_no_position(changes: dict[int, Any]) -> None:
     assert gps_of_tags({**NORTH_EAST, **changes}) is None
-
-
-def test_degrees_without_minutes_and_references_of_bytes() -> None:
-    found = gps_of_tags({1: b"N\0", 2: (47.51,), 3: "e", 4: (8.0, 45.0)})
-    assert found is not None
-    assert (found.latitude_deg, found.longitude_deg) == (47.51, 8.75)
-
-
-def test_files_without_gps(tmp_path: Path) -> None:
-    plain = tmp_path / "a.png"
-    Image.new("RGB", (8, 8)).save(plain)
-    (tmp_path / "b.jpg").write_bytes(b"no photo")
-    assert read_gps_exif(plain) is None
-    assert read_gps_exif(tmp_path / "b.jpg") is None
-    assert read_gps_exif(tmp_path / "missing.jpg") is None
 
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (40, 48, 3), dtype=np.uint8)
@@ -281,13 +256,15 @@ def open_files(folder: Path) -> list[str]:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc, which Linux has")
-@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp", "bmp"])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
 @pytest.mark.parametrize("read", [read_photo, read_mask])
 def test_no_file_stays_open(tmp_path: Path, suffix: str, read: object) -> None:
     path = tmp_path / f"a.{suffix}"
     Image.fromarray(PIXELS).save(path)
     kept = read(path)  # type: ignore[operator]
     assert open_files(tmp_path) == []
+    if suffix == "png" and read is read_photo:
+        np.testing.assert_array_equal(kept.color, PIXELS)
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(DatasetError) as caught:
@@ -295,10 +272,3 @@ def test_no_file_stays_open(tmp_path: Path, suffix: str, read: object) -> None:
     # The traceback, which the exception holds, holds what was opened.
     assert open_files(tmp_path) == []
     assert "a." in str(caught.value)
-    assert kept is not None
-
-
-def test_pixels_outlive_the_file(tmp_path: Path) -> None:
-    path = tmp_path / "a.png"
-    Image.fromarray(PIXELS).save(path)
-    np.testing.assert_array_equal(read_photo(path).color, PIXELS)

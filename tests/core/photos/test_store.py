@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import errno
-import logging
 import shutil
 import subprocess
 import sys
@@ -53,8 +52,8 @@ def make_scene(folder: Path, count: int = 1, width: int = 101, height: int = 67)
     return Scene(tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), Similarity())
 
 
-@pytest.mark.parametrize("max_image_px", [5000, 101, 64, 40])
-@pytest.mark.parametrize("divisor", [1, 2, 3, 4])
+@pytest.mark.parametrize("max_image_px", [5000, 64])
+@pytest.mark.parametrize("divisor", [1, 2, 3])
 def test_levels_show_what_their_camera_sees(
     tmp_path: Path, max_image_px: int, divisor: int
 ) -> None:
@@ -73,7 +72,6 @@ def test_levels_show_what_their_camera_sees(
     inner = (slice(1, -1), slice(1, -1))  # the resampling filter bends a ramp at the border
     np.testing.assert_allclose(photo[..., 0][inner], (u * 250 / 101)[inner], atol=1.6)
     np.testing.assert_allclose(photo[..., 1][inner], (v * 250 / 67)[inner], atol=1.6)
-    assert mask is not None
     assert mask.shape == photo.shape[:2]
     assert mask.dtype == bool
     clear = np.abs(u - 50) > 101 / camera.width
@@ -85,11 +83,11 @@ def test_downscaling_averages_and_does_not_alias(tmp_path: Path) -> None:
     board[::2, ::2] = board[1::2, 1::2] = 200
     Image.fromarray(board).save(tmp_path / "b.png")
     camera = Camera("b", 64, 64, 60.0, 60.0, 32.0, 32.0, np.eye(3, 4))
-    view = View(camera, tmp_path / "b.png")
-    store = PhotoStore(Scene((view,), np.zeros((0, 3)), np.zeros((0, 3)), Similarity()), 64)
+    nothing = np.zeros((0, 3))
+    scene = Scene((View(camera, tmp_path / "b.png"),), nothing, nothing, Similarity())
+    store = PhotoStore(scene, 64)
     assert np.unique(store.photo(0, 2)).tolist() == [100]
-    half = PhotoStore(Scene((view,), np.zeros((0, 3)), np.zeros((0, 3)), Similarity()), 16)
-    assert np.abs(half.photo(0).astype(int) - 100).max() <= 3
+    assert np.abs(PhotoStore(scene, 16).photo(0).astype(int) - 100).max() <= 3
     assert store.mask(0) is None
 
 
@@ -244,6 +242,11 @@ def test_the_last_of_each_kind_is_kept_beyond_the_limit() -> None:
     kept.put(("photo", 1, 1), photo)
     assert kept.get(("photo", 0, 1)) is None
     assert kept.bytes_kept == 0
+    # Two that made the same photo hold one.
+    kept = KeptPhotos(100)
+    assert kept.put(("photo", 0, 1), photo)[0] is photo
+    assert kept.put(("photo", 0, 1), array(10, 1))[0] is photo
+    assert kept.bytes_kept == 10
 
 
 def test_what_nobody_asked_for_takes_nothing_elses_place_and_goes_first() -> None:
@@ -258,45 +261,25 @@ def test_what_nobody_asked_for_takes_nothing_elses_place_and_goes_first() -> Non
     assert kept.peek(("photo", 0, 4)) is not None
 
 
-def test_two_that_made_the_same_photo_hold_one() -> None:
-    kept = KeptPhotos(100)
-    first, second = array(10), array(10)
-    assert kept.put(("photo", 0, 1), first)[0] is first
-    assert kept.put(("photo", 0, 1), second)[0] is first
-    assert kept.bytes_kept == 10
-
-
 GIB = 2**30
 
 
-@pytest.mark.parametrize(
-    ("free", "budget"),
-    [
-        (0, limits.UNKNOWN_PHOTO_MEMORY_BYTES),
-        (1, limits.MIN_PHOTO_MEMORY_BYTES),
-        (8 * GIB, 2 * GIB),
-        (1000 * GIB, limits.MAX_PHOTO_MEMORY_BYTES),
-    ],
-)
-def test_the_budget_is_a_share_of_what_is_free(free: int, budget: int) -> None:
-    assert photo_budget_bytes(free) == budget
-
-
-def test_few_photos_are_in_memory_and_hundreds_are_read_on_demand() -> None:
+def test_the_budget_is_a_share_of_what_is_free() -> None:
+    assert photo_budget_bytes(0) == limits.UNKNOWN_PHOTO_MEMORY_BYTES
+    assert photo_budget_bytes(1) == limits.MIN_PHOTO_MEMORY_BYTES
+    assert photo_budget_bytes(8 * GIB) == 2 * GIB
+    assert photo_budget_bytes(1000 * GIB) == limits.MAX_PHOTO_MEMORY_BYTES
     few = photo_memory(40, 640 * 480, masked=False, free_bytes=8 * GIB)
     assert few.fits
     assert few.used_bytes == few.all_bytes == 40 * 640 * 480 * 3 * 21 // 16
-    assert few.sentence() == "in memory, 0.05 GB"
     many = photo_memory(400, 4000 * 3000, masked=True, free_bytes=8 * GIB)
     assert not many.fits
     assert many.all_bytes == 400 * 4000 * 3000 * 4 * 21 // 16
     assert many.used_bytes == many.budget_bytes == 2 * GIB
-    assert many.sentence() == (
-        "read on demand: 400 of 60.1 MB decoded are 23.47 GB, 2.00 GB of memory are for them"
+    assert many.sentence().startswith(
+        "read on demand: 400 of 60.1 MB decoded are 23.47 GB, 2.00 GB"
     )
-
-
-def test_the_figures_of_the_panel_stay_short_enough_for_a_row() -> None:
+    # In the panel's row there is room for so many letters.
     most = photo_memory(10**4, 68_000.0, masked=True, free_bytes=1000 * GIB)
     assert most.fits
     assert len(most.sentence()) <= 18
@@ -317,7 +300,6 @@ def test_arrays_come_back_and_nothing_is_seen_of_the_file(tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == []
     for key, array in (photos | masks).items():
         found = file.get(key)
-        assert found is not None
         assert found.dtype == array.dtype
         np.testing.assert_array_equal(found, array)
     assert file.get(("photo", 9, 1)) is None
@@ -332,12 +314,11 @@ def test_half_of_the_free_disk_is_the_most(tmp_path: Path, monkeypatch: pytest.M
     file = DecodedFile(tmp_path)
     for index in range(4):
         file.add(("photo", index, 1), np.full(20, index, np.uint8))
-    assert [file.get(("photo", index, 1)) is not None for index in range(4)] == [
-        True, True, False, False,
-    ]  # fmt: skip
+    found = [file.get(("photo", index, 1)) is not None for index in range(4)]
+    assert found == [True, True, False, False]
 
 
-def test_a_full_disk_gives_the_space_back(
+def test_a_full_disk_gives_the_space_back_and_a_missing_folder_is_told_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     class Full:
@@ -351,27 +332,20 @@ def test_a_full_disk_gives_the_space_back(
         def close(self) -> None:
             self.closed = True
 
-    full = Full()
-    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: full)
-    file = DecodedFile(tmp_path)
-    with caplog.at_level(logging.WARNING):
+    def add_three(file: DecodedFile) -> None:
+        caplog.clear()
         for index in range(3):
             file.add(("photo", index, 1), np.zeros(10, np.uint8))
-    assert full.closed
-    assert len(caplog.records) == 1
-    assert "No space left" in caplog.text
-    assert file.get(("photo", 0, 1)) is None
+        assert len(caplog.records) == 1
+        assert file.get(("photo", 0, 1)) is None
 
-
-def test_a_folder_that_is_not_there_is_told_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    file = DecodedFile(tmp_path / "missing")
-    with caplog.at_level(logging.WARNING):
-        for index in range(2):
-            file.add(("photo", index, 1), np.zeros(10, np.uint8))
-    assert len(caplog.records) == 1
+    add_three(DecodedFile(tmp_path / "missing"))
     assert not (tmp_path / "missing").exists()
+    full = Full()
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: full)
+    add_three(DecodedFile(tmp_path))
+    assert full.closed
+    assert "No space left" in caplog.text
 
 
 def test_a_file_cut_short_is_not_believed(

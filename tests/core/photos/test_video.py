@@ -9,6 +9,7 @@ import struct
 import sys
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
@@ -18,8 +19,7 @@ from gaussian_wrapping_addon.core.jobs.commands.estimate_command import input_fa
 from gaussian_wrapping_addon.core.loading import check
 from gaussian_wrapping_addon.core.loading.check import Finding, check_input
 from gaussian_wrapping_addon.core.loading.source_kind import source_kind
-from gaussian_wrapping_addon.core.photos import video
-from gaussian_wrapping_addon.core.photos import video as decode
+from gaussian_wrapping_addon.core.photos import video as video_module
 from gaussian_wrapping_addon.core.photos.video import (
     container_of,
     frames_of,
@@ -37,17 +37,20 @@ from tests.core.photos.small_videos import FPS, HEIGHT, WIDTH, pan, write
 @pytest.mark.parametrize(
     ("name", "codec", "container"),
     [
-        ("a.mp4", "libx264", "mov"), ("a.mov", "mpeg4", "mov"), ("a.mkv", "libx264", "matroska"),
+        ("a.mp4", "libx264", "mov"), ("a.MOV", "mpeg4", "mov"), ("a.mkv", "libx264", "matroska"),
         ("a.webm", "libvpx", "matroska"), ("a.avi", "mpeg4", "avi"),
     ],
 )  # fmt: skip
-def test_containers_by_their_first_bytes(
+def test_all_containers_are_read_and_known_by_their_first_bytes(
     tmp_path: Path, name: str, codec: str, container: str
 ) -> None:
-    path = write(tmp_path / name, pan([0, 2, 4]), codec=codec)
+    path = write(tmp_path / name, pan(range(0, 20, 2)), codec=codec)
     assert container_of(path) == container
-    (tmp_path / "other.mp4").write_bytes(path.read_bytes())
-    assert container_of(tmp_path / "other.mp4") == container
+    path = path.rename(tmp_path / "other.mp4")
+    assert container_of(path) == container
+    with open_video(path, 1) as video:
+        assert [frame.index for frame in frames_of(video)] == list(range(10))
+        assert (video.bad_packets, video.is_cut) == (0, False)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +59,6 @@ def test_containers_by_their_first_bytes(
         (b"", "is empty"),
         (b"#EXTM3U\n#EXT-X-VERSION:3\nfile:///etc/passwd\n", "no video that can be read"),
         (b"ffconcat version 1.0\nfile /etc/passwd\n", "no video that can be read"),
-        (b"hello, this is text", "no video that can be read"),
         (b"\xff\xd8\xff\xe0 jpeg", "no video that can be read"),
     ],
 )
@@ -66,13 +68,10 @@ def test_what_is_no_video_is_refused_by_name(tmp_path: Path, content: bytes, wor
     with pytest.raises(DatasetError, match=rf"^clip\.mp4 .*{words}|^clip\.mp4 is {words}") as told:
         container_of(path)
     assert told.value.hint
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes on this system")
-def test_a_named_pipe_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "clip.mp4")
-    with pytest.raises(ParseError):
-        container_of(tmp_path / "clip.mp4")
+    if hasattr(os, "mkfifo"):  # a named pipe is not waited for
+        os.mkfifo(tmp_path / "pipe.mp4")
+        with pytest.raises(ParseError):
+            container_of(tmp_path / "pipe.mp4")
 
 
 def test_a_folder_with_one_video_and_no_photos_is_that_video(tmp_path: Path) -> None:
@@ -100,15 +99,12 @@ def quarters() -> np.ndarray:
 
 
 # Turned counterclockwise by so much, as numpy's rot90 counts, and mirrored after it.
-@pytest.mark.parametrize("suffix", [".mp4", ".mov"])
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_rotation_flags_are_respected(
-    tmp_path: Path, turns: int, mirrored: bool, suffix: str
-) -> None:
+def test_rotation_flags_are_respected(tmp_path: Path, turns: int, mirrored: bool) -> None:
     degrees = (0, 90, 180, -90)[turns]
     stored = quarters()
-    path = write(tmp_path / f"clip{suffix}", [stored] * 3, rotation=degrees, mirrored=mirrored)
+    path = write(tmp_path / "clip.mp4", [stored] * 3, rotation=degrees, mirrored=mirrored)
     wanted = np.rot90(stored, turns)
     if mirrored:
         wanted = wanted[:, ::-1]
@@ -120,12 +116,15 @@ def test_rotation_flags_are_respected(
     assert np.abs(color.astype(int) - wanted).mean() < 6.0
 
 
-def test_pixels_that_are_not_square_become_square(tmp_path: Path) -> None:
-    path = write(tmp_path / "clip.mp4", pan([0, 4, 8]))
+def test_pixels_become_square_and_grey_pictures_keep_their_brightness(tmp_path: Path) -> None:
+    path = write(tmp_path / "clip.mp4", [np.full((HEIGHT, WIDTH, 3), 100, np.uint8)] * 3)
     with open_video(path, 1) as video:
         frame = next(frames_of(video)).frame
         assert upright_color(frame, 1.5).shape == (HEIGHT, 480, 3)
         assert upright_size(frame, 1.5) == (480, HEIGHT)
+        grey = grey_of(frame, 160)
+    assert grey.shape == (120, 160)
+    assert np.abs(grey - 100).max() < 3
 
 
 def test_uneven_times_are_those_of_the_file(tmp_path: Path) -> None:
@@ -134,39 +133,6 @@ def test_uneven_times_are_those_of_the_file(tmp_path: Path) -> None:
     with open_video(path, 1) as video:
         found = [frame.time_s for frame in frames_of(video)]
     assert np.allclose(found, np.array(times) / FPS, atol=1.1e-3)  # Matroska counts milliseconds
-
-
-@pytest.mark.parametrize(
-    ("name", "codec"),
-    [
-        ("a.mp4", "libx264"), ("a.MOV", "mpeg4"), ("a.m4v", "mpeg4"), ("a.mkv", "libx264"),
-        ("a.webm", "libvpx"), ("a.avi", "mpeg4"),
-    ],
-)  # fmt: skip
-def test_all_containers_are_read(tmp_path: Path, name: str, codec: str) -> None:
-    path = write(tmp_path / name, pan(range(0, 20, 2)), codec=codec)
-    with open_video(path, 1) as video:
-        frames = list(frames_of(video))
-        assert (video.bad_packets, video.is_cut) == (0, False)
-    assert [frame.index for frame in frames] == list(range(10))
-
-
-def test_grey_pictures_are_small_and_of_the_right_brightness(tmp_path: Path) -> None:
-    path = write(tmp_path / "clip.mp4", [np.full((HEIGHT, WIDTH, 3), 100, np.uint8)] * 3)
-    with open_video(path, 1) as video:
-        grey = grey_of(next(frames_of(video)).frame, 160)
-    assert grey.shape == (120, 160)
-    assert np.abs(grey - 100).max() < 3
-
-
-def test_a_file_that_is_cut_gives_what_is_whole(tmp_path: Path) -> None:
-    path = write(tmp_path / "clip.mp4", pan(range(0, 120, 2)), options={"movflags": "faststart"})
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2])
-    with open_video(path, 1) as video:
-        count = len(list(frames_of(video)))
-        assert video.facts.frames == 60
-    assert 10 < count < 50
 
 
 def test_a_file_without_its_index_is_refused(tmp_path: Path) -> None:
@@ -194,8 +160,6 @@ def test_damage_in_the_middle_leaves_the_rest(tmp_path: Path) -> None:
 
 
 SIZE_IN_JPEG = b"\xff\xc0\x00\x11\x08" + struct.pack(">HH", HEIGHT, WIDTH)
-
-
 SIZE_IN_AVI = struct.pack("<ii", WIDTH, HEIGHT)
 
 
@@ -219,20 +183,14 @@ def test_absurd_sizes_of_a_header_are_refused(tmp_path: Path, side: int) -> None
         list(frames_of(video))
 
 
-def test_frames_that_claim_absurd_sizes_take_no_memory(tmp_path: Path) -> None:
+def test_frames_of_absurd_or_other_sizes_are_left_out(tmp_path: Path) -> None:
     huge = SIZE_IN_JPEG[:5] + struct.pack(">HH", 12_000, 12_000)
-    path = patched(tmp_path / "clip.avi", "mjpeg", SIZE_IN_JPEG, huge)
-    with open_video(path, 1) as video:
-        assert not list(frames_of(video))
-        assert video.bad_packets == 10
-
-
-def test_frames_of_another_size_are_left_out(tmp_path: Path) -> None:
     larger = SIZE_IN_JPEG[:5] + struct.pack(">HH", 2 * HEIGHT, 2 * WIDTH)
-    path = patched(tmp_path / "clip.avi", "mjpeg", SIZE_IN_JPEG, larger, skipped=6)
-    with open_video(path, 1) as video:
-        assert [frame.index for frame in frames_of(video)] == list(range(6))
-        assert video.bad_packets == 4
+    for size, skipped, kept in ((huge, 0, 0), (larger, 6, 6)):
+        path = patched(tmp_path / "clip.avi", "mjpeg", SIZE_IN_JPEG, size, skipped=skipped)
+        with open_video(path, 1) as video:
+            assert [frame.index for frame in frames_of(video)] == list(range(kept))
+            assert video.bad_packets == 10 - kept
 
 
 def test_long_videos_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,14 +201,12 @@ def test_long_videos_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         open_video(path),
     ):
         pass
-    monkeypatch.setattr(decode, "_check_limits", lambda name, facts: None)
+    monkeypatch.setattr(video_module, "_check_limits", lambda name, facts: None)
     with open_video(path, 1) as video, pytest.raises(DatasetError, match="more than 9 frames"):
         list(frames_of(video))
 
 
 def test_sound_alone_is_no_video(tmp_path: Path) -> None:
-    import av
-
     path = tmp_path / "clip.mp4"
     with av.open(str(path), "w") as container:
         stream = container.add_stream("aac", rate=44100, layout="mono")
@@ -260,13 +216,6 @@ def test_sound_alone_is_no_video(tmp_path: Path) -> None:
         container.mux(stream.encode())
     with pytest.raises(DatasetError, match="holds no pictures"), open_video(path):
         pass
-
-
-def test_hdr_is_noticed(tmp_path: Path) -> None:
-    for trc, wanted in ((16, True), (18, True), (1, False)):
-        path = write(tmp_path / f"clip-{trc}.mp4", pan([0, 2, 4]), trc=trc)
-        with open_video(path) as video:
-            assert video.facts.is_hdr is wanted
 
 
 def kinds(findings: list[Finding]) -> list[str]:
@@ -283,15 +232,10 @@ def test_facts_are_those_that_players_show(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("worker", ["", sys.executable])
-@pytest.mark.parametrize(
-    ("content", "words"), [(b"", "is empty"), (b"some text, not a video", "no video")]
-)
-def test_the_check_refuses_what_is_no_video(
-    tmp_path: Path, content: bytes, words: str, worker: str
-) -> None:
-    (tmp_path / "clip.mkv").write_bytes(content)
+def test_the_check_refuses_what_is_no_video(tmp_path: Path, worker: str) -> None:
+    (tmp_path / "clip.mkv").write_bytes(b"some text, not a video")
     (error,) = [f for f in check_input(tmp_path, worker=worker) if f.severity == "error"]
-    assert words in error.message
+    assert "no video" in error.message
     assert error.hint
 
 
@@ -324,8 +268,8 @@ def test_a_worker_without_the_decoder_says_so(
     def missing(_path: Path) -> None:
         raise ModuleNotFoundError("No module named 'av'", name="av")
 
-    monkeypatch.setattr(video, "probed", missing)
-    assert video.main(["clip.mp4"]) == WorkerError.exit_code
+    monkeypatch.setattr(video_module, "probed", missing)
+    assert video_module.main(["clip.mp4"]) == WorkerError.exit_code
     (line,) = capsys.readouterr().out.splitlines()
     said = json.loads(line)
     assert "lacks a package" in said["error"]

@@ -11,11 +11,7 @@ from PIL import Image
 from scipy import ndimage
 
 HALF = np.array([3.0, 4.0, 2.0])
-
-
 """The room reaches from -HALF to HALF."""
-
-
 _TEXTURE_PX = 500
 
 

@@ -35,7 +35,6 @@ from gaussian_wrapping_addon.core.poses.panoramas import (
     view_name,
 )
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.scene.scene import Scene
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.poses.room import HALF, color_of, poses, write_panoramas
@@ -138,13 +137,8 @@ def test_posed_panoramas_become_pinhole_photos_of_the_room(tmp_path: Path) -> No
     # A panorama of 400 pixels cannot show the walls sharply; what is elsewhere differs much more.
     assert max(right) < 9.0
     assert (np.array(right) < 0.6 * np.array(mirrored)).all()
-    _agrees_with_points(scene)
-
-
-def _agrees_with_points(scene: Scene) -> None:
     world = scene.world_from_scene.points(scene.points)
     assert np.abs(np.abs(world) / HALF).max() == pytest.approx(1.0, abs=1e-4)
-    assert isinstance(scene.cameras[0], Camera)
 
 
 def test_masks_are_cut_as_well(tmp_path: Path) -> None:
@@ -289,9 +283,6 @@ def test_views_of_one_place_are_not_matched() -> None:
     pairs = pairs_by_pose(centers, forwards)
     assert pairs
     assert all(i < 3 <= j for i, j in pairs)
-
-
-def test_pairs_of_panoramas() -> None:
     assert len(panorama_pairs(12)) == 66
     pairs = panorama_pairs(100)
     assert {(i, i + 1) for i in range(99)} <= set(pairs)

@@ -34,8 +34,6 @@ from tests.core.readers.model_writers import ring_model, write_binary
 from tests.synthetic import look_at
 
 BANANAS = Path(__file__).parents[3] / "examples" / "bananas"
-
-
 NAMES = ("DSC_0423", "DSC_0424", "DSC_0425", "DSC_0438")
 
 
@@ -225,8 +223,6 @@ def test_cancelling_ends_the_helper(tmp_path: Path) -> None:
 
 
 pycolmap = pytest.importorskip("pycolmap")
-
-
 PHOTOS = 36
 
 

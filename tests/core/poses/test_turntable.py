@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -31,42 +32,32 @@ def spread(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform([20, 20], [620, 460], (count, 2))
 
 
-def everywhere(count: int, *, is_still: bool, moved: int) -> list[PairMotion]:
-    return [PairMotion(a, b, is_still, moved) for a, b in itertools.combinations(range(count), 2)]
-
-
 def test_background_that_stays_and_an_object_that_moves() -> None:
     background, thing = spread(30), spread(25, 1)
     points = np.concatenate([background, thing])
     others = np.concatenate([background + 0.4, thing + np.array([40, 3])])
     found = pair_motion(3, 7, points, others, SIZE)
     assert found == PairMotion(3, 7, True, 25)
+    nothing = np.zeros((0, 2))
+    assert pair_motion(0, 1, nothing, nothing, SIZE) == PairMotion(0, 1, False, 0)
 
 
-def test_a_moving_camera_leaves_nothing_in_its_place() -> None:
-    points = spread(200)
-    assert not pair_motion(0, 1, points, points + np.array([9, 0]), SIZE).is_still
-
-
-def test_a_date_in_the_corner_is_no_background() -> None:
-    date = np.random.default_rng(0).uniform([540, 440], [630, 470], (60, 2))
-    points = np.concatenate([date, spread(100)])
-    others = np.concatenate([date, spread(100) + np.array([30, 8])])
-    assert not pair_motion(0, 1, points, others, SIZE).is_still
-
-
-def test_a_bonnet_along_the_lower_edge_is_no_background() -> None:
-    bonnet = np.random.default_rng(0).uniform([10, 430], [630, 475], (200, 2))
-    world = spread(400)
-    points, others = np.concatenate([bonnet, world]), np.concatenate([bonnet, world + 20.0])
-    assert not pair_motion(0, 1, points, others, SIZE).is_still
-
-
-def test_a_display_over_a_moving_picture_is_no_background() -> None:
-    """Marks all over the picture stand still, between them everything moves."""
-    marks, world = spread(40), spread(900, 1)
-    points, others = np.concatenate([marks, world]), np.concatenate([marks, world + 20.0])
-    assert not pair_motion(0, 1, points, others, SIZE).is_still
+@pytest.mark.parametrize(
+    ("low", "high", "count", "others"),
+    [
+        pytest.param((20, 20), (620, 460), 0, 200, id="a moving camera"),
+        pytest.param((540, 440), (630, 470), 60, 100, id="a date in the corner"),
+        pytest.param((10, 430), (630, 475), 200, 400, id="a bonnet along the lower edge"),
+        pytest.param((20, 20), (620, 460), 40, 900, id="a display over a moving picture"),
+    ],
+)
+def test_what_is_no_background(low: tuple, high: tuple, count: int, others: int) -> None:
+    """Some points stand still, between them or beside them everything moves."""
+    still = np.random.default_rng(0).uniform(low, high, (count, 2))
+    world = spread(others, 1)
+    moved = np.concatenate([still, world + np.array([20.0, 9.0])])
+    points = np.concatenate([still, world])
+    assert not pair_motion(0, 1, points, moved, SIZE).is_still
 
 
 def test_what_moves_must_move_as_one() -> None:
@@ -75,47 +66,26 @@ def test_what_moves_must_move_as_one() -> None:
     assert not are_turning([])
 
 
-def test_no_match_is_no_evidence() -> None:
-    nothing = np.zeros((0, 2))
-    assert pair_motion(0, 1, nothing, nothing, SIZE) == PairMotion(0, 1, False, 0)
-    assert standing_groups(5, []) == []
-
-
-def test_a_turntable_is_one_group() -> None:
-    motions = everywhere(12, is_still=True, moved=40)
-    assert standing_groups(12, motions) == [list(range(12))]
-
-
-def test_a_camera_that_waits_is_no_turntable() -> None:
-    assert standing_groups(12, everywhere(12, is_still=True, moved=3)) == []
-
-
-def test_a_short_pause_on_a_walk_is_no_turntable() -> None:
-    motions = [
-        PairMotion(a, b, b < MIN_GROUP - 1, 40) for a, b in itertools.combinations(range(40), 2)
-    ]
-    assert standing_groups(40, motions) == []
-
-
-def test_slow_steps_are_not_chained_to_one_place() -> None:
-    """A slow orbit: neighbours hardly move, photos farther apart do."""
-    motions = [PairMotion(a, b, b - a == 1, 40) for a, b in itertools.combinations(range(30), 2)]
-    assert standing_groups(30, motions) == []
-
-
-def test_waiting_on_the_way_while_somebody_walks_by_is_no_turntable() -> None:
-    motions = [PairMotion(a, b, b < 10, 40) for a, b in itertools.combinations(range(21), 2)]
-    assert standing_groups(21, motions) == []
-
-
-@pytest.mark.parametrize("strays", [0, 4])
-def test_two_places_are_two_groups(strays: int) -> None:
-    count = 20 + strays
-    motions = [
-        PairMotion(a, b, b < 20 and a // 10 == b // 10, 40)
-        for a, b in itertools.combinations(range(count), 2)
-    ]
-    assert standing_groups(count, motions) == [list(range(10)), list(range(10, 20))]
+@pytest.mark.parametrize(
+    ("count", "is_still", "moved", "groups"),
+    [
+        pytest.param(5, lambda a, b: False, 0, [], id="nothing stands still"),
+        pytest.param(12, lambda a, b: True, 40, [range(12)], id="a turntable"),
+        pytest.param(12, lambda a, b: True, 3, [], id="a camera that waits"),
+        pytest.param(40, lambda a, b: b < MIN_GROUP - 1, 40, [], id="a pause on a walk"),
+        # A slow orbit: neighbours hardly move, photos farther apart do.
+        pytest.param(30, lambda a, b: b - a == 1, 40, [], id="slow steps"),
+        pytest.param(21, lambda a, b: b < 10, 40, [], id="somebody walks by"),
+        pytest.param(
+            24, lambda a, b: b < 20 and a // 10 == b // 10, 40, [range(10), range(10, 20)],
+            id="two places and strays",
+        ),
+    ],
+)  # fmt: skip
+def test_standing_groups(count: int, is_still: Callable, moved: int, groups: list[range]) -> None:
+    pairs = itertools.combinations(range(count), 2)
+    motions = [PairMotion(a, b, is_still(a, b), moved) for a, b in pairs]
+    assert standing_groups(count, motions) == [list(group) for group in groups]
 
 
 COUNT, WIDTH, HEIGHT = 24, 240, 180

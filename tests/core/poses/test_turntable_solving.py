@@ -56,7 +56,6 @@ def test_each_photo_has_a_mask_of_what_turns(solved: Scene) -> None:
     # The points are of what turns: every mask contains them.
     for i in range(0, COUNT, 4):
         mask = store.mask(i)
-        assert mask is not None
         pixels, depth = store.camera(i).project(solved.points)
         visible = (depth > 0) & (pixels >= 0).all(1) & (pixels < mask.shape[::-1]).all(1)
         column, row = pixels[visible].astype(int).T

@@ -20,38 +20,16 @@ from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.scene.camera import Camera
 
 DISTANCE, ELEVATIONS_DEGREES, FOCAL_SHARE = 3.1, (18.0, 42.0), 1.25
-
-
 """The camera stands still at one elevation after the other, for as many photos each."""
-
-
 WALL_Y, TABLE_Z = 1.6, -0.62
-
-
 """The wall's place behind the cow, and the table's, a little below its hoofs."""
-
-
 LIGHT = np.array([0.45, -0.65, 0.62])
-
-
 AMBIENT = 0.55
-
-
 NOISE_LEVELS = 1.5
-
-
 SUPERSAMPLING = 2
-
-
 TRUTH_SAMPLES = 100_000
-
-
 JPEG_QUALITY = 95
-
-
 FOCAL_35MM = 36.0
-
-
 """Width of the film that EXIF's focal length refers to, mm."""
 
 

@@ -16,11 +16,7 @@ from tests.core.readers.writers import Shots
 from tests.poses import look_at_pose
 
 WIDTH, HEIGHT = 96, 64
-
-
 NAMES = ("IMG_0001.jpg", "IMG_0002.jpg", "IMG_0003.jpg", "IMG_0004.jpg")
-
-
 EYES = ((3.0, 0.3, 1.0), (0.5, 2.8, -0.7), (-2.5, -1.0, 1.6), (0.9, -2.7, 0.4))
 
 

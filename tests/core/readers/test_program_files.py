@@ -30,62 +30,58 @@ from tests.core.readers import writers
 from tests.core.readers.known_scene import NAMES, read, shots, write_photos
 from tests.core.readers.writers import Shots
 
-OSFM = {"focal_x": 0.9, "focal_y": 0.9, "k1": -0.05}
-
 
 def load(source: Path, work: Path) -> Scene:
     return load_scene(source, work, Progress(), seed=1, threads=1)
 
 
-def test_poses_and_points_become_a_scene(tmp_path: Path) -> None:
+@pytest.mark.parametrize("program", ["meshroom", "opensfm"])
+def test_poses_and_points_become_a_scene(tmp_path: Path, program: str) -> None:
+    write, lens = LENSES[program]
     points = np.random.default_rng(4).uniform(-0.5, 0.5, (300, 3))
     write_photos(tmp_path / "set" / "images")
-    written = shots(OSFM, points=points)
-    writers.write_opensfm(tmp_path / "set", written)
+    made = shots(lens, points=points)
+    path = write(tmp_path / "set", made)
+    model = read(path)
+    np.testing.assert_array_equal(model.points, points)
+    assert model.point_colors.tolist() == [[200, 100, 50]] * 300
     scene = load(tmp_path / "set", tmp_path / "work")
-    assert scene.facts["kind"] == "OpenSfM reconstruction"
+    assert scene.facts["kind"] == model.kind
     assert scene.facts["photos_undistorted"] == 4
     centers = scene.world_from_scene.points(np.array([c.center for c in scene.cameras]))
-    np.testing.assert_allclose(centers, written.centers(), atol=1e-5)
+    np.testing.assert_allclose(centers, made.centers(), atol=1e-5)
     step = POINT_STEP * scene.world_from_scene.scale
     np.testing.assert_allclose(scene.world_from_scene.points(scene.points), points, atol=step)
     assert (scene.point_colors == [200, 100, 50]).all()
+    # Masks lie where they do for other inputs; photos may be nowhere.
+    (tmp_path / "set" / "masks").mkdir()
+    Image.new("L", (96, 64), 255).save(tmp_path / "set" / "masks" / "IMG_0002.png")
+    texts = [finding.message for finding in check_input(tmp_path / "set")]
+    assert "1 of 4 photos have a mask." in texts
+    assert f"The input is of kind: {model.kind}." in texts
+    shutil.rmtree(tmp_path / "set" / "images")
+    with pytest.raises(DatasetError, match=f"None of the 4 photos that the {model.kind} names"):
+        load(path, tmp_path / "work2")
 
 
 def test_points_are_triangulated_where_the_file_has_none(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     cameras = textured_plane(tmp_path / "set")
     shutil.rmtree(tmp_path / "set" / "sparse")
-    first = cameras[0]
-    written = Shots(
-        [camera.name for camera in cameras],
-        [camera.cam_from_world for camera in cameras],
-        first.width,
-        first.height,
-        {"f": first.fx, "b1": first.fx - first.fy, "cx": 0.0},
-    )
-    path = writers.write_metashape(tmp_path / "set", written)
-    scene = load(path, tmp_path / "work")
+    first, poses = cameras[0], [camera.cam_from_world for camera in cameras]
+    lens = {"f": first.fx, "b1": first.fx - first.fy, "cx": 0.0}
+    written = Shots([camera.name for camera in cameras], poses, first.width, first.height, lens)
+    scene = load(writers.write_metashape(tmp_path / "set", written), tmp_path / "work")
     assert scene.facts["start_points"] == "triangulated from the photos"
     assert len(scene.points) >= 200
     world = scene.world_from_scene.points(scene.points)
     assert np.percentile(np.abs(world[:, 2]), 90) < 0.02  # cameras are 2.8 away
 
 
-def test_masks_beside_photos_of_another_program(tmp_path: Path) -> None:
-    write_photos(tmp_path / "images")
-    (tmp_path / "masks").mkdir()
-    Image.new("L", (96, 64), 255).save(tmp_path / "masks" / "IMG_0002.png")
-    writers.write_metashape(tmp_path, shots({"f": 88.0}))
-    texts = [finding.message for finding in check_input(tmp_path)]
-    assert "1 of 4 photos have a mask." in texts
-    assert "The input is of kind: Metashape cameras." in texts
-
-
 def test_a_project_of_opendronemap(tmp_path: Path) -> None:
     write_photos(tmp_path / "images")
     (tmp_path / "opensfm").mkdir()
-    writers.write_opensfm(tmp_path / "opensfm", shots(OSFM))
+    writers.write_opensfm(tmp_path / "opensfm", shots(LENSES["opensfm"][1]))
     for source in (tmp_path, tmp_path / "opensfm", tmp_path / "opensfm" / "reconstruction.json"):
         kind = source_kind(source)
         assert kind.kind == "OpenSfM reconstruction"
@@ -104,34 +100,22 @@ def test_polycam_prefers_corrected_cameras(tmp_path: Path) -> None:
     write_photos(tmp_path / "keyframes" / "corrected_images")
     for source in (tmp_path, tmp_path / "keyframes"):
         kind = source_kind(source)
-        assert kind.program is not None
         assert kind.program.path.name == "corrected_cameras"
         assert kind.photo_roots == [tmp_path / "keyframes" / "corrected_images"]
         assert not [f for f in check_input(source) if f.severity == "error"]
 
 
 def test_xmp_files_without_a_pose_are_not_cameras(tmp_path: Path) -> None:
-    text = (
-        "<x:xmpmeta xmlns:x='adobe:ns:meta/'><d xmlns:xcr='http://www.capturingreality.com/ns/xcr/"
-        "1.1#' xcr:Version='3' xcr:PosePrior='initial'/></x:xmpmeta>"
+    begin = "<x:xmpmeta xmlns:x='adobe:ns:meta/'"
+    unposed = (
+        f"{begin}><d xmlns:xcr='http://www.capturingreality.com/ns/xcr/1.1#' xcr:Version='3'"
+        " xcr:PosePrior='initial'/></x:xmpmeta>"
     )
     write_photos(tmp_path)
-    for name in NAMES:
-        (tmp_path / name).with_suffix(".xmp").write_text(text)
-    assert source_kind(tmp_path).kind == "photos"
-
-
-def test_xmp_files_of_other_programs_are_not_cameras(tmp_path: Path) -> None:
-    write_photos(tmp_path)
-    for name in NAMES:
-        (tmp_path / name).with_suffix(".xmp").write_text("<x:xmpmeta xmlns:x='adobe:ns:meta/'/>")
-    assert source_kind(tmp_path).kind == "photos"
-
-
-def test_photos_that_are_nowhere_are_said(tmp_path: Path) -> None:
-    writers.write_meshroom(tmp_path, shots({"f": 32.0}))
-    with pytest.raises(DatasetError, match="None of the 4 photos that the Meshroom cameras names"):
-        load(tmp_path / "cameras.sfm", tmp_path / "work")
+    for text in (unposed, f"{begin}/>"):
+        for name in NAMES:
+            (tmp_path / name).with_suffix(".xmp").write_text(text)
+        assert source_kind(tmp_path).kind == "photos"
 
 
 def test_estimates_and_stages_know_the_file(tmp_path: Path) -> None:
@@ -154,11 +138,11 @@ LENSES = {
 }
 
 
-def written(folder: Path, program: str) -> tuple[Path, Path]:
+def written(folder: Path, program: str, **more: object) -> tuple[Path, Path]:
     """Write an input; return what to give, and the file to spoil."""
     write, lens = LENSES[program]
     write_photos(folder if program == "xmp" else folder / "images")
-    source = write(folder, shots(lens))  # type: ignore[operator]
+    source = write(folder, shots(lens, **more))
     if program == "xmp":
         return source, folder / "IMG_0001.xmp"
     if program == "polycam":
@@ -175,37 +159,26 @@ def spoiled(folder: Path, program: str, old: str, new: str) -> Path:
     return source
 
 
-LAUGHS = (
-    '<?xml version="1.0"?><!DOCTYPE d [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">'
-    '<!ENTITY c "&b;&b;&b;&b;&b;&b;&b;&b;">]><document><chunk label="&c;"/></document>'
-)
-
-
-OUTSIDE = (
-    '<?xml version="1.0"?><!DOCTYPE d [<!ENTITY x SYSTEM "file:///etc/passwd">]>'
-    '<document><chunk label="&x;"/></document>'
-)
-
-
-@pytest.mark.parametrize("text", [LAUGHS, OUTSIDE, LAUGHS.encode("utf-16").decode("latin-1")])
-def test_entities_are_not_expanded(tmp_path: Path, text: str) -> None:
-    source, path = written(tmp_path, "metashape")
-    path.write_bytes(text.encode("latin-1"))
-    if text.startswith("<"):
+def test_entities_are_not_expanded_and_depth_is_bounded(tmp_path: Path) -> None:
+    source, path = written(tmp_path / "a", "metashape")
+    laughs = '<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;"><!ENTITY c "&b;&b;&b;&b;">'
+    for entities in (laughs, '<!ENTITY c SYSTEM "file:///etc/passwd">'):
+        text = f'<?xml version="1.0"?><!DOCTYPE d [{entities}]><document><chunk label="&c;"/>'
+        path.write_text(text + "</document>")
         with pytest.raises(ParseError, match="document types and entities are not read"):
             read(source)
-    else:  # in UTF-16 the file is not even taken for one of the program
-        with pytest.raises(DatasetError, match="not a transforms"):
+        path.write_bytes(text.encode("utf-16"))
+        with pytest.raises(DatasetError, match="not a transforms"):  # not even taken for one
             read(source)
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
-def test_entities_beside_photos_are_not_expanded(tmp_path: Path, encoding: str) -> None:
-    source, path = written(tmp_path, "xmp")
-    text = '<!DOCTYPE d [<!ENTITY a "1">]>' + path.read_text()
-    path.write_bytes(text.encode(encoding) + b"<!-- capturingreality.com/ns/xcr Rotation -->")
-    with pytest.raises(ParseError, match=r"IMG_0001\.xmp, line 1: document types and entities"):
+    path.write_text("<document><chunk>" + "<a>" * 200_000)
+    with pytest.raises(ParseError, match="line 1: nested too deeply"):
         read(source)
+    source, path = written(tmp_path / "b", "xmp")
+    text = '<!DOCTYPE d [<!ENTITY a "1">]>' + path.read_text()
+    for encoding in ("utf-8", "utf-16"):
+        path.write_bytes(text.encode(encoding) + b"<!-- capturingreality.com/ns/xcr Rotation -->")
+        with pytest.raises(ParseError, match=r"IMG_0001\.xmp, line 1: document types and entities"):
+            read(source)
 
 
 @pytest.mark.parametrize(
@@ -228,7 +201,6 @@ def test_entities_beside_photos_are_not_expanded(tmp_path: Path, encoding: str) 
         ("xmp", "</rdf:RDF>", "", "not XML: mismatched tag"),
         ("metashape", "</chunk>", "", r"cameras\.xml, line [0-9]+: not XML: mismatched tag"),
         ("metashape", "<scale>2.5", "<scale>-2.5", "the scale is not positive"),
-        ("metashape", "<f>88.0", "<f>-88", "the focal length is not positive"),
         ("metashape", "<f>88.0", "<f>1e300", "the number is not finite, or too large"),
         (
             "metashape", 'width="96"(?= height="64"/>\\s*<f>)', 'width="-96"',
@@ -276,13 +248,6 @@ def test_large_files_are_not_read(tmp_path: Path, program: str) -> None:
         read(source)
 
 
-def test_deep_xml_is_refused(tmp_path: Path) -> None:
-    source, path = written(tmp_path, "metashape")
-    path.write_text("<document><chunk>" + "<a>" * 200_000)
-    with pytest.raises(ParseError, match="line 1: nested too deeply"):
-        read(source)
-
-
 def names_of(model: SourceModel) -> list[str]:
     return [photo.name for photo in model.photos]
 
@@ -302,23 +267,19 @@ def test_unusable_names_are_left_out(tmp_path: Path, name: str) -> None:
     assert names_of(model) == kept
 
 
-def test_names_of_another_computer() -> None:
-    windows = ["C:\\Users\\me\\set\\a\\1.jpg", "C:\\Users\\me\\set\\b\\1.jpg"]
-    assert list(relative_names(windows).values()) == ["a/1.jpg", "b/1.jpg"]
-    assert list(relative_names(["/home/me/1.jpg"]).values()) == ["1.jpg"]
-    assert list(relative_names(["/home/me/1.jpg", "sub/2.jpg"]).values()) == ["1.jpg", "sub/2.jpg"]
-    assert list(relative_names(["C:/a/1.jpg", "D:/b/2.jpg"]).values()) == ["a/1.jpg", "b/2.jpg"]
-    assert list(relative_names(["\\\\server\\x\\1.jpg", "../2.jpg", "./3.jpg"]).values()) == [
-        "1.jpg", "2.jpg", "3.jpg",
-    ]  # fmt: skip
+def test_names_of_another_computer(tmp_path: Path) -> None:
+    def relative(*names: str) -> list[str]:
+        return list(relative_names(names).values())
 
-
-@pytest.mark.parametrize("program", ["csv", "meshroom", "opensfm"])
-def test_photos_of_absolute_paths_are_found(tmp_path: Path, program: str) -> None:
-    write, lens = LENSES[program]
-    write_photos(tmp_path / "images")
-    source = write(tmp_path, shots(lens, stored_in="D:\\work\\house\\"))  # type: ignore[operator]
-    assert names_of(read(source)) == list(NAMES)
+    assert relative("C:\\me\\set\\a\\1.jpg", "C:\\me\\set\\b\\1.jpg") == ["a/1.jpg", "b/1.jpg"]
+    assert relative("/home/me/1.jpg") == ["1.jpg"]
+    assert relative("/home/me/1.jpg", "sub/2.jpg") == ["1.jpg", "sub/2.jpg"]
+    assert relative("C:/a/1.jpg", "D:/b/2.jpg") == ["a/1.jpg", "b/2.jpg"]
+    found = relative("\\\\server\\x\\1.jpg", "../2.jpg", "./3.jpg")
+    assert found == ["1.jpg", "2.jpg", "3.jpg"]
+    for program in ("csv", "meshroom", "opensfm"):
+        source, _ = written(tmp_path / program, program, stored_in="D:\\work\\house\\")
+        assert names_of(read(source)) == list(NAMES)
 
 
 def test_the_largest_reconstruction_is_used(tmp_path: Path) -> None:
@@ -331,8 +292,8 @@ def test_the_largest_reconstruction_is_used(tmp_path: Path) -> None:
     assert "[1] with 4 photos was used, 2 photos are in others" in model.warnings[0].text
 
 
-def test_components_and_disabled_cameras_of_metashape(tmp_path: Path) -> None:
-    source, path = written(tmp_path, "metashape")
+def test_components_and_disabled_cameras(tmp_path: Path) -> None:
+    source, path = written(tmp_path / "a", "metashape")
     text = path.read_text()
     text = text.replace('component_id="0" label="IMG_0002"', 'component_id="1" label="IMG_0002"')
     text = text.replace('label="IMG_0003"', 'label="IMG_0003" enabled="false"')
@@ -354,10 +315,7 @@ def test_components_and_disabled_cameras_of_metashape(tmp_path: Path) -> None:
     a, b = (-m.photos[0].cam_from_world[:, :3].T @ m.photos[0].cam_from_world[:, 3]
             for m in (chunk_only, model))  # fmt: skip
     np.testing.assert_allclose((a - [4, -3, 2]) / 2.5, (b - [10, 20, 30]) / 2, atol=1e-12)
-
-
-def test_components_of_xmp_files(tmp_path: Path) -> None:
-    source, path = written(tmp_path, "xmp")
+    source, path = written(tmp_path / "b", "xmp")
     path.write_text(path.read_text().replace("xcr:Skew", 'xcr:ComponentId="{A}" xcr:Skew', 1))
     model = read(source)
     assert names_of(model) == list(NAMES[1:])
@@ -381,30 +339,8 @@ def test_versions_of_meshroom_write_focal_lengths_in_four_ways(tmp_path: Path) -
             entry | ({"pxFocalLength": focal} if focal else {})
         ]}))  # fmt: skip
         lens = read(source).photos[0].lens
-        assert lens is not None
         np.testing.assert_allclose(lens.focal, focal_px, rtol=1e-14)
         np.testing.assert_allclose(lens.principal_point, center, rtol=1e-14)
-
-
-def test_points_are_read_with_their_colours(tmp_path: Path) -> None:
-    points = np.random.default_rng(2).normal(size=(5, 3))
-    for program in ("meshroom", "opensfm"):
-        write, lens = LENSES[program]
-        (tmp_path / program).mkdir()
-        model = read(write(tmp_path / program, shots(lens, points=points)))  # type: ignore[operator]
-        np.testing.assert_array_equal(model.points, points)
-        assert model.point_colors.tolist() == [[200, 100, 50]] * 5
-
-
-def test_later_names_of_csv_columns(tmp_path: Path) -> None:
-    source, path = written(tmp_path, "csv")
-    before = read(source).photos
-    path.write_text(
-        path.read_text().replace("heading", "yaw").replace(",f,px,py", ",f_35mm,px_norm,py_norm")
-    )
-    after = read(source).photos
-    assert [(p.name, p.relative) for p in after] == [(p.name, p.relative) for p in before]
-    np.testing.assert_array_equal(after[0].cam_from_world, before[0].cam_from_world)
 
 
 def test_half_turns_of_opensfm(tmp_path: Path) -> None:
@@ -418,13 +354,6 @@ def test_half_turns_of_opensfm(tmp_path: Path) -> None:
     np.testing.assert_array_equal(turned[1], np.eye(3))
 
 
-def test_a_folder_with_two_files_of_a_format(tmp_path: Path) -> None:
-    _, path = written(tmp_path, "csv")
-    (tmp_path / "more.csv").write_bytes(path.read_bytes())
-    with pytest.raises(DatasetError, match=r"2 files of kind RealityScan CSV: cameras.csv, more"):
-        read(tmp_path)
-
-
 @pytest.mark.parametrize("program", LENSES)
 def test_the_folder_does_as_well_as_the_file(tmp_path: Path, program: str) -> None:
     source, path = written(tmp_path, program)
@@ -433,3 +362,14 @@ def test_the_folder_does_as_well_as_the_file(tmp_path: Path, program: str) -> No
     assert of_file.kind == of_folder.kind
     if program == "xmp":
         assert names_of(read(path)) == names_of(of_folder)
+    if program == "csv":
+        later = path.read_text().replace("heading", "yaw")  # later names of columns
+        path.write_text(later.replace(",f,px,py", ",f_35mm,px_norm,py_norm"))
+        after = read(source).photos
+        assert [(p.name, p.relative) for p in after] == [
+            (p.name, p.relative) for p in of_file.photos
+        ]
+        np.testing.assert_array_equal(after[0].cam_from_world, of_file.photos[0].cam_from_world)
+        (tmp_path / "more.csv").write_bytes(path.read_bytes())
+        with pytest.raises(DatasetError, match="2 files of kind RealityScan CSV"):
+            read(tmp_path)

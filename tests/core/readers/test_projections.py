@@ -30,11 +30,7 @@ from tests.core.readers.known_scene import (
 )
 
 EXACT_PX = 1e-6
-
-
 SIDE = max(WIDTH, HEIGHT)
-
-
 Pixels = dict[str, np.ndarray]
 
 
@@ -227,65 +223,33 @@ def polycam(folder: Path, points: np.ndarray) -> Pixels:
 
 
 TURN = rodrigues([0.4, -1.1, 0.7])
-
-
 RS = {
     "f": 31.0, "px": 0.011, "py": -0.007,
     "k1": -0.09, "k2": 0.03, "k3": -0.011, "t1": 0.004, "t2": -0.003,
 }  # fmt: skip
-
-
 MS = {
     "f": 88.0, "cx": 1.5, "cy": -2.25,
     "k1": -0.08, "k2": 0.02, "k3": -0.004, "p1": 0.003, "p2": -0.002,
 }  # fmt: skip
-
-
 MS_FISHEYE = {"f": 70.0, "cx": 1.0, "k1": -0.03, "k2": 0.01, "k3": -0.002, "k4": 0.001}
-
-
 MS_DECENTRED = {"f": 70.0, "b1": 0.6, "k1": -0.03, "k3": 0.002, "p1": 0.003, "p2": -0.002}
-
-
 OSFM = {
     "focal_x": 0.9, "focal_y": 0.91, "c_x": 0.012, "c_y": -0.008,
     "k1": -0.07, "k2": 0.02, "k3": -0.003, "p1": 0.002, "p2": -0.004,
 }  # fmt: skip
-
-
 OSFM_OPENCV = {
     "focal_x": 0.7, "focal_y": 0.71, "c_x": 0.01, "c_y": 0.02,
     "k1": -0.02, "k2": 0.01, "k3": -0.003, "k4": 0.001,
 }  # fmt: skip
-
-
 OSFM_SIMPLE = {"focal": 0.88, "k1": -0.1, "k2": 0.02}
-
-
 OSFM_FISHEYE = {"focal": 0.7, "k1": -0.02, "k2": 0.003}
-
-
 AV = {"f": 32.0, "cx": 1.25, "cy": -0.75, "k1": -0.06, "k2": 0.015, "k3": -0.002}
-
-
 AV_BROWN = AV | {"t1": 0.003, "t2": -0.002}
-
-
 POLYCAM = {"fx": 80.0, "fy": 81.0, "cx": 47.5, "cy": 33.0}
-
-
 Case = tuple[Callable[..., Path], dict[str, float], dict[str, object], Callable[..., Pixels], str]
-
-
 _CSV, _XMP = writers.write_realityscan_csv, writers.write_realityscan_xmp
-
-
 _MS, _AV, _OSFM = writers.write_metashape, writers.write_meshroom, writers.write_opensfm
-
-
 _SKEWED = MS | {"b1": 1.5, "b2": -0.8, "k4": 0.01}
-
-
 CASES: dict[str, Case] = {
     "csv": (_CSV, RS, {}, realityscan_csv, "FULL_OPENCV"),
     "csv-plain": (_CSV, {"f": 30.0}, {}, realityscan_csv, "PINHOLE"),

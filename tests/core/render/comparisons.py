@@ -163,6 +163,7 @@ def judge(
     near_z: float = 0.2,
     background: tuple[float, float, float] = (0.2, 0.5, 0.1),
     nearer_than: float = np.inf,
+    renderer: Renderer = render,
 ) -> Verdict:
     """Render with the kernels and from first principles and compare.
 
@@ -180,7 +181,7 @@ def judge(
     )
     truth = oracle.images()
     with torch.no_grad():
-        found = images_of(render(leaves(exact, torch.float32), camera, options))
+        found = images_of(renderer(leaves(exact, torch.float32), camera, options))
     clear = truth.margin > margin
     blended = {}
     for name in BLENDED:
@@ -200,7 +201,7 @@ def judge(
             near = has & (depth < nearer_than)
             weights["depth"] = np.where(near, np.random.default_rng(7).normal(size=near.shape), 0.0)
         losses = [{name: weights[name] for name in BLENDED}, {"depth": weights["depth"]}]
-        fast = [gradients_of(render, exact, camera, options, w, torch.float32) for w in losses]
+        fast = [gradients_of(renderer, exact, camera, options, w, torch.float32) for w in losses]
         if digits if gradient_digits is None else gradient_digits:
             wanted = oracle.gradients(losses)
         else:

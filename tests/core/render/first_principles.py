@@ -182,37 +182,44 @@ class FirstPrinciples:
     def images(self, start: np.ndarray | None = None) -> Truth:
         """Return every image; with ``start (h, w)`` the depth is one Newton step from there."""
         camera = self.camera
-        count = camera.width * camera.height
+        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+        truth = self.at(
+            np.stack([x.ravel(), y.ravel()], 1), None if start is None else start.ravel()
+        )
+        shape = (camera.height, camera.width)
+        return Truth(**{k: v.reshape(shape + v.shape[1:]) for k, v in vars(truth).items()})
+
+    def at(self, positions: np.ndarray, start: np.ndarray | None = None) -> Truth:
+        """Return (m, ...) what is seen at (m, 2) positions in pixels, on the image or not."""
+        count = len(positions)
         size = max(1, _ELEMENTS_PER_CHUNK // max(len(self.order), 1))
-        guess = None if start is None else start.reshape(-1)
         chunks = [
             self._pixels(
-                np.arange(first, min(first + size, count)),
-                None if guess is None else guess[first : first + size],
+                self._rays(positions[first : first + size]),
+                None if start is None else start[first : first + size],
             )
             for first in range(0, count, size)
         ]
-        whole = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
-        shape = (camera.height, camera.width)
-        return Truth(**{k: v.reshape(shape + v.shape[1:]) for k, v in whole.items()})
+        return Truth(
+            **{name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
+        )
 
-    def _rays(self, pixels: np.ndarray) -> np.ndarray:
+    def _rays(self, positions: np.ndarray) -> np.ndarray:
         """(p, 3) world directions whose component along the optical axis is 1."""
         camera, array = self.camera, self.numbers.array
-        x = (array(pixels % camera.width + 0.5) - array(camera.cx)) / array(camera.fx)
-        y = (array(pixels // camera.width + 0.5) - array(camera.cy)) / array(camera.fy)
+        x = (array(positions[:, 0]) - array(camera.cx)) / array(camera.fx)
+        y = (array(positions[:, 1]) - array(camera.cy)) / array(camera.fy)
         return x[:, None] * self.turn[0] + y[:, None] * self.turn[1] + self.turn[2]
 
-    def _pixels(self, pixels: np.ndarray, start: np.ndarray | None) -> dict[str, np.ndarray]:
+    def _pixels(self, rays: np.ndarray, start: np.ndarray | None) -> dict[str, np.ndarray]:
         numbers = self.numbers
-        rays = self._rays(pixels)  # (p, 3)
         pulled = _apply(self.precision[None], rays[:, None])  # (p, n, 3) Sigma^-1 r
         steep = (pulled * rays[:, None]).sum(-1)  # (p, n) 1 / variance along the ray
         peak = (pulled * self.gap).sum(-1) / steep  # (p, n) t*
         alpha = self._opacity_at(peak, rays[:, None], slice(None))
         capped = np.minimum(alpha, self.cap)
         seen = (capped >= self.least).astype(bool)
-        one = numbers.array(np.ones((len(pixels), 1)))
+        one = numbers.array(np.ones((len(rays), 1)))
         # A Gaussian that is too late would only darken what comes behind it, which is later still.
         through = np.cumprod(np.concatenate([one, np.where(seen, 1 - capped, 1)], 1), 1)
         late = (through[:, :-1] < 1e-4).astype(bool)

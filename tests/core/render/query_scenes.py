@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render import reference
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
-from tests.core.render.scenes import look_at, random_gaussians
+from tests.core.render.first_principles import FirstPrinciples
+from tests.core.render.scenes import isotropic, look_at, random_gaussians
 
 SHAPES = ("means", "log_scales", "quats", "opacity_logits")
 EYE = (2.2, 1.0, 0.8)
@@ -24,8 +24,39 @@ SCENES = {
 }
 
 
+def thin_layers() -> tuple[OrientedGaussians, Camera]:
+    """Return turned sheets of a hundredth of their distance and less, one behind the other."""
+    gaussians = random_gaussians(90, seed=4, dtype=torch.float32, opacity=(0.2, 0.6))
+    thickness = torch.linspace(-7.0, -4.0, 90)
+    logs = torch.stack([torch.full((90,), -0.5), torch.full((90,), -1.0), thickness], 1)
+    return gaussians.replaced(log_scales=logs), look_at((2.2, 1.0, 0.8), width=33, height=17)
+
+
+def opaque_stack() -> tuple[OrientedGaussians, Camera]:
+    """Return more Gaussians on every ray than a warp takes at once, and an opaque wall in them."""
+    count = 150
+    means = [(0.0, 0.02 * i, 0.0) for i in range(count)]
+    gaussians = isotropic(means, [0.5] * count, [0.03] * 70 + [0.95] * 80, torch.float32)
+    logs = gaussians.log_scales + torch.tensor([0.3, -1.0, 0.1])
+    quats = torch.tensor([[0.9, 0.1, -0.2, 0.3]]).repeat(count, 1)
+    return gaussians.replaced(log_scales=logs, quats=quats), Camera(
+        "front", 33, 17, 40.0, 40.0, 16.0, 8.0, look_at((0.0, -4.0, 0.0)).cam_from_world
+    )
+
+
+def one_tile() -> tuple[OrientedGaussians, Camera]:
+    """Return more Gaussians in one tile than a block has threads."""
+    gaussians = random_gaussians(400, seed=6, dtype=torch.float32, opacity=(0.02, 0.2))
+    return gaussians, look_at((2.2, 1.0, 0.8), width=16, height=16, focal=30.0)
+
+
+HARD = {"thin layers": thin_layers, "opaque stack": opaque_stack, "one tile": one_tile}
+
+
 def scene(name: str, seed: int = 3) -> tuple[OrientedGaussians, Camera]:
     """Return float32 Gaussians and a camera of several tiles, the last ones cut."""
+    if name in HARD:
+        return HARD[name]()
     values, count, eye = SCENES[name]
     gaussians = random_gaussians(count, seed=seed, dtype=torch.float32, sh_degree=1, **values)  # type: ignore[arg-type]
     return gaussians, look_at(eye, width=50, height=40, focal=60.0)
@@ -52,66 +83,12 @@ def reference_depth_at(
     return positions.new_zeros(len(positions)).index_put((seen,), depth)
 
 
-class Oracle:
-    """Numpy float64 from inverse covariances and world-space rays; bisection of 200 steps."""
-
-    def __init__(self, gaussians: OrientedGaussians, camera: Camera) -> None:
-        raw = {name: t.detach().double().numpy() for name, t in gaussians.tensors()}
-        self.camera = camera
-        variance = np.exp(2.0 * raw["log_scales"])
-        blurred = variance + raw["filter_3d"][:, None] ** 2
-        opacity = np.sqrt((variance / blurred).prod(1)) / (1.0 + np.exp(-raw["opacity_logits"]))
-        turn = Rotation.from_quat(raw["quats"][:, [1, 2, 3, 0]]).as_matrix()
-        precision = np.linalg.inv(turn @ (blurred[:, :, None] * turn.transpose(0, 2, 1)))
-        gap = raw["means"] - camera.center
-        distance = np.linalg.norm(gap, axis=1)
-        order = np.lexsort((np.arange(len(gap)), distance.astype(np.float32)))
-        order = order[gap[order] @ camera.forward > 0.2]
-        self.opacity, self.precision, self.gap = opacity[order], precision[order], gap[order]
-
-    def cast(self, positions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return alpha before its cap (0 where none), peak, sharpness (p, n) and final T (p,)."""
-        x, y = positions.astype(np.float64).T
-        camera = self.camera
-        local = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 0.0 * x + 1], 1)
-        rays = local @ camera.rotation  # (p, 3), z-depth 1
-        turned = np.einsum("nij,pj->pni", self.precision, rays)  # (p, n, 3)
-        sharpness = np.einsum("pi,pni->pn", rays, turned)
-        peak = np.einsum("ni,pni->pn", self.gap, turned) / sharpness
-        miss = peak[:, :, None] * rays[:, None, :] - self.gap  # (p, n, 3)
-        smallest = np.einsum("pni,nij,pnj->pn", miss, self.precision, miss, optimize=True)
-        raw = self.opacity * np.exp(-0.5 * smallest)
-        through = np.ones(len(positions))
-        for i in range(raw.shape[1]):
-            counts = (raw[:, i] >= 1.0 / 255.0) & (through >= 1e-4)
-            raw[:, i] = np.where(counts, raw[:, i], 0.0)
-            through *= 1.0 - np.minimum(raw[:, i], 0.99)
-        return raw, peak, sharpness, through
-
-    @staticmethod
-    def through(hits: tuple[np.ndarray, ...], t: np.ndarray) -> np.ndarray:
-        """T (p,) up to z-depth t (p,)."""
-        raw, peak, sharpness, _ = hits
-        ahead = np.maximum(peak - t[:, None], 0.0)
-        density = raw * np.exp(-0.5 * sharpness * ahead * ahead)
-        return np.prod(1.0 - np.minimum(density, 0.99), axis=1)
-
-    def depth(self, positions: np.ndarray, limit: float = 0.45) -> np.ndarray:
-        """z-depth (p,); 0 where there is none and off the image."""
-        size = np.array([self.camera.width, self.camera.height])
-        on_image = ((positions >= 0) & (positions <= size)).all(1)
-        hits = self.cast(positions)
-        low, high = np.zeros(len(positions)), np.full(len(positions), 1e3)
-        valid = on_image & (hits[3] <= limit) & (hits[3] < 0.5) & (self.through(hits, low) > 0.5)
-        kept = tuple(part[valid] for part in hits)
-        low, high = low[valid], high[valid]
-        for _ in range(200):
-            middle = 0.5 * (low + high)
-            clear = self.through(kept, middle) > 0.5
-            low, high = np.where(clear, middle, low), np.where(clear, high, middle)
-        out = np.zeros(len(positions))
-        out[valid] = low
-        return out
+def true_depth(gaussians: OrientedGaussians, camera: Camera, positions: np.ndarray) -> np.ndarray:
+    """Return the z-depths (m,) from first principles; 0 where there is none and off the image."""
+    on_image = ((positions >= 0) & (positions <= [camera.width, camera.height])).all(1)
+    depth = np.zeros(len(positions))
+    depth[on_image] = FirstPrinciples(gaussians, camera).at(positions[on_image]).depth
+    return depth
 
 
 def assert_depths(found: np.ndarray, wanted: np.ndarray) -> None:

@@ -21,6 +21,8 @@ from gaussian_wrapping_addon.core.render.reference import reference_projection
 from gaussian_wrapping_addon.core.render.types import ImageGradients, RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.scene.camera import Camera
+from tests.core.render.comparisons import leaves
+from tests.core.render.first_principles import TRAINED
 from tests.core.render.scenes import look_at, random_gaussians
 
 OPTIONS = RenderOptions(near_z=0.0, threads=1)
@@ -78,17 +80,14 @@ def test_kernel_and_definition_hide_the_same(camera: Camera) -> None:
 
 def test_hidden_rows_do_not_reach_the_gradients_of_the_definition() -> None:
     gaussians = spread_over_magnitudes(2000, 6, AXIS)
-    leaf = gaussians.replaced(
-        **{k: t.clone().requires_grad_(k != "filter_3d") for k, t in gaussians.tensors()}
-    )
+    leaf = leaves(gaussians, torch.float64)
     screen = reference_projection(leaf, AXIS, OPTIONS)
     screen.params.sum().backward()
-    for name, tensor in leaf.tensors():
-        if name != "filter_3d":
-            assert tensor.grad is not None
-            assert tensor.grad.isfinite().all(), name
-            assert not tensor.grad[~screen.usable].any(), name
-            assert tensor.grad[screen.usable].any(), name
+    for name in TRAINED:
+        gradient = getattr(leaf, name).grad
+        assert gradient.isfinite().all(), name
+        assert not gradient[~screen.usable].any(), name
+        assert gradient[screen.usable].any(), name
 
 
 def single(**values: float | list[float]) -> OrientedGaussians:
@@ -118,17 +117,12 @@ _TURN = [0.9, 0.3, 0.1, 0.2]
 # A pixel centre is at (10.5, 9.5): straight ahead of this camera.
 CENTERED = replace(AXIS, cx=10.5, cy=9.5)
 LARGE = replace(AXIS, width=20_000, height=16_000, fx=2e4, fy=2e4, cx=10_000.5, cy=8_000.5)
+DISC, SMALL = sigmas(1.0, 1.0, 1e-6), sigmas(1e-4, 1e-4, 1e-4)
 SANE = {
-    "sigma of 1e-4 at 1e5": (
-        single(means=[0.0, 0.0, 1e5], log_scales=sigmas(1e-4, 1e-4, 1e-4)),
-        CENTERED,
-    ),
-    "the same on 20000 px": (
-        single(means=[0.0, 0.0, 1e5], log_scales=sigmas(1e-4, 1e-4, 1e-4)),
-        LARGE,
-    ),
-    "disc of 1e6 : 1": (single(log_scales=sigmas(1.0, 1.0, 1e-6), quats=_TURN), CENTERED),
-    "disc of 1e6 : 1 on 20000 px": (single(log_scales=sigmas(1.0, 1.0, 1e-6), quats=_TURN), LARGE),
+    "sigma of 1e-4 at 1e5": (single(means=[0.0, 0.0, 1e5], log_scales=SMALL), CENTERED),
+    "the same on 20000 px": (single(means=[0.0, 0.0, 1e5], log_scales=SMALL), LARGE),
+    "disc of 1e6 : 1": (single(log_scales=DISC, quats=_TURN), CENTERED),
+    "disc of 1e6 : 1 on 20000 px": (single(log_scales=DISC, quats=_TURN), LARGE),
     "grazing disc of 1e6 : 1": (single(log_scales=sigmas(1.0, 1e-6, 1.0)), CENTERED),
     "needle of 1e6 : 1": (single(log_scales=sigmas(1.0, 1e-6, 1e-6)), CENTERED),
     "needle along the ray": (single(log_scales=sigmas(1e-6, 1e-6, 1.0)), LARGE),
@@ -221,35 +215,26 @@ def at_limit(name: str, value: float) -> tuple[OrientedGaussians, Camera]:
 
 def test_gradients_scale_beyond_the_squares_of_float32() -> None:
     """Lengths are taken in float64: upstream gradients times 2^90 give results times 2^90."""
-    gaussians = random_gaussians(12, 4, dtype=torch.float32)
+    raw = RawArrays.from_gaussians(random_gaussians(12, 4, dtype=torch.float32))
     camera = look_at((0.3, -3.0, 0.2), width=20, height=18)
     options = RenderOptions(threads=1, statistics=True, budget_bytes=1)
-    random = np.random.default_rng(2)
-    renderer, scale = ViewRenderer(), np.float32(2.0**90)
+    renderer, random = ViewRenderer(), np.random.default_rng(2)
+    shapes = [(18, 20, 3)] * 3 + [(18, 20)] * 2
+    upstream = [random.normal(size=shape).astype(np.float32) for shape in shapes]
 
-    def gradients(factor: np.float32) -> dict[str, np.ndarray]:
-        view = renderer.render(RawArrays.from_gaussians(gaussians), camera, options)
-        images = view.color, view.normal, view.geometric_normal, view.alpha, view.depth
-        out = view.backward(ImageGradients(*(u * factor for u in upstream(images))))
+    def gradients(factor: float) -> dict[str, np.ndarray]:
+        view = renderer.render(raw, camera, options)
         assert view.bands > 1
-        assert view.statistics is not None
-        names = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
-        found = {name: getattr(out, name).copy() for name in names}
+        out = view.backward(ImageGradients(*(one * np.float32(factor) for one in upstream)))
+        found = {name: getattr(out, name).copy() for name in TRAINED}
         for name in ("grad_px", "grad_abs_px"):
             found[name] = getattr(view.statistics, name).copy()
         return found
 
-    drawn: list[np.ndarray] = []
-
-    def upstream(images: tuple[np.ndarray, ...]) -> list[np.ndarray]:
-        if not drawn:
-            drawn.extend(random.normal(size=image.shape).astype(np.float32) for image in images)
-        return drawn
-
-    one, many = gradients(np.float32(1.0)), gradients(scale)
-    for name, value in one.items():
+    many = gradients(2.0**90)
+    for name, value in gradients(1.0).items():
         assert value.any(), name
-        np.testing.assert_allclose(many[name], value * scale, rtol=1e-6, err_msg=name)
+        np.testing.assert_allclose(many[name], value * np.float32(2.0**90), 1e-6, err_msg=name)
     # Beyond float32 a gradient is 0, as a whole.
-    for name, value in gradients(np.float32(2.0**126)).items():
+    for name, value in gradients(2.0**126).items():
         assert np.isfinite(value).all(), name

@@ -16,6 +16,7 @@ from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.render.comparisons import judge, leaves
+from tests.core.render.depth_scenes import joined
 from tests.core.render.first_principles import IMAGES, TRAINED
 from tests.core.render.scenes import look_at, random_gaussians
 from tests.poses import look_at_pose
@@ -81,16 +82,9 @@ def cameras(draw: st.DrawFn) -> Camera:
     center = st.sampled_from([0.5, 0.3, -2.0, 1e4, -1e9])
     eye = np.random.default_rng(draw(seeds)).normal(size=3)
     eye *= draw(st.sampled_from([1.0, 3.0, 1e-6, 1e4, 1e12]))
-    return Camera(
-        "any",
-        width,
-        height,
-        focal,
-        focal * draw(st.sampled_from([1.0, 0.2, 1e4])),
-        width * draw(center),
-        height * draw(center),
-        look_at_pose(eye),
-    )
+    aspect = draw(st.sampled_from([1.0, 0.2, 1e4]))
+    cx, cy = width * draw(center), height * draw(center)
+    return Camera("any", width, height, focal, focal * aspect, cx, cy, look_at_pose(eye))
 
 
 def run(
@@ -161,7 +155,6 @@ ZOOMED = replace(PLAIN, fx=1e9, fy=1e9)
 AROUND = {"log_scales": 1.5, "means": [0.0, -2.5, 0.0], "filter_3d": 0.0}
 ABSURD = {
     "principal point 1e30 px away": (one_wild(**AROUND), FAR_CENTER),
-    "harmonics of 1e30": (one_wild(sh=1e30), PLAIN),
     "harmonics of 3e38": (one_wild(sh=3e38), PLAIN),
     "harmonics of 1e30 on 1e9 px": (one_wild(sh=1e30, means=0.03), ZOOMED),
     "harmonics of -3e38": (one_wild(sh=-3e38), PLAIN),
@@ -183,7 +176,6 @@ ABSURD = {
     "log scales of -1e30 without filter": (one_wild(log_scales=-1e30, filter_3d=0.0), PLAIN),
     "log scales of 1e30": (one_wild(log_scales=1e30), PLAIN),
     "log scales of 80": (one_wild(log_scales=80.0), PLAIN),
-    "log scales of 300": (one_wild(log_scales=300.0), PLAIN),
     "opacity logit of 1e30": (one_wild(opacity_logits=1e30), PLAIN),
     "opacity logit of -1e30": (one_wild(opacity_logits=-1e30), PLAIN),
     "quaternion of 3e38": (one_wild(quats=3e38), PLAIN),
@@ -216,12 +208,8 @@ ABSURD = {
 @pytest.mark.parametrize("near_z", [0.2, 0.0, -1.0])
 def test_absurd_values_stay_finite(name: str, near_z: float) -> None:
     gaussians, camera = ABSURD[name]
-    # A plain one behind it must not be lost.
-    plain = one_wild()
-    parts = zip(gaussians.tensors(), plain.tensors(), strict=True)
-    both = OrientedGaussians(**{key: torch.cat([one, two]) for (key, one), (_, two) in parts})
     options = RenderOptions(near_z=near_z, statistics=True, threads=1)
-    view, images, gradients = run(both, camera, options)
+    view, images, gradients = run(joined(gaussians, one_wild()), camera, options)
     for key, image in images.items():
         assert np.isfinite(image).all(), key
     for key, gradient in gradients.items():
@@ -231,6 +219,7 @@ def test_absurd_values_stay_finite(name: str, near_z: float) -> None:
     for key in ("radii_px", "weight_sum", "weight_max", "grad_px", "grad_abs_px"):
         assert np.isfinite(getattr(statistics, key)).all(), key
     if camera is PLAIN:
+        # The plain one behind it is not lost.
         assert statistics.visible[1]
         assert gradients["means"][1].any()
 
@@ -287,12 +276,9 @@ def test_bitwise_the_same_for_any_number_of_threads(
         view, images, gradients = run(
             gaussians, camera, RenderOptions(threads=threads, statistics=True)
         )
-        figures = view.statistics
-        assert figures is not None
         names = ("visible", "radii_px", "weight_sum", "weight_max", "grad_px", "grad_abs_px")
-        results.append(
-            {**images, **gradients, **{f"{n} figure": getattr(figures, n) for n in names}}
-        )
+        figures = {f"{name} figure": getattr(view.statistics, name) for name in names}
+        results.append({**images, **gradients, **figures})
     for other in results[1:]:
         for name, value in results[0].items():
             np.testing.assert_array_equal(other[name], value, err_msg=name)

@@ -14,16 +14,9 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection import (
-    RawArrays,
-    RawGradients,
-    project_backward,
-    project_gaussians,
-)
-from gaussian_wrapping_addon.core.render.reference import reference_projection, render_reference
+from gaussian_wrapping_addon.core.render.reference import render_reference
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
-from gaussian_wrapping_addon.core.scene.camera import Camera
 from tests.core.render.comparisons import (
     gradients_of,
     images_of,
@@ -36,11 +29,9 @@ from tests.core.render.comparisons import (
 from tests.core.render.first_principles import IMAGES, TRAINED, FirstPrinciples
 from tests.core.render.scenes import front_camera, look_at, one_gaussian, random_gaussians
 
+LARGE = look_at((2.2, 1.0, 0.8), width=48, height=36, focal=52.0)
 DEPTH_SCENES = {
-    "2000 generic": (
-        lambda: random_gaussians(2000, 41, scale=(0.01, 0.12)),
-        look_at((2.2, 1.0, 0.8), width=48, height=36, focal=52.0),
-    ),
+    "2000 generic": (lambda: random_gaussians(2000, 41, scale=(0.01, 0.12)), LARGE),
     "2000 faint": (
         lambda: random_gaussians(2000, 43, scale=(0.03, 0.2), opacity=(0.01, 0.2)),
         look_at((2.2, 1.0, 0.8), width=32, height=24, focal=40.0),
@@ -53,10 +44,6 @@ DEPTH_SCENES = {
         lambda: random_gaussians(500, 47, scale=(0.03, 0.3)),
         look_at((0.1, 0.2, 0.0), (1.0, 0.3, 0.2), width=48, height=36, focal=30.0),
     ),
-    "mixed sizes": (
-        lambda: random_gaussians(800, 49, scale=(0.003, 1.0), opacity=(0.02, 0.999)),
-        look_at((2.6, -1.0, 0.3), width=48, height=36, focal=52.0),
-    ),
     "a wall at a grazing angle": (
         lambda: one_gaussian((5.0, 0.01, 5.0), 0.95, (0.0, 0.0, 0.0), 1.3, 0),
         front_camera(48, 36, focal=40.0),
@@ -65,7 +52,7 @@ DEPTH_SCENES = {
 
 
 @pytest.mark.parametrize("name", DEPTH_SCENES)
-def test_depth_against_bisection(name: str, record_property: pytest.RecordProperty) -> None:
+def test_depth_against_bisection(name: str) -> None:
     make, camera = DEPTH_SCENES[name]
     gaussians = narrowed(make())
     truth = FirstPrinciples(gaussians, camera).images()
@@ -79,7 +66,6 @@ def test_depth_against_bisection(name: str, record_property: pytest.RecordProper
     has = sure & (truth.depth > 0)
     assert has.sum() > 100
     error = abs(found - truth.depth)[has] / truth.depth[has]
-    record_property("worst relative depth error", float(error.max()))
     # Flat discs seen at a grazing angle: 1 + p.d and its denominator all but cancel in float32.
     share = 0.997 if name == "500 flat discs" else 0.999
     assert float((error < 1e-5).mean()) >= share, (error.max(), np.quantile(error, 0.999))
@@ -96,22 +82,23 @@ def generic(count: int = 120, seed: int = 31, **options: object) -> OrientedGaus
     return narrowed(random_gaussians(count, seed, **{"opacity": (0.1, 0.97), **options}))  # type: ignore[arg-type]
 
 
+GENERIC = look_at((2.2, 1.0, 0.8), width=33, height=21, focal=36.0)
+
+
 @functools.cache
-def generic_view() -> tuple[OrientedGaussians, Camera, dict[str, np.ndarray]]:
+def generic_view() -> tuple[OrientedGaussians, dict[str, np.ndarray]]:
     gaussians = generic(sh_degree=3)
-    camera = look_at((2.2, 1.0, 0.8), width=33, height=21, focal=36.0)
-    truth = FirstPrinciples(gaussians, camera).images()
+    truth = FirstPrinciples(gaussians, GENERIC).images()
     assert (truth.depth > 0).mean() > 0.3
-    return gaussians, camera, random_weights(truth, margin=1e-4)
+    return gaussians, random_weights(truth, margin=1e-4)
 
 
 @pytest.mark.parametrize("image", IMAGES)
 def test_item_13_each_image_to_each_parameter(image: str) -> None:
-    gaussians, camera, weights = generic_view()
-    loss = {image: weights[image]}
-    options = RenderOptions(threads=2)
-    fast = gradients_of(render, gaussians, camera, options, loss, torch.float32)
-    exact = gradients_of(render_reference, gaussians, camera, options, loss, torch.float64)
+    gaussians, weights = generic_view()
+    given = gaussians, GENERIC, RenderOptions(threads=2), {image: weights[image]}
+    fast = gradients_of(render, *given, torch.float32)
+    exact = gradients_of(render_reference, *given, torch.float64)
     for name in TRAINED:
         if image in DEPENDENT.get(name, IMAGES):
             error = relative_l2(fast[name], exact[name])
@@ -121,39 +108,29 @@ def test_item_13_each_image_to_each_parameter(image: str) -> None:
             assert not fast[name].any(), name
 
 
-view = functools.partial(look_at, width=28, height=21, focal=32.0)
-
-
+SIDE = look_at((2.2, 1.0, 0.8), width=28, height=21, focal=32.0)
+WITHIN = look_at((0.1, 0.2, 0.0), (1.0, 0.3, 0.2), width=28, height=21, focal=32.0)
+NEAR = look_at((1.6, 0.6, 0.5), width=28, height=21, focal=50.0)
 # Name: Gaussians, camera, bounds of the gradient of images and of depth. The last column is loose
 # where float32 depths resolve sigma poorly, see test_stability_images.py.
 SCENES = {
-    "generic": (lambda: generic(), view((2.2, 1.0, 0.8)), 5e-6, 5e-5),
-    "from within": (lambda: generic(200, 1), view((0.1, 0.2, 0.0), (1.0, 0.3, 0.2)), 1e-5, 1e-4),
+    "generic": (lambda: generic(), SIDE, 5e-6, 5e-5),
+    "from within": (lambda: generic(200, 1), WITHIN, 1e-5, 1e-4),
     "many small": (
-        lambda: generic(400, 3, scale=(0.004, 0.02), filter_size=0.004),
-        view((1.6, 0.6, 0.5), focal=50.0),
+        lambda: generic(400, 3, scale=(0.004, 0.02), filter_size=4e-3),
+        NEAR,
         1e-4,
         1e-3,
     ),
     "large and dense": (
         lambda: generic(60, 5, scale=(0.3, 1.5), opacity=(0.6, 0.999)),
-        view((2.2, 1.0, 0.8)),
+        SIDE,
         1e-5,
         1e-4,
     ),
-    "faint": (lambda: generic(400, 7, opacity=(0.01, 0.08)), view((2.2, 1.0, 0.8)), 1e-5, 1e-4),
-    "flat discs": (
-        lambda: generic(150, 9, scale=(0.002, 0.4), filter_size=0.001),
-        view((2.2, 1.0, 0.8)),
-        1e-4,
-        1e-3,
-    ),
-    "opaque": (
-        lambda: generic(80, 11, opacity=(0.98, 0.99999)),
-        view((2.2, 1.0, 0.8)),
-        1e-5,
-        1e-4,
-    ),
+    "faint": (lambda: generic(400, 7, opacity=(0.01, 0.08)), SIDE, 1e-5, 1e-4),
+    "flat discs": (lambda: generic(150, 9, scale=(0.002, 0.4), filter_size=1e-3), SIDE, 1e-4, 1e-3),
+    "opaque": (lambda: generic(80, 11, opacity=(0.98, 0.99999)), SIDE, 1e-5, 1e-4),
 }
 
 
@@ -165,45 +142,3 @@ def test_item_13_hard_scenes(name: str) -> None:
         blended=2e-5, depth=1e-4, gradient=gradient, depth_gradient=depth_gradient, clear=0.97
     )
     assert verdict.found["alpha"].max() > 0.5
-
-
-@pytest.mark.parametrize("name", TRAINED)
-def test_item_13_analytic_projection_in_float64(name: str) -> None:
-    """The hand-written backward of the projection against central differences of its forward."""
-    gaussians = random_gaussians(4, 8, sh_degree=3)
-    camera = look_at((2.0, 0.6, 0.9))
-    options = RenderOptions(threads=1)
-    random = np.random.default_rng(2)
-    arrays = RawArrays.from_gaussians(gaussians)
-    screen = project_gaussians(arrays, camera, options)
-    assert screen.visible.all()
-    weights = random.normal(size=screen.params.shape) / (abs(screen.params).max(0) + 1e-3)
-    weights[:, 23] = 0.0
-    found = RawGradients.zeros(arrays)
-    project_backward(arrays, camera, options, screen, weights, found)
-    values = getattr(gaussians, name)
-    wanted = np.zeros(values.shape)
-    step = 1e-6
-    for at in np.ndindex(*values.shape):
-        sums = []
-        for side in (step, -step):
-            moved = values.clone()
-            moved[at] += side
-            # The forward pass writes float32: torch's projection is its float64 form.
-            wide = reference_projection(gaussians.replaced(**{name: moved}), camera, options)
-            sums.append(float((wide.params.numpy() * weights).sum()))
-        wanted[at] = (sums[0] - sums[1]) / (2.0 * step)
-    assert relative_l2(getattr(found, name), wanted) < 1e-7
-
-
-def test_gradients_add_up_over_images() -> None:
-    gaussians, camera, weights = generic_view()
-    options = RenderOptions(threads=1)
-    whole = gradients_of(render, gaussians, camera, options, weights, torch.float32)
-    parts = [
-        gradients_of(render, gaussians, camera, options, {image: weights[image]}, torch.float32)
-        for image in IMAGES
-    ]
-    for name in TRAINED:
-        total = np.sum([part[name] for part in parts], axis=0)
-        assert relative_l2(total, whole[name]) < 5e-6, name

@@ -10,7 +10,6 @@ from typing import Any
 
 import llvmlite.binding
 import numba
-import numpy as np
 import pytest
 import torch
 
@@ -18,7 +17,7 @@ from gaussian_wrapping_addon.core.render import projection, projection_kernels, 
 from gaussian_wrapping_addon.core.render.depth_query import query_gradient_range
 from gaussian_wrapping_addon.core.render.query_kernels import query_range
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.simd import aligned_zeros, vector_lanes
+from gaussian_wrapping_addon.core.render.simd import vector_lanes
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from tests.core.render.comparisons import leaves
 from tests.core.render.query_autograd import query_depth
@@ -26,25 +25,27 @@ from tests.core.render.query_scenes import scene
 from tests.core.render.scenes import look_at, random_gaussians
 
 PACKED = re.compile(r"\bvfn?m(?:add|sub)\d+ps\b.*%[yz]mm")
-
-
 SINGLE = re.compile(r"\bvfn?m(?:add|sub)\d+ss\b")
+
+
+def compiled_anew(kernel: Any, signature: Any) -> str:
+    """Compile a kernel, since cached code keeps no listing; return its assembly."""
+    options = {k: v for k, v in kernel.targetoptions.items() if k != "nopython"}
+    fresh = numba.njit(**options)(kernel.py_func)
+    fresh.compile(signature)
+    return str(fresh.inspect_asm(fresh.signatures[0]))
 
 
 @functools.cache
 def listing_of(kernel: Any) -> str:
-    """Compile a kernel anew, since cached code keeps no listing; return its assembly."""
-    options = {k: v for k, v in kernel.targetoptions.items() if k != "nopython"}
-    fresh = numba.njit(**options)(kernel.py_func)
-    signature = kernel.signatures[0]
-    fresh.compile(signature)
-    return str(fresh.inspect_asm(signature))
+    return compiled_anew(kernel, kernel.signatures[0])
 
 
-def fused_instructions(kernel: Any) -> tuple[int, int]:
+def assert_packed(kernel: Any, least: int) -> None:
     """Count packed and single FMAs of a kernel."""
     listing = listing_of(kernel)
-    return len(PACKED.findall(listing)), len(SINGLE.findall(listing))
+    assert len(PACKED.findall(listing)) >= least
+    assert len(SINGLE.findall(listing)) < len(PACKED.findall(listing))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -62,37 +63,22 @@ def _compiled() -> None:
         (out.color.sum() + out.depth.sum()).backward()
 
 
-def test_blending_is_packed() -> None:
-    packed, single = fused_instructions(raster.forward_kernel(vector_lanes(), False, False))
+def test_rendering_is_packed() -> None:
+    lanes = vector_lanes()
     # Nine channels, six for the exponential, four for the conic and the quadratic.
-    assert packed >= 19
-    assert single < packed
-
-
-def test_gradient_is_packed() -> None:
-    packed, single = fused_instructions(raster.backward_kernel(vector_lanes(), True, False))
-    # Two exponentials, the conic, nine products with the loss, and most of the sums.
-    assert packed >= 40
-    assert single < packed
-
-
-def test_isosurface_is_packed() -> None:
-    blending, _ = fused_instructions(raster.forward_kernel(vector_lanes(), False, False))
-    packed, single = fused_instructions(raster.forward_kernel(vector_lanes(), True, False))
+    assert_packed(raster.forward_kernel(lanes, False, False), 19)
     # Blending in three loops, and the solver's exponential and products.
-    assert packed >= 3 * 19 + 9
-    assert packed > blending
-    assert single < packed
+    assert_packed(raster.forward_kernel(lanes, True, False), 3 * 19 + 9)
+    # Two exponentials, the conic, nine products with the loss, and most of the sums.
+    assert_packed(raster.backward_kernel(lanes, True, False), 40)
 
 
 def test_queries_use_packed_arithmetic() -> None:
     gaussians, camera = scene("generic")
     leaf = leaves(gaussians, torch.float32)
     query_depth(leaf, camera, torch.full((1, 2), 20.0)).sum().backward()
-    for kernel, least in ((query_range, 30), (query_gradient_range, 40)):
-        packed, single = fused_instructions(kernel)
-        assert packed >= least
-        assert single < packed
+    assert_packed(query_range, 30)
+    assert_packed(query_gradient_range, 40)
 
 
 def test_no_reference_is_counted_in_the_inner_loops() -> None:
@@ -108,36 +94,11 @@ def test_no_reference_is_counted_in_the_inner_loops() -> None:
         assert not any("NRT_" in block for block in hot)
 
 
-def test_runs_are_aligned_to_cache_lines() -> None:
-    for count in (1, 15, 1000):
-        values = aligned_zeros(count)
-        assert len(values) == count
-        assert values.dtype == np.float32
-        assert values.ctypes.data % 64 == 0
-
-
 ARITHMETIC = r"\bv(?:fn?m(?:add|sub)\d+|mul|add|sub|div|sqrt)"
-
-
 PACKED_DOUBLES = re.compile(ARITHMETIC + r"pd\b.*%[yz]mm")
-
-
 SINGLE_DOUBLES = re.compile(ARITHMETIC + r"sd\b")
-
-
 FUSED = re.compile(r"\bvfn?m(?:add|sub)\d+pd\b.*%[yz]mm")
-
-
 SPILLED = re.compile(r"\bcall\w*\b")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _this_processor() -> None:
-    machine = platform.machine().lower()
-    if machine not in ("x86_64", "amd64"):
-        pytest.skip(f"packed FMA is looked for in x86 code; this machine is {machine}")
-    if not llvmlite.binding.get_host_cpu_features().get("fma"):
-        pytest.skip("this processor has no FMA instructions")
 
 
 @pytest.mark.parametrize(
@@ -151,13 +112,8 @@ def _this_processor() -> None:
     ],
 )
 def test_blocks_are_packed(kernel: Any, with_camera: bool, fused: int) -> None:
-    options = {k: v for k, v in kernel.targetoptions.items() if k != "nopython"}
-    fresh = numba.njit(**options)(kernel.py_func)
-    values = numba.float64[::1]
-    signature = (values, values) if with_camera else (values,)
-    fresh.compile(signature)
+    listing = compiled_anew(kernel, (numba.float64[::1],) * (2 if with_camera else 1))
     # The function itself, without the wrappers that Python calls it through.
-    listing = str(fresh.inspect_asm(fresh.signatures[0]))
     body = listing[: listing.index("_ZN7cpython")]
     assert len(FUSED.findall(body)) >= fused
     # A few scalars are computed once per block from the camera; no lane is done alone.

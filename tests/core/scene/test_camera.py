@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -73,11 +71,10 @@ def test_values_that_no_camera_has_are_refused(change: dict[str, Any]) -> None:
 
 CAMERAS = {
     "barrel": LensCamera("SIMPLE_RADIAL", 200, 150, (180.0, 102.0, 74.0, -0.15)),
-    "pincushion": LensCamera("RADIAL", 200, 150, (180.0, 98.0, 76.0, 0.15, 0.02)),
     "opencv": LensCamera("OPENCV", 120, 200, (140, 141, 61, 99, 0.06, -0.08, 1e-3, -2e-3)),
     "fisheye": LensCamera("OPENCV_FISHEYE", 200, 160, (120, 120, 100, 80, 0.02, 0.0, 0.0, 0.0)),
-    "full": LensCamera(
-        "FULL_OPENCV", 200, 150, (180, 180, 100, 75, 0.1, 0.02, 0, 0, 0.01, 0.05, 0, 0)
+    "skewed": Brown(-0.2, 0.06, -0.01, 0.002, p1=0.003, p2=-0.002, skew=0.8).lens(
+        120, 90, (100.0, 103.0), (60.0, 45.0)
     ),
 }
 
@@ -90,17 +87,6 @@ def opencv_pixel(camera: LensCamera, x: np.ndarray, y: np.ndarray) -> tuple[np.n
     u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     v = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
     return fx * u + cx, fy * v + cy
-
-
-def test_map_is_the_lens_formula() -> None:
-    camera = CAMERAS["opencv"]
-    pinhole = pinhole_of(camera)
-    where = sampling_map(camera, pinhole)
-    fx, fy, cx, cy = pinhole.params
-    columns, rows = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
-    u, v = opencv_pixel(camera, (columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy)
-    np.testing.assert_allclose(where[..., 0], u, atol=2e-5)
-    np.testing.assert_allclose(where[..., 1], v, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", CAMERAS)
@@ -233,32 +219,11 @@ def test_broken_photos_name_the_file(tmp_path: Path) -> None:
     }
     for name, content in cases.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(DatasetError, match=name):
-            read_photo(tmp_path / name)
     (tmp_path / "folder.jpg").mkdir()
     (tmp_path / "link.jpg").symlink_to(tmp_path / "nowhere.jpg")
-    for name in ("folder.jpg", "link.jpg"):
+    for name in (*cases, "folder.jpg", "link.jpg"):
         with pytest.raises(DatasetError, match=name):
             read_photo(tmp_path / name)
-
-
-def test_bomb_is_refused_on_its_header(tmp_path: Path) -> None:
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-        )
-
-    path = tmp_path / "bomb.png"
-    size = struct.pack(">IIBBBBB", 50_000, 40_000, 8, 0, 0, 0, 0)
-    rows = zlib.compress(bytes(50_001 * 100))
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
-    )
-    with pytest.raises(DatasetError, match="50000 x 40000 pixels; the limit"):
-        read_photo(path)
-
-
-BENT = Brown(-0.2, 0.06, -0.01, 0.002, p1=0.003, p2=-0.002, skew=0.8)
 
 
 def rays() -> np.ndarray:
@@ -279,11 +244,13 @@ def test_agrees_with_pycolmap_without_k4_and_skew() -> None:
 
 
 def test_every_pixel_leads_back_to_its_ray() -> None:
-    camera = BENT.lens(120, 90, (100.0, 103.0), (60.0, 45.0))
+    camera = CAMERAS["skewed"]
     assert camera.model == SKEWED_BROWN
     lens = SkewedBrown(camera)
     back = lens.cam_from_img(lens.img_from_cam(rays()))
     np.testing.assert_allclose(back, rays()[:, :2], rtol=0, atol=1e-12)
+    half = camera.resized(60, 45)
+    np.testing.assert_allclose(project(half, rays()), 0.5 * project(camera, rays()), atol=1e-12)
 
 
 def test_pixels_that_no_ray_reaches_are_not_a_number() -> None:
@@ -291,14 +258,3 @@ def test_pixels_that_no_ray_reaches_are_not_a_number() -> None:
     slopes = SkewedBrown(camera).cam_from_img(np.array([[60.0, 45.0], [119.0, 45.0]]))
     np.testing.assert_allclose(slopes[0], 0.0, atol=1e-15)
     assert np.isnan(slopes[1]).all()
-
-
-def test_resized_photos_and_undistortion() -> None:
-    camera = BENT.lens(120, 90, (100.0, 103.0), (60.0, 45.0))
-    half = camera.resized(60, 45)
-    np.testing.assert_allclose(project(half, rays()), 0.5 * project(camera, rays()), atol=1e-12)
-    pinhole = pinhole_of(camera)
-    assert (pinhole.width, pinhole.height) > (100, 80)
-    pixels = sampling_map(camera, pinhole)
-    assert pixels.reshape(-1, 2).min() >= 0
-    assert (pixels.reshape(-1, 2).max(0) <= [120, 90]).all()

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
 from gaussian_wrapping_addon.core.limits import SCENE_RADIUS
-from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity, rotation_from_quaternion
+from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
 from gaussian_wrapping_addon.core.scene.frames import (
     CENTER_STEP,
     FRAME_STEP,
@@ -62,39 +65,30 @@ def off_deg(up: np.ndarray, expected: np.ndarray = UP) -> float:
 MIXED = np.array(
     [0, 90, 0, 0, 270, 90, 0, 0, 90, 0, 90, 0, 0, 90, 0, 270, 0, 0, 90, 0, 0, 90, 0, 0]
 )
+QUARTERS = np.where(np.arange(24) % 2, 90.0, 270.0)
+SOME_DOWN = np.where(np.arange(24) % 6 == 0, 180.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    "rolls",
-    [0.0, 90.0, 270.0, MIXED, np.roll(MIXED, 5), np.where(np.arange(24) % 2, 90.0, 270.0)],
-)
+@pytest.mark.parametrize("rolls", [0.0, 90.0, 270.0, MIXED, np.roll(MIXED, 5), QUARTERS, SOME_DOWN])
 @pytest.mark.parametrize("sweep", [2 * np.pi, 2.0])
 def test_up_of_hand_held_cameras(rolls: np.ndarray | float, sweep: float) -> None:
-    up, _ = camera_up(*orbit(rolls, sweep=sweep))
-    assert off_deg(up) < 4.0
+    assert off_deg(camera_up(*orbit(rolls, sweep=sweep))[0]) < 4.0
 
 
 @pytest.mark.parametrize("rolls", [0.0, 90.0, MIXED])
 def test_exact_where_hands_are_steady(rolls: np.ndarray | float) -> None:
-    up, _ = camera_up(*orbit(rolls, noise=0.0))
-    assert off_deg(up) < 1e-4
+    assert off_deg(camera_up(*orbit(rolls, noise=0.0))[0]) < 1e-4
 
 
-@pytest.mark.parametrize("rolls", [0.0, 90.0, MIXED])
+@pytest.mark.parametrize("rolls", [0.0, MIXED])
 @pytest.mark.parametrize(("scale", "away"), [(1e-3, 0.0), (1e4, 0.0), (1.0, 4e6)])
 def test_up_turns_with_the_scene(rolls: np.ndarray | float, scale: float, away: float) -> None:
     rotations, centers = orbit(rolls)
     base, rule = camera_up(rotations, centers)
-    q, _ = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))
-    q = q if np.linalg.det(q) > 0 else -q
+    q = Rotation.random(random_state=8).as_matrix()
     up, same_rule = camera_up(rotations @ q.T, scale * centers @ q.T + away)
     assert same_rule == rule
     assert off_deg(up, q @ base) < 1e-3
-
-
-def test_a_few_photos_upside_down_do_not_count() -> None:
-    rolls = np.where(np.arange(24) % 6 == 0, 180.0, 0.0)
-    assert off_deg(camera_up(*orbit(rolls))[0]) < 4.0
 
 
 def test_all_upside_down_is_taken_for_upright_cameras() -> None:
@@ -110,24 +104,11 @@ def test_quarter_turns_take_the_sign_of_the_look(height: float) -> None:
     assert off_deg(up, np.sign(height) * UP) < 4.0
 
 
-def test_one_camera_is_its_own_up() -> None:
-    rotation = look_at_pose([3.0, 0.0, 0.0])[None, :, :3]
-    assert off_deg(camera_up(rotation, np.array([[3.0, 0, 0]]))[0]) < 1e-6
-
-
-def test_two_cameras_that_face_each_other_share_their_up() -> None:
-    poses = [look_at_pose([3.0, 0, 0]), look_at_pose([-3.0, 0, 0])]
-    rotations = np.array([p[:, :3] for p in poses])
-    assert off_deg(camera_up(rotations, np.array([[3.0, 0, 0], [-3.0, 0, 0]]))[0]) < 1e-6
-
-
-def random_rotations(count: int) -> np.ndarray:
-    random = np.random.default_rng(11)
-    found = []
-    for _ in range(count):
-        q, _ = np.linalg.qr(random.normal(size=(3, 3)))
-        found.append(q if np.linalg.det(q) > 0 else -q)
-    return np.array(found)
+def test_one_camera_and_two_that_face_each_other_have_their_own_up() -> None:
+    rotations = np.array([look_at_pose([x, 0, 0])[:, :3] for x in (3.0, -3.0)])
+    centers = np.array([[3.0, 0, 0], [-3.0, 0, 0]])
+    for count in (1, 2):
+        assert off_deg(camera_up(rotations[:count], centers[:count])[0]) < 1e-6
 
 
 def opposite() -> tuple[np.ndarray, np.ndarray]:
@@ -140,7 +121,10 @@ def opposite() -> tuple[np.ndarray, np.ndarray]:
     "cameras",
     [
         (np.zeros((0, 3, 3)), np.zeros((0, 3))),
-        (random_rotations(40), np.random.default_rng(1).normal(size=(40, 3))),
+        (
+            Rotation.random(40, random_state=11).as_matrix(),
+            np.random.default_rng(1).normal(size=(40, 3)),
+        ),
         opposite(),
         orbit(90.0, height=0.0, noise=0.0),
         (np.full((3, 3, 3), np.nan), np.zeros((3, 3))),
@@ -188,8 +172,8 @@ def tilt(faces: Faces, degrees: float) -> tuple[Faces, np.ndarray]:
     return (faces[0] @ rotation.T, faces[1] @ rotation.T, faces[2]), rotation @ UP
 
 
-@pytest.mark.parametrize("degrees", [0.0, 2.0, -6.0])
-@pytest.mark.parametrize(("scale", "away"), [(1.0, 0.0), (1e-3, 0.0), (1e4, 0.0), (1.0, 1e3)])
+@pytest.mark.parametrize("degrees", [0.0, -6.0])
+@pytest.mark.parametrize(("scale", "away"), [(1e-3, 0.0), (1e4, 0.0), (1.0, 1e3)])
 def test_a_table_is_found_and_levelled(degrees: float, scale: float, away: float) -> None:
     (centers, normals, areas), true_up = tilt(table(), degrees)
     plane = find_ground_plane(scale * centers + away, normals, scale**2 * areas, UP)
@@ -213,16 +197,14 @@ def test_the_cap_of_a_region_that_cuts_through_does_not_count() -> None:
     assert abs(plane.point[2]) < 1e-3
 
 
-def cube() -> Faces:
-    faces = sheet(0.5, 0.5, (0, 0, 1))
-    return together(faces, (-faces[0], -faces[1], faces[2]))
+TOP = sheet(0.5, 0.5, (0, 0, 1))
 
 
 @pytest.mark.parametrize(
     "faces",
     [
         ball(1.0, 0.0),
-        cube(),
+        together(TOP, (-TOP[0], -TOP[1], TOP[2])),
         together(*[sheet(0.2 * k, 1.0, (0, 0, 1), 20) for k in range(5)]),
         sheet(0.0, 1.0, (0, 0, -1)),
         (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)),
@@ -247,23 +229,13 @@ def moved(pose: np.ndarray, new_from_old: Similarity) -> np.ndarray:
     return np.concatenate([rotation, -(rotation @ center)[:, None]], 1)
 
 
-def some_rotation() -> np.ndarray:
-    q, r = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))
-    q = q * np.sign(np.diag(r))
-    return q if np.linalg.det(q) > 0 else -q
-
-
 def wobbly_arc(count: int = 24, sweep: float = 2.0) -> list[np.ndarray]:
     """Poses of a hand-held camera over part of a circle, looking down and not quite level."""
     rng = np.random.default_rng(1)
     poses = []
     for angle in np.linspace(0, sweep, count):
         center = np.array([3 * np.cos(angle), 3 * np.sin(angle), 2.0]) + 0.05 * rng.normal(size=3)
-        pose = look_at_pose(center, np.zeros(3))
-        roll = 0.03 * rng.normal()
-        c, s = np.cos(roll), np.sin(roll)
-        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        poses.append(turn @ pose)
+        poses.append(rolled(look_at_pose(center), np.degrees(0.03 * rng.normal())))
     return poses
 
 
@@ -278,14 +250,14 @@ def test_mean_radius_and_right_handed_up() -> None:
     np.testing.assert_allclose(rotation @ [0, 0, 1], [0, 0, 1], atol=2 * FRAME_STEP)
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+@pytest.mark.parametrize("scale", [1e-3, 1e4])
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (5e5, 4e6, 0.0)])
 def test_same_frame_for_any_similarity_of_the_input(
     scale: float, offset: tuple[float, float, float]
 ) -> None:
     poses = wobbly_arc()
     base, centers = frame_of(poses)
-    change = Similarity(scale, some_rotation(), np.array(offset))
+    change = Similarity(scale, TURN, np.array(offset))
     frame, far_centers = frame_of([moved(pose, change) for pose in poses])
     expected = base.scene_from_world.points(centers)
     # What float64 holds of the input: the offset's last digit, seen at the scene's scale.
@@ -308,12 +280,9 @@ def test_up_of_a_pitched_arc_is_the_true_up() -> None:
 
 def test_portrait_cameras_fall_back_to_their_plane_path() -> None:
     """Cameras rolled by +-45 degrees have no level axis, but their path is a circle."""
-    rng = np.random.default_rng(2)
-    poses = []
-    for i, pose in enumerate(ring_poses(16)):
-        roll = np.radians(45.0 if i % 2 else -45.0) + 0.02 * rng.normal()
-        c, s = np.cos(roll), np.sin(roll)
-        poses.append(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ pose)
+    hands = np.degrees(0.02 * np.random.default_rng(2).normal(size=16))
+    rolls = np.where(np.arange(16) % 2, 45.0, -45.0) + hands
+    poses = [rolled(pose, roll) for pose, roll in zip(ring_poses(16), rolls, strict=True)]
     frame, _ = frame_of(poses)
     assert frame.up_rule == "plane camera path"
     np.testing.assert_allclose(frame.scene_from_world.rotation[2], [0, 0, 1], atol=1e-6)
@@ -339,14 +308,8 @@ def test_degenerate_camera_sets() -> None:
     np.testing.assert_allclose(frame.scene_from_world.rotation[2], [0, 0, 1], atol=1e-9)
 
 
-def rotation_about(axis: list[float], degrees: float) -> np.ndarray:
-    a = np.array(axis) / np.linalg.norm(axis)
-    k = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-    angle = np.radians(degrees)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
-
-
-TRUE = Similarity(3.7, rotation_about([1, 2, -1], 131.0), np.array([5.0, -2.0, 0.3]))
+TURN = Rotation.random(random_state=5).as_matrix()
+TRUE = Similarity(3.7, TURN, np.array([5.0, -2.0, 0.3]))
 
 
 def assert_same(found: Similarity, true: Similarity, tolerance: float) -> None:
@@ -358,22 +321,15 @@ def assert_same(found: Similarity, true: Similarity, tolerance: float) -> None:
 
 def test_umeyama_is_exact() -> None:
     points = np.random.default_rng(0).normal(size=(20, 3))
-    assert_same(umeyama(points, TRUE.points(points), with_scale=True), TRUE, 1e-13)
+    corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0]])
+    for some in (points, corner):
+        assert_same(umeyama(some, TRUE.points(some), with_scale=True), TRUE, 1e-13)
     rigid = Similarity(1.0, TRUE.rotation, TRUE.translation)
     assert_same(umeyama(points, rigid.points(points), with_scale=False), rigid, 1e-13)
-
-
-def test_three_points_in_a_plane_are_enough() -> None:
-    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0]])
-    assert_same(umeyama(points, TRUE.points(points), with_scale=True), TRUE, 1e-13)
-
-
-def test_huge_coordinates_keep_their_digits() -> None:
-    points = np.random.default_rng(1).normal(size=(50, 3)) + np.array([4e6, -7e6, 3e5])
-    target = TRUE.points(points)
-    found = umeyama(points, target, with_scale=True)
+    far = points + np.array([4e6, -7e6, 3e5])
+    found = umeyama(far, TRUE.points(far), with_scale=True)
     # 3.7 x 7e6 has a rounding of 4e-9.
-    assert np.abs(found.points(points) - target).max() < 2e-7
+    assert np.abs(found.points(far) - TRUE.points(far)).max() < 2e-7
     np.testing.assert_allclose(found.rotation, TRUE.rotation, atol=1e-9)
 
 
@@ -396,14 +352,10 @@ def test_a_mirror_image_gets_the_best_proper_rotation() -> None:
     ],
 )
 def test_degenerate_pairs_are_refused(points: np.ndarray, words: str) -> None:
-    for call in (
-        lambda: umeyama(points, points, with_scale=True),
-        lambda: umeyama_ransac(
-            points, points, threshold=1.0, iterations=10, seed=0, with_scale=True
-        ),
-    ):
-        with pytest.raises(DatasetError, match=words):
-            call()
+    with pytest.raises(DatasetError, match=words):
+        umeyama(points, points, with_scale=True)
+    with pytest.raises(DatasetError, match=words):
+        umeyama_ransac(points, points, threshold=1.0, iterations=10, seed=0, with_scale=True)
 
 
 def test_ransac_survives_forty_percent_of_outliers() -> None:
@@ -412,14 +364,12 @@ def test_ransac_survives_forty_percent_of_outliers() -> None:
     target = TRUE.points(points)
     wrong = rng.permutation(100)[:40]
     target[wrong] += rng.normal(size=(40, 3)) * 5 + 3
-    found = umeyama_ransac(
-        points, target, threshold=0.05, iterations=100_000, seed=0, with_scale=True
+    found, again = (
+        umeyama_ransac(points, target, threshold=0.05, iterations=100_000, seed=0, with_scale=True)
+        for _ in range(2)
     )
     assert set(np.flatnonzero(~found.inliers)) == set(wrong)
     assert np.abs(found.transform.points(points) - TRUE.points(points)).max() < 1e-8
-    again = umeyama_ransac(
-        points, target, threshold=0.05, iterations=100_000, seed=0, with_scale=True
-    )
     assert (again.transform.matrix() == found.transform.matrix()).all()
 
 
@@ -435,12 +385,6 @@ def test_pairs_that_do_not_belong_together_are_refused() -> None:
 RANDOM = np.random.default_rng(11)
 
 
-def random_rotation() -> np.ndarray:
-    rotation = rotation_from_quaternion(RANDOM.normal(size=4))
-    assert rotation is not None
-    return rotation
-
-
 def test_noise_below_half_a_step_leaves_no_trace() -> None:
     step = CENTER_STEP
     cells = step * RANDOM.integers(-(2**20), 2**20, (1000, 3))
@@ -450,17 +394,16 @@ def test_noise_below_half_a_step_leaves_no_trace() -> None:
 
 
 def test_a_camera_moves_by_less_than_a_step_and_stays_a_rotation() -> None:
-    for _ in range(50):
-        rotation, center = random_rotation(), RANDOM.uniform(-5, 5, 3)
+    for rotation in Rotation.random(50, random_state=1).as_matrix():
+        center = RANDOM.uniform(-5, 5, 3)
         pose = np.concatenate([rotation, -(rotation @ center)[:, None]], 1)
         camera = Camera("a", 80, 64, 90.0, 90.0, 40.0, 32.0, pose)
         near = snapped_camera(camera)
         np.testing.assert_allclose(near.center, center, atol=0.5 * CENTER_STEP + 1e-14)
         np.testing.assert_allclose(near.rotation, rotation, atol=4 * ROTATION_STEP)
         np.testing.assert_allclose(near.rotation @ near.rotation.T, np.eye(3), atol=1e-15)
-        wobble = np.concatenate([rotation, -(rotation @ center)[:, None]], 1)
-        wobble[:, 3] *= 1.0 + 2.0**-52
-        again = snapped_camera(Camera("a", 80, 64, 90.0, 90.0, 40.0, 32.0, wobble))
+        wobble = pose * [1.0, 1.0, 1.0, 1.0 + 2.0**-52]
+        again = snapped_camera(dataclasses.replace(camera, cam_from_world=wobble))
         np.testing.assert_array_equal(again.cam_from_world, near.cam_from_world)
 
 
@@ -470,7 +413,7 @@ def test_half_turns_whose_quaternion_has_no_sign() -> None:
         np.testing.assert_array_equal(snapped_rotation(turn, ROTATION_STEP), turn)
 
 
-@pytest.mark.parametrize("length", [0.0, 1e-7, 0.013, 1.0, 37.5, 1e6])
+@pytest.mark.parametrize("length", [0.0, 1e-7, 37.5, 1e6])
 def test_lengths_keep_their_significant_bits(length: float) -> None:
     near = snapped_length(length)
     assert abs(near - length) <= length * 2.0**-LENGTH_BITS

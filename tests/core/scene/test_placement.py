@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.errors import ParseError, UsageError
 from gaussian_wrapping_addon.core.scene.camera import Similarity
 from gaussian_wrapping_addon.core.scene.placement import (
-    Plane,
     check_scale,
     ground_step,
     origin_step,
@@ -27,16 +27,12 @@ from gaussian_wrapping_addon.core.scene.placement import (
 NOTHING = np.zeros((0, 3))
 
 
-def some_rotation(seed: int) -> np.ndarray:
-    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    q = q * np.sign(np.diag(r))
-    return q if np.linalg.det(q) > 0 else -q
-
-
 def some_similarity(seed: int) -> Similarity:
     random = np.random.default_rng(seed)
     return Similarity(
-        float(10 ** random.uniform(-3, 3)), some_rotation(seed), random.normal(size=3)
+        float(10 ** random.uniform(-3, 3)),
+        Rotation.random(random_state=seed).as_matrix(),
+        random.normal(size=3),
     )
 
 
@@ -49,8 +45,8 @@ def test_after_is_one_then_the_other() -> None:
     np.testing.assert_allclose(back, np.eye(4), atol=1e-12)
 
 
-@pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
-@pytest.mark.parametrize("length", [1e-3, 1.0, 250.0])
+@pytest.mark.parametrize("size", [1e-3, 1e4])
+@pytest.mark.parametrize("length", [1e-3, 250.0])
 def test_scale_step_gives_the_length_and_keeps_the_origin(size: float, length: float) -> None:
     points = size * np.random.default_rng(4).normal(size=(2, 3))
     step = scale_step(points, length)
@@ -67,12 +63,9 @@ def test_scale_step_gives_the_length_and_keeps_the_origin(size: float, length: f
         ([[0, 0, 0]], 1.0, "One point is picked"),
         (NOTHING, 1.0, "No point"),
         ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], 1.0, "3 are picked"),
-        ([[0, 0, 0], [0, 0, 0]], 1.0, "coincide"),
         ([[1, 2, 3], [1, 2, 3]], 1.0, "coincide"),
         ([[1e5, 0, 0], [1e5 + 1e-3, 0, 0]], 1.0, "coincide"),
-        ([[0, 0, 0], [1, 0, 0]], 0.0, "not a distance"),
         ([[0, 0, 0], [1, 0, 0]], -2.0, "not a distance"),
-        ([[0, 0, 0], [1, 0, 0]], np.inf, "not a distance"),
         ([[0, 0, 0], [1, 0, 0]], np.nan, "not a distance"),
         ([[0, 0, 0], [np.nan, 0, 0]], 1.0, "not finite"),
     ],
@@ -83,14 +76,14 @@ def test_scale_step_refuses(points: object, length: float, text: str) -> None:
     assert caught.value.hint
 
 
-@pytest.mark.parametrize("seed", range(12))
-@pytest.mark.parametrize(("size", "away"), [(1.0, 0.0), (1e-3, 0.0), (1e4, 0.0), (1.0, 1e3)])
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("size", "away"), [(1e-3, 0.0), (1e4, 0.0), (1.0, 1e3)])
 @pytest.mark.parametrize("count", [3, 20])
 def test_three_points_become_the_ground(seed: int, size: float, away: float, count: int) -> None:
     random = np.random.default_rng(seed)
     flat = np.concatenate([random.uniform(-1, 1, (count, 2)), np.zeros((count, 1))], 1)
     above = np.concatenate([random.normal(size=(9, 2)), random.uniform(0.5, 3, (9, 1))], 1)
-    move = Similarity(size, some_rotation(seed), np.full(3, away))
+    move = Similarity(size, Rotation.random(random_state=seed).as_matrix(), np.full(3, away))
     points, cameras = move.points(flat), move.points(above)
     step = ground_step(plane_through(points, cameras))
     rounding = 1e-12 * max(size, away)
@@ -119,9 +112,7 @@ def test_the_side_of_a_plane_without_cameras_is_the_one_nearer_to_z() -> None:
         ([[0, 0, 0], [1, 0, 0]], "2 are picked"),
         ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], "one line"),
         ([[0, 0, 0], [1, 1, 1], [2, 2, 2.001]], "one line"),
-        ([[0, 0, 0], [0, 0, 0], [5, 0, 0]], "one line"),
         ([[3, 0, 0]] * 3, "coincide"),
-        ([[0, 0, 0]] * 3, "coincide"),
         ([[0, 0, 0], [1, 0, 0], [0, np.inf, 0]], "not finite"),
     ],
 )
@@ -147,11 +138,6 @@ def test_turn_to_z_is_the_shortest_turn_for_any_direction() -> None:
             assert 0.5 * (np.trace(rotation) - 1) == pytest.approx(direction[2], abs=1e-14)
 
 
-def test_ground_of_a_plane_that_looks_down() -> None:
-    step = ground_step(Plane(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, -1.0])))
-    np.testing.assert_allclose(step.points(np.array([[1.0, 2.0, 1.0]])), [[1, 2, 2]], atol=1e-15)
-
-
 def test_origin_step() -> None:
     point = np.array([1.0, -2.0, 5e5])
     np.testing.assert_array_equal(origin_step(point).points(point[None]), np.zeros((1, 3)))
@@ -160,7 +146,7 @@ def test_origin_step() -> None:
 
 
 def test_similarity_of_a_matrix() -> None:
-    for seed in range(20):
+    for seed in range(10):
         expected = some_similarity(seed)
         rough = expected.matrix().astype(np.float32).astype(np.float64)
         found = similarity_of_matrix(rough, "x")
@@ -210,7 +196,6 @@ def test_placement_file_is_exact_and_belongs_to_its_frame(tmp_path: Path) -> Non
     [
         {"version": 2},
         {"blender_from_scene": None},
-        {"blender_from_scene": {**Similarity().to_json(), "scale": 0.0}},
         {"blender_from_scene": {**Similarity().to_json(), "scale": -1.0}},
         {"blender_from_scene": {**Similarity().to_json(), "scale": 10**400}},
         {"blender_from_scene": {**Similarity().to_json(), "translation": [1, 2]}},
@@ -223,10 +208,8 @@ def test_broken_placement_files_are_refused(tmp_path: Path, change: dict) -> Non
     path = tmp_path / "placement.json"
     write_placement(path, Similarity(), Similarity())
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(ParseError, match=r"placement\.json") as caught:
-        read_placement(path, Similarity())
-    assert "Delete the file" in caught.value.hint
-    path.write_text(path.read_text()[:20])
-    with pytest.raises(ParseError, match=r"placement\.json") as caught:
-        read_placement(path, Similarity())
-    assert "Delete the file" in caught.value.hint
+    for text in (path.read_text(), path.read_text()[:20]):
+        path.write_text(text)
+        with pytest.raises(ParseError, match=r"placement\.json") as caught:
+            read_placement(path, Similarity())
+        assert "Delete the file" in caught.value.hint

@@ -36,12 +36,9 @@ def test_markers(text: str, wanted: MarkerSpec | None) -> None:
     [
         ("4x4_50", "have no size.*DICTIONARY:SIZE"),
         ("4x4_51:0.05", "no marker dictionary '4x4_51'. Use one of 4x4_50,"),
-        (":0.05", "no marker dictionary ''"),
         ("4x4_50:0", "marker size '0' is not a length"),
-        ("4x4_50:-0.05", "'-0.05' is not"),
         ("4x4_50:5cm", "'5cm' is not.*in metres"),
         ("4x4_50:nan", "'nan' is not"),
-        ("4x4_50:inf", "'inf' is not"),
         ("4x4_50:1001", "up to 1000 m"),
         ("4x4_50:", "'' is not"),
     ],

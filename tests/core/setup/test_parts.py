@@ -11,13 +11,11 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core.errors import ResourceError, UsageError, WorkerError
-from gaussian_wrapping_addon.core.jobs import client as job_client
 from gaussian_wrapping_addon.core.jobs import install
 from gaussian_wrapping_addon.core.jobs.install import FoundPython, SetupRequest
 from gaussian_wrapping_addon.core.worker import environment
 from gaussian_wrapping_addon.core.worker.environment import (
     Requirement,
-    interpreter_of,
     read_requirements,
 )
 
@@ -35,22 +33,19 @@ def fake_python(folder: Path, version: str, name: str = "python3", bits: int = 6
 
 
 @pytest.mark.parametrize(
-    ("version", "bits", "words"),
-    [("[3, 10, 4]", 64, "3.10.4, which is too old"), ("[2, 7, 18]", 64, "too old"),
-     ("[3, 12, 1]", 32, "32-bit"), ("no", 64, "does not run as a Python")],
+    ("version", "name", "bits", "words"),
+    [("[3, 10, 4]", "python3", 64, "3.10.4, which is too old"),
+     ("[3, 12, 1]", "python3", 32, "32-bit"), ("no", "python3", 64, "does not run as a Python"),
+     ("[3, 11, 1]", "blender-4.3", 64, "is Blender")],
 )  # fmt: skip
-def test_pythons_that_are_refused(tmp_path: Path, version: str, bits: int, words: str) -> None:
-    path = fake_python(tmp_path, version, bits=bits)
+def test_pythons_that_are_refused(
+    tmp_path: Path, version: str, name: str, bits: int, words: str
+) -> None:
+    path = fake_python(tmp_path, version, name, bits)
     with pytest.raises(UsageError, match=words):
         install.probe(path)
     assert install.find_pythons(paths=[path]) == []
-
-
-def test_blender_is_no_python(tmp_path: Path) -> None:
-    path = fake_python(tmp_path, "[3, 11, 1]", "blender-4.3")
-    with pytest.raises(UsageError, match="is Blender"):
-        install.probe(path)
-    assert path not in install.candidates(path)
+    assert (path in install.candidates(path)) == (name == "python3")
 
 
 def test_pythons_with_wheels_come_first(tmp_path: Path) -> None:
@@ -76,17 +71,12 @@ def test_the_words_of_the_launcher() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("choice", "system", "index"),
-    [("cpu", "Linux", install.CPU_INDEX), ("cuda", "Linux", ""), ("cpu", "Windows", ""),
-     ("cuda", "Windows", install.CUDA_INDEX), ("cpu", "Darwin", ""), ("index", "Linux", ""),
-     ("index", "Windows", "")],
-)  # fmt: skip
-def test_where_torch_comes_from(choice: str, system: str, index: str) -> None:
-    assert install.torch_index(choice, system) == index
-
-
-def test_no_cuda_on_macos() -> None:
+def test_where_torch_comes_from() -> None:
+    for choice, system, index in (
+        ("cpu", "Linux", install.CPU_INDEX), ("cuda", "Linux", ""), ("cpu", "Windows", ""),
+        ("cuda", "Windows", install.CUDA_INDEX), ("cpu", "Darwin", ""), ("index", "Linux", ""),
+    ):  # fmt: skip
+        assert install.torch_index(choice, system) == index
     with pytest.raises(UsageError, match="no CUDA"):
         install.torch_index("cuda", "Darwin")
 
@@ -106,6 +96,12 @@ def test_commands_are_shown_as_they_run(monkeypatch: pytest.MonkeyPatch) -> None
     _, pip, _ = install.all_commands(offline, PYTHON)
     assert {"--isolated", "--no-index", "--find-links", "/wheels"} <= set(pip)
     assert not [word for word in pip if "http" in word]
+    plain = replace(PYTHON, has_venv=False)  # Blender's own on Windows
+    (pip,) = install.all_commands(SetupRequest("/w", "/p", "/r.txt", "index"), plain)
+    assert pip[:4] == (PYTHON.path, "-I", "-m", "pip")
+    assert pip[-2:] == ("--target", "/w/env")
+    with pytest.raises(UsageError, match=r"neither venv nor pip.*python3\.12-venv"):
+        install.all_commands(SetupRequest("/w", "/p", "/r.txt"), replace(plain, pip=()))
 
 
 @pytest.mark.parametrize("torch", ["cpu", "cuda", "index"])
@@ -142,22 +138,9 @@ def test_the_list_with_hashes_is_that_of_our_requirements() -> None:
         assert len(re.findall(r"--hash=sha256:[0-9a-f]{64}\b", entry)) >= 1, name
     wanted = read_requirements(ours)
     assert {r.name for r in wanted} - set(pinned) == {"torch"}
+    assert all(r.versions for r in wanted)
     for requirement in wanted:
         assert all(requirement.allows(v) for v in pinned.get(requirement.name, []))
-
-
-def test_a_python_without_venv_installs_into_a_folder() -> None:
-    """Blender's own on Windows."""
-    plain = FoundPython("/p", (3, 11, 2), has_venv=False)
-    (pip,) = install.all_commands(SetupRequest("/w", "/p", "/r.txt", "index"), plain)
-    assert pip[:4] == ("/p", "-I", "-m", "pip")
-    assert pip[-2:] == ("--target", "/w/env")
-
-
-def test_a_python_with_nothing_is_refused() -> None:
-    bare = FoundPython("/p", (3, 11, 2), has_venv=False, pip=())
-    with pytest.raises(UsageError, match=r"neither venv nor pip.*python3\.11-venv"):
-        install.all_commands(SetupRequest("/w", "/p", "/r.txt"), bare)
 
 
 @pytest.mark.parametrize(
@@ -168,12 +151,6 @@ def test_a_python_with_nothing_is_refused() -> None:
 )  # fmt: skip
 def test_versions(versions: str, version: str, answer: bool) -> None:
     assert Requirement("x", versions).allows(version) is answer
-
-
-def test_our_list_is_read() -> None:
-    found = read_requirements(environment.requirements_file())
-    assert {"numpy", "torch", "xatlas"} <= {r.name for r in found}
-    assert all(r.versions for r in found)
 
 
 def test_lists_that_are_refused(tmp_path: Path) -> None:
@@ -201,14 +178,3 @@ def test_failures_get_their_type(words: str, kind: type, text: str) -> None:
     assert type(error) is kind
     assert text in error.message
     assert error.hint
-
-
-def test_no_worker_at_all_names_the_button(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(job_client.PYTHON_VARIABLE, raising=False)
-    monkeypatch.setattr(job_client, "_has_torch", lambda: False)
-    with pytest.raises(UsageError, match=r"No worker is set up.*Set Up Worker.*set-up-worker"):
-        job_client.worker_python()
-
-
-def test_a_plain_interpreter_is_itself() -> None:
-    assert interpreter_of("/usr/bin/python3") == ("/usr/bin/python3", "")

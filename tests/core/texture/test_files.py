@@ -24,8 +24,6 @@ from gaussian_wrapping_addon.core.texture.files import write_glb, write_obj, wri
 from tests.core.texture.texture_scenes import box
 
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-
-
 UTM = Similarity(3.5, TURN, np.array([512_345.678, 4_123_456.789, 123.4]))
 
 
@@ -51,6 +49,13 @@ def same_triangles(one: np.ndarray, other: np.ndarray, tolerance: float) -> None
     assert np.abs(ordered(one) - ordered(other)).max() <= tolerance
 
 
+def read_glb(path: Path) -> tuple[dict, bytes]:
+    """The JSON and the binary part."""
+    data = path.read_bytes()
+    (size,) = struct.unpack("<I", data[12:16])
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
     folder = tmp_path / "a new" / "folder"
@@ -58,19 +63,14 @@ def files(tmp_path: Path) -> Path:
     return folder
 
 
-def test_names_of_the_contract(files: Path) -> None:
+def test_names_of_the_contract_and_arrays_for_blender(files: Path) -> None:
     assert {p.name for p in files.iterdir()} == {
         "mesh.npz", "mesh.ply", "mesh.glb", "mesh.obj", "mesh.mtl", "albedo.png", "transform.json",
     }  # fmt: skip
-
-
-def test_arrays_for_blender(files: Path) -> None:
     textured = cube()
     with np.load(files / "mesh.npz", allow_pickle=False) as arrays:
-        assert set(arrays.files) == {"vertices", "faces", "corner_uvs"}
-        assert arrays["vertices"].dtype == np.float64
-        assert arrays["faces"].dtype == np.int32
-        assert arrays["corner_uvs"].dtype == np.float32
+        kinds = {name: arrays[name].dtype for name in arrays.files}
+        assert kinds == {"vertices": "f8", "faces": "i4", "corner_uvs": "f4"}
         assert (arrays["vertices"] == textured.mesh.vertices).all()
         assert (arrays["corner_uvs"] == textured.corner_uvs).all()
     assert (np.asarray(Image.open(files / "albedo.png")) == textured.albedo).all()
@@ -89,35 +89,27 @@ def test_glb_read_by_trimesh_is_the_same_mesh_and_image(files: Path) -> None:
     assert read.volume == pytest.approx(6.0, rel=1e-6)
 
 
-def test_glb_follows_the_container_format(files: Path) -> None:
+def test_glb_follows_the_container_format_and_is_unlit_without_maps(files: Path) -> None:
     data = (files / "mesh.glb").read_bytes()
-    magic, version, length = struct.unpack("<4sII", data[:12])
-    assert (magic, version, length) == (b"glTF", 2, len(data))
+    assert struct.unpack("<4sII", data[:12]) == (b"glTF", 2, len(data))
     size, kind = struct.unpack("<I4s", data[12:20])
     assert (kind, size % 4) == (b"JSON", 0)
-    document = json.loads(data[20 : 20 + size])
     rest, kind = struct.unpack("<I4s", data[20 + size : 28 + size])
     assert (kind, rest) == (b"BIN\0", len(data) - size - 28)
-    binary = data[28 + size :]
+    document, binary = read_glb(files / "mesh.glb")
     for accessor in document["accessors"]:
         view = document["bufferViews"][accessor["bufferView"]]
         assert view["byteOffset"] % 4 == 0
         width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}[accessor["type"]]
         assert view["byteLength"] == 4 * width * accessor["count"]
-    place = document["bufferViews"][document["images"][0]["bufferView"]]
-    png = binary[place["byteOffset"] : place["byteOffset"] + place["byteLength"]]
-    assert Image.open(io.BytesIO(png)).size == (32, 32)
     normals = document["bufferViews"][1]
-    begin = normals["byteOffset"]
-    values = np.frombuffer(binary[begin : begin + normals["byteLength"]], "<f4").reshape(-1, 3)
-    assert np.abs(np.linalg.norm(values, axis=1) - 1).max() < 1e-5
-
-
-def read_glb(path: Path) -> tuple[dict, bytes]:
-    """The JSON and the binary part."""
-    data = path.read_bytes()
-    (size,) = struct.unpack("<I", data[12:16])
-    return json.loads(data[20 : 20 + size]), data[28 + size :]
+    values = np.frombuffer(binary, "<f4", normals["byteLength"] // 4, normals["byteOffset"])
+    assert np.abs(np.linalg.norm(values.reshape(-1, 3), axis=1) - 1).max() < 1e-5
+    (material,) = document["materials"]
+    assert set(material) == {"name", "pbrMetallicRoughness", "extensions"}
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
+    assert len(document["textures"]) == len(document["images"]) == 1
+    assert "map_Bump" not in (files / "mesh.mtl").read_text()
 
 
 def test_maps_are_written_beside_and_into_the_files(tmp_path: Path) -> None:
@@ -153,25 +145,6 @@ def test_maps_are_written_beside_and_into_the_files(tmp_path: Path) -> None:
     assert (np.asarray(read.visual.material.normalTexture.convert("RGB")) == normal_map).all()
 
 
-def test_without_maps_files_are_unlit_and_without_links(files: Path) -> None:
-    document, _ = read_glb(files / "mesh.glb")
-    (material,) = document["materials"]
-    assert set(material) == {"name", "pbrMetallicRoughness", "extensions"}
-    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
-    assert len(document["textures"]) == len(document["images"]) == 1
-    assert "map_Bump" not in (files / "mesh.mtl").read_text()
-
-
-def test_levels_share_the_offset_that_they_are_given(tmp_path: Path) -> None:
-    offset = np.array([512_000.0, 4_123_000.0, 100.0])
-    write_textured(cube(), tmp_path, ("glb",), UTM, offset)
-    assert json.loads((tmp_path / "transform.json").read_text())["offset"] == offset.tolist()
-    document, _ = read_glb(tmp_path / "mesh.glb")
-    low = np.array(document["accessors"][0]["min"])
-    world = UTM.points(cube().mesh.vertices) - offset
-    assert low[[0, 1]] == pytest.approx(world.min(axis=0)[[0, 2]], rel=1e-6)
-
-
 def test_obj_read_by_trimesh_is_the_same_mesh_and_image(files: Path) -> None:
     textured = cube()
     read = trimesh.load(files / "mesh.obj", force="mesh", process=False)
@@ -190,34 +163,43 @@ def test_ply_keeps_doubles_at_utm_offsets(tmp_path: Path) -> None:
     vertices = generator.normal(size=(50, 3)) + UTM.translation
     faces = np.array([[k, k + 1, k + 2] for k in range(48)], np.int32)
     colors = generator.integers(0, 256, (50, 3), dtype=np.uint8)
-    write_mesh_ply(tmp_path / "m.ply", vertices, faces, colors)
-    read = trimesh.load(tmp_path / "m.ply", process=False)
-    assert read.vertices.dtype == np.float64
-    assert (read.vertices == vertices).all()
-    assert (read.faces == faces).all()
-    assert (read.visual.vertex_colors[:, :3] == colors).all()
-    write_mesh_ply(tmp_path / "plain.ply", vertices, faces)
-    assert (trimesh.load(tmp_path / "plain.ply", process=False).vertices == vertices).all()
+    for given in (colors, None):
+        write_mesh_ply(tmp_path / "m.ply", vertices, faces, given)
+        read = trimesh.load(tmp_path / "m.ply", process=False)
+        assert read.vertices.dtype == np.float64
+        assert (read.vertices == vertices).all()
+        assert (read.faces == faces).all()
+        assert given is None or (read.visual.vertex_colors[:, :3] == colors).all()
+    flat = replace(cube(), albedo=np.full((32, 32, 3), (10, 200, 30), np.uint8))
+    write_textured(flat, tmp_path, (), Similarity())
+    read = trimesh.load(tmp_path / "mesh.ply", process=False)
+    assert (read.visual.vertex_colors[:, :3] == [10, 200, 30]).all()
 
 
-def test_far_meshes_are_written_near_the_origin_with_their_offset(tmp_path: Path) -> None:
+@pytest.mark.parametrize("given", [None, np.array([512_000.0, 4_123_000.0, 100.0])])
+def test_far_meshes_are_written_near_the_origin_with_their_offset(
+    tmp_path: Path, given: np.ndarray | None
+) -> None:
+    """Levels share the offset that they are given."""
     textured = cube()
-    write_textured(textured, tmp_path, ("glb", "obj"), UTM)
+    write_textured(textured, tmp_path, ("glb", "obj"), UTM, given)
     world = UTM.points(textured.mesh.vertices)
     corners = world[textured.mesh.faces]
     facts = json.loads((tmp_path / "transform.json").read_text())
     offset = np.array(facts["offset"])
-    assert np.abs(world - offset).max() < 11
+    if given is None:
+        assert np.abs(world - offset).max() < 11
+    else:
+        assert offset.tolist() == given.tolist()
     assert (Similarity.from_json(facts["world_from_scene"]).matrix() == UTM.matrix()).all()
     ply = trimesh.load(tmp_path / "mesh.ply", process=False)
     assert (ply.vertices == world).all()
     glb = trimesh.load(tmp_path / "mesh.glb", force="mesh", process=False)
     back = glb.vertices[:, [0, 2, 1]] * [1, -1, 1] + offset
-    same_triangles(back[glb.faces], corners, 2e-6)
+    same_triangles(back[glb.faces], corners, 2e-6 if given is None else 1e-4)
     obj = trimesh.load(tmp_path / "mesh.obj", force="mesh", process=False)
     same_triangles((obj.vertices + offset)[obj.faces], corners, 1e-6)
-    data = (tmp_path / "mesh.glb").read_bytes()
-    document = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    document, _ = read_glb(tmp_path / "mesh.glb")
     assert document["nodes"][0]["extras"]["world_offset"] == offset.tolist()
 
 
@@ -233,23 +215,11 @@ def test_offsets_only_where_float32_would_show(centre: float, size: float, moved
     assert np.abs(local.astype(np.float32) - local).max() <= 1e-5 * size
 
 
-def test_ply_of_a_textured_mesh_has_the_texture_colours(tmp_path: Path) -> None:
-    textured = cube()
-    flat = TexturedMesh(
-        textured.mesh, textured.corner_uvs, np.full((32, 32, 3), (10, 200, 30), np.uint8)
-    )
-    write_textured(flat, tmp_path, (), Similarity())
-    read = trimesh.load(tmp_path / "mesh.ply", process=False)
-    assert (read.visual.vertex_colors[:, :3] == [10, 200, 30]).all()
-
-
 def spoiled(how: str) -> TexturedMesh:
     good = cube()
     vertices, faces, uvs = good.mesh.vertices.copy(), good.mesh.faces.copy(), good.corner_uvs.copy()
-    if how == "nan vertex":
-        vertices[2, 1] = np.nan
-    elif how == "infinite vertex":
-        vertices[0, 0] = np.inf
+    if "vertex" in how:
+        vertices[2, 1] = np.nan if how == "nan vertex" else np.inf
     elif how == "nan uv":
         uvs[3] = np.nan
     elif how == "no faces":
@@ -268,23 +238,24 @@ def test_bad_meshes_are_refused_and_write_nothing(how: str, tmp_path: Path) -> N
 
 
 def test_nan_is_refused_by_each_writer(tmp_path: Path) -> None:
-    bad = spoiled("nan vertex")
-    with pytest.raises(MeshingError, match="Vertex 2"):
-        write_mesh_ply(tmp_path / "m.ply", bad.mesh.vertices, bad.mesh.faces)
-    with pytest.raises(MeshingError, match="Vertex 2"):
-        write_obj(tmp_path / "m.obj", bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, ["a.png"])
-    path, png, zero = tmp_path / "m.glb", [b""], np.zeros(3)
-    with pytest.raises(MeshingError, match="Vertex 2"):
-        write_glb(path, bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, png, zero)
-    bad = spoiled("nan uv")
-    with pytest.raises(MeshingError, match="Face 3"):
-        write_glb(path, bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, png, zero)
-    with pytest.raises(MeshingError, match="Face 3"):
-        write_obj(tmp_path / "m.obj", bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, ["a.png"])
-    # Finite, but not in single precision.
-    good = cube()
+    def write(kind: str, textured: TexturedMesh, factor: float = 1.0) -> None:
+        path, vertices = tmp_path / f"m.{kind}", factor * textured.mesh.vertices
+        faces, uvs = textured.mesh.faces, textured.corner_uvs
+        if kind == "ply":
+            write_mesh_ply(path, vertices, faces)
+        elif kind == "obj":
+            write_obj(path, vertices, faces, uvs, ["a.png"])
+        else:
+            write_glb(path, vertices, faces, uvs, [b""], np.zeros(3))
+
+    for kind in ("ply", "obj", "glb"):
+        with pytest.raises(MeshingError, match="Vertex 2"):
+            write(kind, spoiled("nan vertex"))
+    for kind in ("obj", "glb"):
+        with pytest.raises(MeshingError, match="Face 3"):
+            write(kind, spoiled("nan uv"))
     with pytest.raises(MeshingError, match="not finite"):
-        write_glb(path, good.mesh.vertices * 1e39, good.mesh.faces, good.corner_uvs, png, zero)
+        write("glb", cube(), 1e39)  # finite, but not in single precision
     assert list(tmp_path.iterdir()) == []
 
 
@@ -292,24 +263,16 @@ def test_places_that_cannot_be_written_are_named(tmp_path: Path) -> None:
     good = cube()
     with pytest.raises(ResourceError, match="nowhere"):
         write_mesh_ply(tmp_path / "nowhere" / "m.ply", good.mesh.vertices, good.mesh.faces)
-    long = tmp_path / ("x" * 300)
-    with pytest.raises(ResourceError, match="cannot be written"):
-        write_textured(good, long, ("glb",), Similarity())
     (tmp_path / "file").write_text("")
-    with pytest.raises(ResourceError, match="cannot be written"):
-        write_textured(good, tmp_path / "file", ("glb",), Similarity())
+    for path in (tmp_path / ("x" * 300), tmp_path / "file"):
+        with pytest.raises(ResourceError, match="cannot be written"):
+            write_textured(good, path, ("glb",), Similarity())
 
 
 def test_unknown_formats_and_names_with_spaces_are_refused(tmp_path: Path) -> None:
-    good = cube()
+    mesh, uvs = cube().mesh, cube().corner_uvs
     with pytest.raises(UsageError, match="fbx"):
-        write_textured(good, tmp_path, ("fbx",), Similarity())
+        write_textured(cube(), tmp_path, ("fbx",), Similarity())
     with pytest.raises(UsageError, match="cannot refer to"):
-        write_obj(
-            tmp_path / "m.obj",
-            good.mesh.vertices,
-            good.mesh.faces,
-            good.corner_uvs,
-            ["my image.png"],
-        )
+        write_obj(tmp_path / "m.obj", mesh.vertices, mesh.faces, uvs, ["my image.png"])
     assert list(tmp_path.iterdir()) == []

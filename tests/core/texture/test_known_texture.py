@@ -64,7 +64,6 @@ def test_the_texture_comes_back(
     baked: TexturedMesh, photos: RenderedPhotos, pattern: SolidTexture
 ) -> None:
     truth, known = true_albedo(baked, pattern)
-    assert baked.views is not None
     seen = known & (baked.views > 0)
     assert psnr(baked.albedo[seen] - truth[seen]) > 31.0
     places = np.flatnonzero(known)

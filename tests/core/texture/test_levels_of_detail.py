@@ -25,8 +25,6 @@ from tests.core.texture.detail_scenes import bumpy_ball
 from tests.core.texture.texture_scenes import waves
 
 SIDE_PX = 512
-
-
 THREADS = 2
 
 
@@ -73,7 +71,6 @@ def test_each_level_is_closed_a_quarter_and_looks_alike(
         # Rays along the normals lean: a colour is met beside the place where it is looked for.
         wrong = level.albedo.reshape(-1, 3)[texels] - colors(points)
         assert np.sqrt((wrong**2).mean()) < 2.5
-        assert level.normal_map is not None
         assert level.normal_map.shape == level.albedo.shape
         assert level.occlusion is not None
         assert level.statistics["normal_map"]["dense_faces"] == len(painted.mesh.faces)
@@ -96,7 +93,7 @@ def test_levels_end_at_the_floor_and_maps_can_be_off(painted: TexturedMesh, tmp_
     assert none == []
 
 
-@pytest.mark.parametrize("level", [0, 1, 2, 3, 6])
+@pytest.mark.parametrize("level", [0, 3, 6])
 def test_no_colour_of_another_chart_comes_in(level: int) -> None:
     """Charts of one colour each, a texel apart: what is looked up in one is its own colour."""
     side = 64

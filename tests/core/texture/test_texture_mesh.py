@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError, UsageError
+from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.mesh.components import FaceGraph, face_graph
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
@@ -77,8 +77,7 @@ def test_colours_of_a_sphere_are_those_of_the_pattern(ball: TexturedMesh) -> Non
     assert ball.statistics["coverage"] > 0.99
     assert error.mean() < 2.0
     assert np.percentile(error, 99) < 10.0
-    squared = ((colors - waves(positions)) ** 2).mean()
-    assert 10 * np.log10(255**2 / squared) > 38.0
+    assert 10 * np.log10(255**2 / (error**2).mean()) > 38.0
 
 
 def test_statistics_are_plain_json_and_add_up(ball: TexturedMesh) -> None:
@@ -105,17 +104,20 @@ def test_threads_and_repeats_change_nothing(tmp_path: Path, ball: TexturedMesh) 
     assert (again.albedo == ball.albedo).all()
 
 
-def test_an_occluder_is_not_painted_on_what_lies_behind(tmp_path: Path) -> None:
-    wall_low, wall_high = [-2.0, 1.0, -1.5], [2.0, 1.2, 1.5]
-    plate_low, plate_high = [-0.4, 0.0, -0.4], [0.4, 0.05, 0.4]
-    mesh = joined(box(wall_low, wall_high, 4), box(plate_low, plate_high, 3))
-    red = plain((230, 20, 20))
+def wall_and_plate(cameras: list, folder: Path) -> tuple[TexturedMesh, FaceGraph]:
+    """A red plate before a blue wall."""
+    wall, plate = ([-2.0, 1.0, -2.0], [2.0, 1.2, 2.0]), ([-0.4, 0.0, -0.4], [0.4, 0.05, 0.4])
+    mesh = joined(box(*wall, 4), box(*plate, 3))
     things = [
-        (lambda o, r: box_hit(o, r, wall_low, wall_high), plain((30, 120, 200))),
-        (lambda o, r: box_hit(o, r, plate_low, plate_high), red),
+        (lambda o, r: box_hit(o, r, *wall), plain((30, 120, 200))),
+        (lambda o, r: box_hit(o, r, *plate), plain((230, 20, 20))),
     ]
+    return run(mesh, photograph(cameras, things), folder), face_graph(mesh.vertices, mesh.faces)
+
+
+def test_an_occluder_is_not_painted_on_what_lies_behind(tmp_path: Path) -> None:
     cameras = [look_at((x, -3.0, z), (0, 0.5, 0)) for x in (-1.0, 0.0, 1.0) for z in (-0.5, 0.5)]
-    textured = run(mesh, photograph(cameras, things), tmp_path)
+    textured, _ = wall_and_plate(cameras, tmp_path)
     positions, colors, normals = texels(textured)
     front = (positions[:, 1] > 0.999) & (normals[:, 1] < -0.9)
     assert front.sum() > 1000
@@ -127,25 +129,15 @@ def test_an_occluder_is_not_painted_on_what_lies_behind(tmp_path: Path) -> None:
 
 
 def test_hidden_texels_of_a_single_photo_are_counted_as_unseen(tmp_path: Path) -> None:
-    wall_low, wall_high = [-2.0, 1.0, -2.0], [2.0, 1.2, 2.0]
-    plate_low, plate_high = [-0.4, 0.0, -0.4], [0.4, 0.05, 0.4]
-    mesh = joined(box(wall_low, wall_high, 4), box(plate_low, plate_high, 2))
-    things = [
-        (lambda o, r: box_hit(o, r, wall_low, wall_high), plain((30, 120, 200))),
-        (lambda o, r: box_hit(o, r, plate_low, plate_high), plain((230, 20, 20))),
-    ]
-    photos = photograph([look_at((0, -2.0, 0), focal=60.0)], things)
-    textured = run(mesh, photos, tmp_path)
+    textured, graph = wall_and_plate([look_at((0, -2.0, 0), focal=60.0)], tmp_path)
     positions, colors, normals = texels(textured)
     front = (positions[:, 1] > 0.999) & (normals[:, 1] < -0.9)
     # The plate's shadow on the wall: 0.8 wide at distance 2, so 1.2 wide at distance 3.
     shadow = front & (np.abs(positions[:, [0, 2]]).max(axis=1) < 0.55)
     lit = front & (np.abs(positions[:, [0, 2]]).max(axis=1) > 0.75)
     assert (np.abs(colors[shadow | lit] - [30, 120, 200]).max(axis=1) < 25).mean() > 0.95
-    share = textured.statistics["coverage"]
-    area = face_graph(mesh.vertices, mesh.faces).areas.sum()
     visible = 4.0 * 4.0 - 1.2 * 1.2 + 0.8 * 0.8
-    assert abs(share - visible / area) < 0.04
+    assert abs(textured.statistics["coverage"] - visible / graph.areas.sum()) < 0.04
 
 
 def test_faces_that_no_photo_sees_are_filled_and_counted(tmp_path: Path) -> None:
@@ -203,7 +195,7 @@ def test_a_constant_colour_stays_constant_everywhere(tmp_path: Path) -> None:
     assert np.abs(textured.albedo.astype(int) - [200, 100, 50]).max() <= 1
 
 
-@pytest.mark.parametrize("brighter", [21, 30, 90])
+@pytest.mark.parametrize("brighter", [21, 90])
 def test_a_highlight_in_the_best_photo_is_outvoted(tmp_path: Path, brighter: int) -> None:
     """The others agree exactly: that must not let the best one win by its weight."""
     low, high = [-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]
@@ -286,15 +278,11 @@ def test_gains_are_recovered_and_absent_ones_left_alone() -> None:
     same, spread = solve_gains(np.broadcast_to(points, (2000, 6, 3)).astype(np.uint8), valid)
     assert (same == 1).all()
     assert spread < 0.01
-
-
-def test_the_texture_has_the_exposure_of_most_photos() -> None:
-    generator = np.random.default_rng(0)
-    brightness = np.array([1.0, 1.0, 1.0, 1.6, 1.6])
-    points = generator.uniform(20, 150, (2000, 1, 1))
-    colors = np.rint(np.repeat(points * brightness[:, None], 3, axis=2)).astype(np.uint8)
+    # The texture has the exposure of most photos.
+    brightness = np.array([1.0, 1.0, 1.0, 1.6, 1.6])[:, None]
+    colors = np.rint(generator.uniform(20, 150, (2000, 1, 3)) * brightness).astype(np.uint8)
     gains, _ = solve_gains(colors, np.ones((2000, 5), bool))
-    assert np.abs(np.log(gains * brightness[:, None])).max() < 0.02
+    assert np.abs(np.log(gains * brightness)).max() < 0.02
 
 
 def test_overexposed_photos_leave_no_grey_on_white(tmp_path: Path) -> None:
@@ -319,32 +307,23 @@ def automatic_size(graph: FaceGraph, photos: FakePhotos, count: int, detail_poin
     return plan_textures(required_side(graph, photos, count, detail_points), 0, 1)[0]
 
 
-def test_the_automatic_size_follows_the_photos() -> None:
-    mesh = sphere(4)
-    graph = face_graph(mesh.vertices, mesh.faces)
+def test_the_automatic_size_follows_the_photos_and_the_detail() -> None:
+    graph = face_graph(sphere(4).vertices, sphere(4).faces)
     sizes = {}
     for focal in (85.0, 170.0, 340.0, 1e5):
         scale = focal / 170.0
         cameras = [
             c.resized(round(c.width * scale), round(c.height * scale)) for c in cameras_all_around()
         ]
-        photos = FakePhotos(cameras, [])
-        sizes[focal] = automatic_size(graph, photos, len(cameras))
+        sizes[focal] = automatic_size(graph, FakePhotos(cameras, []), len(cameras))
     # 4 pi area; footprint about 2.3 / focal: 0.8 sqrt(4 pi / 0.5) focal / 2.3 = 1.7 focal.
     # However coarse the photos are, the faces need room.
     assert sizes == {85.0: 512, 170.0: 512, 340.0: 1024, 1e5: 4096}
     assert automatic_size(graph, FakePhotos([], []), 0) == 256
-
-
-def test_the_automatic_size_has_room_for_the_detail() -> None:
-    mesh = sphere(2)
-    graph = face_graph(mesh.vertices, mesh.faces)
-    assert automatic_size(graph, photographed_from_afar(), 1) == 256
-    assert automatic_size(graph, photographed_from_afar(), 1, 200_000) == 1024
-
-
-def photographed_from_afar() -> FakePhotos:
-    return FakePhotos([look_at((0.0, -300.0, 0.0))], [])
+    coarse = face_graph(sphere(2).vertices, sphere(2).faces)
+    afar = FakePhotos([look_at((0.0, -300.0, 0.0))], [])
+    assert automatic_size(coarse, afar, 1) == 256
+    assert automatic_size(coarse, afar, 1, 200_000) == 1024
 
 
 @pytest.mark.parametrize(
@@ -362,7 +341,6 @@ def test_maps_are_baked_as_settings_ask(
     )  # fmt: skip
     assert (textured.normal_map is not None) == baked
     assert ("normal_map" in textured.statistics) == baked
-    assert textured.occlusion is None
     if baked:
         assert textured.normal_map.shape == textured.albedo.shape
         told = textured.statistics["normal_map"]["dense_faces"]
@@ -387,33 +365,6 @@ def test_photos_finer_than_the_texture_do_not_alias(tmp_path: Path) -> None:
     sides = (np.abs(normals[:, 2]) < 0.5) & (np.abs(positions[:, 2]) < 0.6)
     assert abs(colors[sides].mean() - 120) < 12
     assert colors[sides].std() < 25
-
-
-BAD = {
-    "nan": (lambda v, f: (np.where(np.arange(len(v))[:, None] == 3, np.nan, v), f), "finite"),
-    "infinite": (lambda v, f: (np.where(np.arange(len(v))[:, None] == 3, np.inf, v), f), "finite"),
-    "no faces": (lambda v, f: (v, f[:0]), "no faces"),
-    "index": (lambda v, f: (v, np.where(f == 5, 999, f)), "does not exist"),
-    "flat": (lambda v, f: (v * [1, 0, 0], f), "area"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_bad_meshes_are_refused_before_anything_runs(name: str, tmp_path: Path) -> None:
-    spoil, words = BAD[name]
-    good = sphere(1)
-    vertices, faces = spoil(good.vertices, good.faces)
-    photos = photograph(ring(2, 3.0, 0.0), [(sphere_hit, waves)])
-    with pytest.raises(MeshingError, match=words) as caught:
-        run(SurfaceMesh(vertices, faces), photos, tmp_path)
-    assert caught.value.hint
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_sizes_beyond_the_cap_are_refused(tmp_path: Path) -> None:
-    photos = photograph(ring(2, 3.0, 0.0), [(sphere_hit, waves)])
-    with pytest.raises(UsageError, match="16384"):
-        run(sphere(1), photos, tmp_path, 16384)
 
 
 def test_cancelling_is_obeyed_between_photos(tmp_path: Path) -> None:

@@ -15,25 +15,14 @@ import numpy as np
 from PIL import Image
 
 from gaussian_wrapping_addon.core.scene.camera import Camera
+from tests.poses import look_at_pose
 
 UNITS_PER_METRE = 3.7
-
-
 DICTIONARY = "4x4_50"
-
-
 SIDE_M = 0.12
-
-
 MARGIN = 0.25
-
-
 """White around a marker, over its side."""
-
-
 SAMPLES = 3
-
-
 """Rays of a pixel along each direction."""
 
 
@@ -50,12 +39,12 @@ class Quad:
     """(h, w) float32, 0 to 255."""
 
 
-def marker_image(number: int, module_px: int = 24) -> np.ndarray:
+def marker_image(number: int) -> np.ndarray:
     """Return a marker with its white margin, (n, n) float32."""
     import cv2
 
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    side = 6 * module_px
+    side = 6 * 24
     black = cv2.aruco.generateImageMarker(dictionary, number, side)
     margin = round(MARGIN * side)
     return np.pad(black.astype(np.float32), margin, constant_values=235.0).clip(12.0, 235.0)
@@ -74,20 +63,17 @@ def noise(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
     return np.clip(128.0 + 48.0 * total, 5.0, 250.0).astype(np.float32)
 
 
-def table_scene(seed: int = 0, markers: int = 8, side_m: float = SIDE_M) -> list[Quad]:
+def table_scene() -> list[Quad]:
     """Return ground, boxes and markers, in world units, z up."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     x, y, z = np.eye(3)
     u = UNITS_PER_METRE
-    quads = [
-        Quad(u * np.array([-2.0, 2.0, 0.0]), 4 * u * x, -4 * u * y, noise(rng, 1500, 1500)),
-    ]
+    corner = u * np.array([-2.0, 2.0, 0.0])
+    quads = [Quad(corner, 4 * u * x, -4 * u * y, noise(rng, 1500, 1500))]
     spots: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for angle, size in ((0.3, 0.34), (2.2, 0.28), (4.4, 0.4)):
-        away = 0.55
         a, b = np.cos(angle) * x + np.sin(angle) * y, -np.sin(angle) * x + np.cos(angle) * y
-        middle = away * a
-        h = size
+        middle, h = 0.55 * a, size
         for out, along in ((a, b), (b, -a), (-a, -b), (-b, a)):
             top_left = middle + 0.5 * size * out - 0.5 * size * along + h * z
             quads.append(Quad(u * top_left, u * size * along, -u * h * z, noise(rng, 240, 240)))
@@ -99,11 +85,10 @@ def table_scene(seed: int = 0, markers: int = 8, side_m: float = SIDE_M) -> list
         turn = np.array([np.cos(2 * angle), np.sin(2 * angle), 0.0])
         place = 0.35 * np.array([np.cos(angle), np.sin(angle), 0.0]) + 1e-4 * z
         spots.append((place, turn, np.cross(z, turn)))
-    paper = side_m * (1.0 + 2.0 * MARGIN)
-    for number, (middle, right, up) in enumerate(spots[:markers]):
+    paper = SIDE_M * (1.0 + 2.0 * MARGIN)
+    for number, (middle, right, up) in enumerate(spots[:8]):
         corner = middle - 0.5 * paper * right + 0.5 * paper * up
-        image = marker_image(number)
-        quads.append(Quad(u * corner, u * paper * right, -u * paper * up, image))
+        quads.append(Quad(u * corner, u * paper * right, -u * paper * up, marker_image(number)))
     return quads
 
 
@@ -114,16 +99,9 @@ def ring_cameras(count: int, width: int, height: int) -> list[Camera]:
         angle = 2 * np.pi * i / count
         radius, high = (1.55, 0.85) if i % 2 else (1.35, 1.25)
         eye = UNITS_PER_METRE * np.array([radius * np.cos(angle), radius * np.sin(angle), high])
-        forward = UNITS_PER_METRE * np.array([0.0, 0.0, 0.12]) - eye
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        pose = np.concatenate([rotation, -(rotation @ eye)[:, None]], 1)
-        focal = 0.95 * width
-        out.append(
-            Camera(f"photo{i:03d}.png", width, height, focal, focal, width / 2, height / 2, pose)
-        )
+        pose = look_at_pose(eye, [0.0, 0.0, 0.12 * UNITS_PER_METRE])
+        focal, name = 0.95 * width, f"photo{i:03d}.png"
+        out.append(Camera(name, width, height, focal, focal, width / 2, height / 2, pose))
     return out
 
 
@@ -182,16 +160,8 @@ def _draw(
     depth[rows, columns] = distance[rows, columns]
 
 
-def write_photos(
-    folder: Path, count: int, width: int, height: int, *, k1: float = 0.0, blur: float = 0.6
-) -> list[Camera]:
-    """Write ``images/`` and, beside it, ``transforms.json`` with the exact cameras.
-
-    Parameters
-    ----------
-    blur : float
-        Standard deviation of the lens's blur, pixels.
-    """
+def write_photos(folder: Path, count: int, width: int, height: int, *, k1: float) -> None:
+    """Write blurred ``images/`` and, beside it, ``transforms.json`` with the exact cameras."""
     from scipy.ndimage import gaussian_filter
 
     (folder / "images").mkdir(parents=True, exist_ok=True)
@@ -199,7 +169,7 @@ def write_photos(
     frames: list[dict[str, Any]] = []
     rng = np.random.default_rng(1)
     for camera in cameras:
-        photo = gaussian_filter(photograph(quads, camera, k1).astype(np.float64), blur)
+        photo = gaussian_filter(photograph(quads, camera, k1).astype(np.float64), 0.6)
         photo = np.clip(np.rint(photo + rng.normal(0.0, 1.5, photo.shape)), 0, 255)
         color = np.repeat(photo.astype(np.uint8)[..., None], 3, 2)
         Image.fromarray(color).save(folder / "images" / camera.name)
@@ -213,4 +183,3 @@ def write_photos(
         "cx": first.cx, "cy": first.cy, "k1": k1, "k2": 0.0, "p1": 0.0, "p2": 0.0,
     }  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
-    return cameras

@@ -6,6 +6,7 @@ from __future__ import annotations
 import mpmath
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.photos.exif import GpsPosition
@@ -15,6 +16,7 @@ from gaussian_wrapping_addon.core.units.georeference import (
     ENOUGH,
     SEMI_MAJOR_M,
     GeoPoint,
+    Georeference,
     ecef_from_geographic,
     enu_axes,
     enu_from_geographic,
@@ -31,12 +33,6 @@ from gaussian_wrapping_addon.core.units.georeference import (
 from tests.poses import look_at_pose
 
 
-def places(count: int, seed: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    low, high = [-89.9, -180.0, -500.0], [89.9, 180.0, 9e3]
-    return rng.uniform(low, high, (count, 3))
-
-
 def test_corners_of_the_ellipsoid() -> None:
     polar = SEMI_MAJOR_M * np.sqrt(1 - ECCENTRICITY_2)
     found = ecef_from_geographic(np.array([[0, 0, 0], [0, 90, 10], [90, 0, 5], [-90, 12, 0.0]]))
@@ -46,7 +42,9 @@ def test_corners_of_the_ellipsoid() -> None:
 
 
 def test_there_and_back_to_a_nanometre() -> None:
-    here = np.concatenate([places(500, 0), [[90.0, 0, 3], [-90, 0, -7], [0, 179.999, 0]]])
+    low, high = [-89.9, -180.0, -500.0], [89.9, 180.0, 9e3]
+    places = np.random.default_rng(0).uniform(low, high, (500, 3))
+    here = np.concatenate([places, [[90.0, 0, 3], [-90, 0, -7], [0, 179.999, 0]]])
     xyz = ecef_from_geographic(here)
     again = geographic_from_ecef(xyz)
     np.testing.assert_allclose(again[:, 2], here[:, 2], atol=4e-9)
@@ -77,7 +75,7 @@ def test_enu_is_rigid_and_comes_back() -> None:
     np.testing.assert_allclose(distances, wanted, atol=5e-9)
 
 
-@pytest.mark.parametrize("latitude", [0.0, 12.5, -33.0, 59.0, 83.9])
+@pytest.mark.parametrize("latitude", [0.0, -33.0, 83.9])
 def test_northing_on_the_central_meridian_is_the_meridian_arc(latitude: float) -> None:
     def radius(phi: mpmath.mpf) -> mpmath.mpf:
         sine_2 = mpmath.sin(phi) ** 2
@@ -96,6 +94,7 @@ def test_a_published_place() -> None:
     found = utm_of(place)
     assert found is not None
     assert (found["zone"], found["epsg"]) == ("17N", 32617)
+    assert utm_epsg(56, False) == 32756
     assert found["easting_m"] == pytest.approx(630084, abs=1.0)
     assert found["northing_m"] == pytest.approx(4833438, abs=1.0)
 
@@ -136,14 +135,7 @@ def test_zones(latitude: float, longitude: float, zone: int | None) -> None:
     assert utm_zone(latitude, longitude) == zone
 
 
-def test_epsg() -> None:
-    assert utm_epsg(33, True) == 32633
-    assert utm_epsg(56, False) == 32756
-
-
 PLACE = GeoPoint(46.84, 179.9999, 210.0)
-
-
 """Beside the date line: half of the positions lie across it."""
 
 
@@ -153,12 +145,15 @@ def flight(count: int = 24) -> np.ndarray:
     return np.stack([12.0 * (i % 6) - 30, 15.0 * (i // 6) - 22, 40.0 + 3.0 * ((i * 7) % 5)], 1)
 
 
-def cameras_at(enu: np.ndarray, world_from_enu: Similarity) -> list[Camera]:
-    out = []
-    for i, place in enumerate(enu):
-        camera = Camera(f"p{i:02d}", 100, 80, 90, 90, 50, 40, look_at_pose(place, [0, 0, 0]))
-        out.append(camera.moved(world_from_enu))
-    return out
+TURN = Rotation.random(random_state=3).as_matrix()
+WORLD_FROM_ENU = Similarity(0.031, TURN, np.array([4.0, -2.0, 7.0]))
+
+
+def cameras_at(enu: np.ndarray) -> list[Camera]:
+    return [
+        Camera(f"p{i:02d}", 100, 80, 90, 90, 50, 40, look_at_pose(place)).moved(WORLD_FROM_ENU)
+        for i, place in enumerate(enu)
+    ]
 
 
 def positions_of(enu: np.ndarray) -> dict[str, GpsPosition]:
@@ -166,22 +161,18 @@ def positions_of(enu: np.ndarray) -> dict[str, GpsPosition]:
     return {f"p{i:02d}": GpsPosition(*map(float, place)) for i, place in enumerate(places)}
 
 
-def rotation(seed: int) -> np.ndarray:
-    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    return q * np.sign(np.linalg.det(q))
-
-
-WORLD_FROM_ENU = Similarity(0.031, rotation(3), np.array([4.0, -2.0, 7.0]))
+def placed(enu: np.ndarray, gps: np.ndarray, *given: object) -> Georeference:
+    """Return the frame of cameras at some places whose photos state others."""
+    return georeference(cameras_at(enu), positions_of(gps), *given)  # type: ignore[arg-type]
 
 
 def test_exact_positions_give_the_exact_frame() -> None:
     enu = flight()
-    found = georeference(cameras_at(enu, WORLD_FROM_ENU), positions_of(enu))
+    found = placed(enu, enu)
     assert found.enu_from_world.scale == pytest.approx(1 / 0.031, rel=1e-9)
     # Up at the found origin, which is the median place.
-    places = geographic_from_enu(enu, PLACE)
-    wanted = enu_from_geographic(places, found.origin)
-    centers = np.array([c.center for c in cameras_at(enu, WORLD_FROM_ENU)])
+    wanted = enu_from_geographic(geographic_from_enu(enu, PLACE), found.origin)
+    centers = np.array([c.center for c in cameras_at(enu)])
     np.testing.assert_allclose(found.enu_from_world.points(centers), wanted, atol=1e-6)
     assert np.abs(found.origin.longitude_deg) > 179.999
     assert found.details["gps"]["used"] == 24
@@ -194,7 +185,7 @@ def test_errors_of_metres_and_a_quarter_of_outliers() -> None:
     noisy = enu + rng.normal(0.0, 1.0, enu.shape)
     wrong = rng.permutation(48)[:12]
     noisy[wrong] += rng.normal(0.0, 1.0, (12, 3)) * 30 + 60
-    found = georeference(cameras_at(enu, WORLD_FROM_ENU), positions_of(noisy))
+    found = placed(enu, noisy)
     assert set(found.details["gps"]["left_out"]) == {f"p{i:02d}" for i in wrong}
     # The errors that are stated bound those that are made, at four standard deviations.
     scale_error = abs(found.enu_from_world.scale * 0.031 - 1.0)
@@ -208,7 +199,7 @@ def test_errors_of_metres_and_a_quarter_of_outliers() -> None:
 
 def test_another_scale_keeps_the_middle_and_the_axes() -> None:
     enu = flight()
-    found = georeference(cameras_at(enu, WORLD_FROM_ENU), positions_of(enu))
+    found = placed(enu, enu)
     other = found.with_scale(2.0 * found.enu_from_world.scale)
     middle = found.centers.mean(0)[None]
     np.testing.assert_allclose(
@@ -240,20 +231,20 @@ def noise(count: int, size: float) -> np.ndarray:
 )
 def test_what_does_not_determine_a_frame(enu: np.ndarray, gps: np.ndarray, words: str) -> None:
     with pytest.raises(DatasetError, match=words):
-        georeference(cameras_at(enu, WORLD_FROM_ENU), positions_of(gps))
+        placed(enu, gps)
 
 
 def test_what_is_asked_for_may_be_worse() -> None:
     enu = flight() * 0.25
     noisy = enu + noise(24, 1.2)
     with pytest.raises(DatasetError, match="too little for an error of the GPS positions"):
-        georeference(cameras_at(enu, WORLD_FROM_ENU), positions_of(noisy))
-    found = georeference(cameras_at(enu, WORLD_FROM_ENU), positions_of(noisy), ENOUGH)
+        placed(enu, noisy)
+    found = placed(enu, noisy, ENOUGH)
     assert "too little for an error of the GPS positions" in found.doubt
-    assert georeference(cameras_at(enu, WORLD_FROM_ENU), positions_of(enu)).doubt == ""
+    assert placed(enu, enu).doubt == ""
     worse = enu + noise(24, 5.0)
     with pytest.raises(DatasetError, match="too little for an error"):
-        georeference(cameras_at(enu, WORLD_FROM_ENU), positions_of(worse), ENOUGH)
+        placed(enu, worse, ENOUGH)
 
 
 def test_photos_without_altitude() -> None:
@@ -263,18 +254,18 @@ def test_photos_without_altitude() -> None:
         for name, p in positions_of(enu).items()
     }
     with pytest.raises(DatasetError, match="0 of 24 photos have a GPS altitude"):
-        georeference(cameras_at(enu, WORLD_FROM_ENU), flat)
+        georeference(cameras_at(enu), flat)
 
 
 def test_places_half_the_earth_away() -> None:
     enu = flight()
     gps = positions_of(enu)
     gps["p03"] = GpsPosition(-10.0, 20.0, 3.0)
-    found = georeference(cameras_at(enu, WORLD_FROM_ENU), gps)
+    found = georeference(cameras_at(enu), gps)
     assert found.details["gps"]["left_out"] == ["p03"]
     spread = {f"p{i:02d}": GpsPosition(-80.0 + 6 * i, 14.0 * i, 0.0) for i in range(24)}
     with pytest.raises(DatasetError, match="more than 50 km"):
-        georeference(cameras_at(enu, WORLD_FROM_ENU), spread)
+        georeference(cameras_at(enu), spread)
 
 
 def test_the_stated_error_is_that_of_repeated_fits() -> None:

@@ -31,8 +31,6 @@ from tests.core.units.marker_scene import (
 )
 
 cv2 = pytest.importorskip("cv2")
-
-
 SPEC = MarkerSpec(DICTIONARY, SIDE_M)
 
 

@@ -29,8 +29,6 @@ from gaussian_wrapping_addon.core.worker.spawn import (
 )
 
 PACKAGE = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon"
-
-
 TELL = (
     "import json, os, sys\n"
     "open_files = [n for n in range(3, 64) if os.path.exists(f'/proc/self/fd/{n}')"
@@ -38,8 +36,6 @@ TELL = (
     "print(json.dumps({'read': sys.stdin.read(), 'group': os.getpgid(0), 'own': os.getpid(),"
     " 'environment': dict(os.environ), 'files': open_files}))\n"
 )
-
-
 NAP = "import time; time.sleep(60)"
 
 
@@ -64,9 +60,9 @@ def test_a_child_leads_a_group_and_inherits_nothing(
 
 def test_an_environment_can_be_given() -> None:
     process = spawn([sys.executable, "-I", "-c", TELL], environment={"ONLY": "1"})
-    output, _ = process.communicate(timeout=60)
-    assert json.loads(output)["environment"]["ONLY"] == "1"
-    assert "OMP_WAIT_POLICY" not in json.loads(output)["environment"]
+    told = json.loads(process.communicate(timeout=60)[0])["environment"]
+    assert told["ONLY"] == "1"
+    assert "OMP_WAIT_POLICY" not in told
 
 
 def test_on_windows_a_group_without_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,17 +85,9 @@ def test_what_a_child_has_started_ends_with_it() -> None:
     process.communicate()
     assert process.returncode != 0
     deadline_s = time.monotonic() + 10.0
-    while is_at_work(grandchild):
+    while process_alive(grandchild, 0):
         assert time.monotonic() < deadline_s
         time.sleep(0.05)
-
-
-def is_at_work(pid: int) -> bool:
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
-        return False
-    return text.rpartition(")")[2].split()[0] != "Z"
 
 
 def test_deadlines_and_missing_programs() -> None:
@@ -134,8 +122,8 @@ def ended(pid: int, started: int, monkeypatch: pytest.MonkeyPatch) -> bool:
     return Caller().ended()
 
 
-def test_every_child_knows_its_caller() -> None:
-    assert child_command("jobs.worker")[2:4] == ["-X", caller_option()]
+def test_every_child_is_isolated_and_knows_its_caller() -> None:
+    assert child_command("jobs.worker")[:4] == [sys.executable, "-I", "-X", caller_option()]
     assert caller_option() == f"gwrap_caller={os.getpid()}:{process_start_ticks(os.getpid())}"
 
 
@@ -143,14 +131,10 @@ def test_a_caller_that_was_dead_at_the_start_has_ended(monkeypatch: pytest.Monke
     child = subprocess.Popen([sys.executable, "-c", "pass"])
     child.wait()
     assert ended(child.pid, 0, monkeypatch)
-    assert not ended(os.getpid(), process_start_ticks(os.getpid()), monkeypatch)
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="start times of Linux")
-def test_another_process_with_the_pid_of_the_caller_is_not_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    assert ended(os.getpid(), process_start_ticks(os.getpid()) + 1, monkeypatch)
+    own, ticks = os.getpid(), process_start_ticks(os.getpid())
+    assert not ended(own, ticks, monkeypatch)
+    if sys.platform.startswith("linux"):  # another process with the caller's number is not it
+        assert ended(own, ticks + 1, monkeypatch)
 
 
 @pytest.mark.parametrize("text", ["", "x", "1", "-1:0", "1:x", "9" * 30 + ":0"])
@@ -165,34 +149,21 @@ def test_without_a_caller_told_the_parent_counts(
     assert caller.ended()
 
 
-@pytest.mark.parametrize("pid", [0, -1, 2**31, 10**30])
-def test_numbers_that_are_no_pids_are_not_alive(pid: int) -> None:
-    assert not process_alive(pid, 0)
+def test_numbers_that_are_no_pids_are_not_alive() -> None:
+    for pid in (0, -1, 2**31, 10**30):
+        assert not process_alive(pid, 0)
 
 
-def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run(
-        child_command(*arguments),
-        cwd=cwd,
-        capture_output=True,
-        env=child_environment(),
-        check=False,
-    )
-
-
-def test_a_module_is_found_from_any_folder(tmp_path: Path) -> None:
-    done = run("jobs.commands.doctor", cwd=tmp_path)
-    assert b'"subject": "Python"' in done.stdout, done.stderr.decode()
-
-
-def test_names_that_are_no_modules_are_refused(tmp_path: Path) -> None:
-    for name in ("../x", "os;1", "", "Jobs", "a..b"):
-        assert run(name, cwd=tmp_path).returncode == 2
-
-
-def test_the_command_is_isolated() -> None:
-    command = child_command("jobs.commands.doctor")
-    assert command[:2] == [sys.executable, "-I"]
+def test_a_module_is_found_from_any_folder_and_other_names_are_refused(tmp_path: Path) -> None:
+    for name, code in (("jobs.commands.doctor", None), ("../x", 2), ("os;1", 2), ("a..b", 2)):
+        done = subprocess.run(
+            child_command(name), cwd=tmp_path, capture_output=True, env=child_environment(),
+            check=False,
+        )  # fmt: skip
+        if code is None:
+            assert b'"subject": "Python"' in done.stdout, done.stderr.decode()
+        else:
+            assert done.returncode == code
 
 
 PRINT_PEAKS = (

@@ -13,8 +13,6 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon"
-
-
 CODE = """
 import os, signal, sys, threading, time
 sys.path[:0] = {path!r}
@@ -36,16 +34,12 @@ for number in (signal.SIGTERM, signal.SIGINT):
     time.sleep(0.05)
 sys.exit(40 + len(asked) + 10 * len(failed))
 """
-
-
 PYCOLMAP = """
 def load():
     from gaussian_wrapping_addon.core.readers.lenses import _native
     from gaussian_wrapping_addon.core.readers.source_model import LensCamera
     _native(LensCamera("PINHOLE", 8, 8, (1.0, 1.0, 4.0, 4.0)))
 """
-
-
 IMPOLITE = """
 def load():
     import ctypes

@@ -17,14 +17,12 @@ from gaussian_wrapping_addon.core.evaluation.report.figures import (
     FEW_HELD_OUT,
     NOT_MEASURED,
     TEXELLESS_SHARE,
-    bar,
     collect_warnings,
     duration,
     escaped,
     figure_rows,
     number,
     percent,
-    table,
 )
 from gaussian_wrapping_addon.core.evaluation.report.report import (
     estimate_lines,
@@ -47,8 +45,6 @@ from tests.core.evaluation.report.report_examples import (
 )
 
 LINK = re.compile(r"!\[[^\n]*?\]\(([^)\s]+)\)")
-
-
 WRONG_NUMBER = re.compile(r"\b(nan|inf|infinity|none)\b", re.IGNORECASE)
 
 
@@ -88,70 +84,50 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         "Photos used: 14. Gaussians trained on them: 12,235 (preset draft).",
         "196 faces, not closed",
         "3 min 22 s",  # 201.5 s
-        "PSNR of 23.0 dB",
         "typical error of 7.1 % of full brightness",  # 10 ** (-23 / 20)
         "photos saw 25.0 % of the texture",
         f'The textured mesh of "{escaped(REGION)}": 20.0 dB (2 photos, over the pixels the mesh',
         "covers: 62.5 % of the photo; no face covers 25.0 % of the photo, and with these pixels",
         "counted as black it is 8.0 dB; the texture compared was baked without the held-out photos",
-        "too few for a reliable mean",
     ):
         assert words in summary, words
     stages = section(text, "## Time and memory")
-    assert "| training the Gaussians | 140.0 s | 70.0 % |" in stages
     assert "| photos and cameras (earlier run) | 20.0 s | 10.0 % |" in stages
     assert f'| mesh of region "{escaped(REGION)}" | 30.0 s | 15.0 % |' in stages
     assert "main process: 3.00 GiB" in stages
     assert "512 MiB" in stages
     training = section(text, "## Training")
-    assert cells(training[training.index("| **mean**") :].splitlines()[0]) == [
-        " **mean** ", " 23.00 dB ", " 7.1 % ", " 0.6000 ",
-    ]  # fmt: skip
+    assert "| **mean** | 23.00 dB | 7.1 % | 0.6000 |" in training
     assert "| p\\|q.jpg | 20.00 dB | 10.0 % | 0.5000 |" in training
     assert "LPIPS is not measured: AlexNet's weights are not here." in training
     region = section(text, f"## Region {escaped(REGION)}")
     for name, figure in (
         ("Faces", "196 faces"),
-        ("Vertices", "100 vertices"),
         ("Closed", "not closed, 4 open edges"),
         ("Size (x, y, z)", "1 x 2 x 3.5 world units"),
-        ("Edge length, mean", "0.04 world units"),
         ("Edge length, median", "0.03 world units"),
-        ("Residual, median", "0.002 of vacancy"),
         ("Residual, 99th percentile", "0.31 of vacancy"),
-        ("Residual, largest", "0.45 of vacancy"),
         ("Size", "512 x 512 texels, chosen from the resolution of the photos"),
         ("Texel density", "8.8 texels per world unit"),
         ("Coverage: seen by photos", "25.0 %"),
-        ("Surface area seen by photos", "30.0 %"),
         ("Area of faces smaller than a texel", "2.0 %"),
     ):
         assert row(region, name) == figure
-    assert "| p\\|q.jpg | 18.50 dB | 0.4500 | 75.0 % |" in region
     assert "| **mean** | 20.00 dB | 0.5000 | 62.5 % |" in region
-    assert "The texture compared was baked without the held-out photos." in region
     assert f"LPIPS was {NOT_MEASURED}: its weights are not here." in region
     machine = section(text, "## Machine, versions, seed")
-    for words in ("Some CPU", "numpy 1.26.4", "numba 0.68.1", "seed: 7", "2026-11-21"):
+    for words in ("Some CPU", "numpy 1.26.4", "seed: 7", "2026-11-21"):
         assert words in machine
 
 
-@pytest.mark.parametrize(
-    ("atlases", "size"), [(1, "512 x 512 texels"), (3, "3 textures of 512 x 512 texels")]
-)
-def test_several_textures_are_counted(tmp_path: Path, atlases: int, size: str) -> None:
-    region = full_region()
-    region["texture"].update(atlases=atlases, size_automatic=False)
-    _, text = write(tmp_path, None, {REGION: region})
-    assert row(section(text, f"## Region {escaped(REGION)}"), "Size") == size
-
-
-def test_defects_of_the_last_check_are_told_and_what_was_cleaned_up(tmp_path: Path) -> None:
+def test_what_a_region_went_through_is_told(tmp_path: Path) -> None:
     region = full_region()
     region["check"] = {"good": False, "defects": ["edges have one face only: 4"]}
+    region["texture"].update(atlases=3, size_automatic=False)
     region["provenance"].update(
         removed_solids=2, removed_cavities=1, removed_area_share=0.03, faces_before_clean_up=9000,
         target_faces=196, smooth_steps=3, removed_open_pieces=2, removed_open_area_share=0.01,
+        tiles=3, tile_processes=2, field_evaluations=4000, unseen_evaluations=50, unseen="occupied",
     )  # fmt: skip
     _, text = write(tmp_path, None, {REGION: region})
     told = section(text, f"## Region {escaped(REGION)}")
@@ -162,6 +138,9 @@ def test_defects_of_the_last_check_are_told_and_what_was_cleaned_up(tmp_path: Pa
         ("Smoothed", "3 steps"),
         ("Faces before decimation", "9,000 faces"),
         ("Target number of faces", "196 faces"),
+        ("Tiles", "3 tiles, by 2 processes"),
+        ("Seen by no camera", "1.2 % of the points evaluated, treated as occupied"),
+        ("Size", "3 textures of 512 x 512 texels"),
     ):
         assert row(told, name) == figure
     assert "edges have one face only: 4" in section(text, "## Warnings")
@@ -169,24 +148,9 @@ def test_defects_of_the_last_check_are_told_and_what_was_cleaned_up(tmp_path: Pa
     found = collect_warnings({"regions": {REGION: region}})
     assert not [w for w in found if "check of the final mesh" in w.text]
     assert "| no defect |" in write(tmp_path, None, {REGION: region})[1]
-
-
-def test_tiles_processes_and_what_no_camera_saw_are_told(tmp_path: Path) -> None:
-    region = full_region()
-    region["provenance"].update(
-        tiles=3, tile_processes=2, field_evaluations=4000, unseen_evaluations=50, unseen="occupied"
-    )
-    told = section(write(tmp_path, None, {REGION: region})[1], f"## Region {escaped(REGION)}")
-    assert row(told, "Tiles") == "3 tiles, by 2 processes"
-    assert row(told, "Seen by no camera") == "1.2 % of the points evaluated, treated as occupied"
-    region["provenance"].update(tiles=1, tile_processes=1, unseen_evaluations=0, unseen="empty")
-    told = section(write(tmp_path, None, {REGION: region})[1], f"## Region {escaped(REGION)}")
-    assert row(told, "Tiles") == "1 tile, by 1 process"
-    assert row(told, "Seen by no camera") == "0.0 % of the points evaluated, treated as empty"
     told = section(write(tmp_path)[1], f"## Region {escaped(REGION)}")
-    assert "| Tiles |" not in told
-    assert "Seen by no camera" not in told
-    assert "before decimation" not in told
+    for absent in ("| Tiles |", "Seen by no camera", "before decimation"):
+        assert absent not in told
 
 
 def test_pictures_are_linked_exactly_where_they_are(tmp_path: Path) -> None:
@@ -206,42 +170,44 @@ def test_pictures_are_linked_exactly_where_they_are(tmp_path: Path) -> None:
 
 
 def test_uncovered_pixels_are_told_where_they_were_measured(tmp_path: Path) -> None:
-    """Wherever the textured mesh's PSNR stands, so does what it leaves out."""
+    """Reports of version 0.1.0 hold neither share nor second PSNR, and none is made up."""
     region = full_region()
     report, text = write(tmp_path, full_summary(), {REGION: region})
-    (line,) = [line for line in headline(report) if line.startswith("region")]
-    assert "PSNR 20.00 dB where it covers the photos (25.0 % of them uncovered; 8.00 dB" in line
-    part = section(text, f"## Region {escaped(REGION)}")
-    assert "| 62.5 % | 25.0 % | 8.00 dB |" in part
-    assert "over the pixels that the mesh covers wholly" in part
-    assert "every pixel, black where no face covers it" in part
-    # Reports of version 0.1.0 hold neither share nor second PSNR, and none is made up.
+    told = "PSNR 20.00 dB where it covers the photos (25.0 % of them uncovered; 8.00 dB"
+    assert any(told in line for line in headline(report))
+    assert "| 62.5 % | 25.0 % | 8.00 dB |" in text
     rendering = region["mesh_rendering"]
     for figures in (rendering, *rendering["views"]):
         del figures["uncovered"], figures["whole_psnr"]
     report, text = write(tmp_path, full_summary(), {REGION: region})
     assert any(line.endswith("textured mesh PSNR 20.00 dB") for line in headline(report))
-    part = section(text, f"## Region {escaped(REGION)}")
-    assert "| 0.5000 | 62.5 % |" in part
-    assert "no face covers" not in text
-    assert "black where" not in text
+    assert "| 0.5000 | 62.5 % |" in text
+    for made_up in ("no face covers", "black where"):
+        assert made_up not in text
 
 
 @pytest.mark.parametrize("perceptual", [False, True])
-def test_tables_are_well_formed(tmp_path: Path, perceptual: bool) -> None:
+def test_tables_are_well_formed_with_perceptual_figures_or_without(
+    tmp_path: Path, perceptual: bool
+) -> None:
     summary, region = full_summary(), full_region()
+    summary["training"].pop("lpips_note")
     if perceptual:
-        summary["training"]["held_out"][0]["lpips"] = 0.25
+        for figure, value in zip(summary["training"]["held_out"], (0.25, 0.35), strict=True):
+            figure["lpips"] = value
+        summary["training"]["held_out_lpips"] = 0.3
         region["mesh_rendering"]["views"][1]["lpips"] = 0.35
     _, text = write(tmp_path, summary, {REGION: region})
     found = tables(text)
     assert len(found) == 7
     for lines in found:
-        widths = {len(cells(line)) for line in lines}
-        assert len(widths) == 1, lines
+        assert len({len(cells(line)) for line in lines}) == 1, lines
         assert all(set(c.strip()) <= {"-", ":"} and "---" in c for c in cells(lines[1]))
         assert len(lines) > 2
-    assert ("LPIPS (0 is identical)" in text) == perceptual
+    training = section(text, "## Training")
+    assert ("LPIPS (perceptual distance) was not measured." in training) != perceptual
+    assert ("| p\\|q.jpg | 20.00 dB | 10.0 % | 0.5000 | 0.2500 |" in training) == perceptual
+    assert ("| **mean** | 23.00 dB | 7.1 % | 0.6000 | 0.3000 |" in training) == perceptual
     # Markup of outside names is shown, not obeyed.
     assert text.splitlines()[0] == r"# Report: a\|b &lt;i&gt;\*photos\*&lt;/i&gt;"
 
@@ -256,12 +222,8 @@ def test_every_number_of_the_table_has_a_unit() -> None:
         ("training, held out psnr", "dB"),
         ("peak memory bytes, worker", "bytes"),
         ("stem 1, statistics, area", "square scene units"),
-        ("stem 1, world, area", "square world units"),
         ("stem 1, world, size, 0", "world units"),
-        ("stem 1, seconds, mesh", "s"),
         ("stem 1, provenance, level error p99", "of vacancy"),
-        ("stem 1, statistics, faces", "count"),
-        ("texture, gutter px", "px"),
         ("started unix s", "s since 1970"),
     ):
         (found,) = [u for name, u in units.items() if name.endswith(words)]
@@ -271,24 +233,8 @@ def test_every_number_of_the_table_has_a_unit() -> None:
     assert unknown == [("training, brightness", "3.5", "")]
 
 
-def test_perceptual_figures_of_held_out_photos(tmp_path: Path) -> None:
-    summary = full_summary()
-    summary["training"].pop("lpips_note")
-    _, text = write(tmp_path, summary)
-    assert "LPIPS (perceptual distance) was not measured." in section(text, "## Training")
-    for figure, value in zip(summary["training"]["held_out"], (0.25, 0.35), strict=True):
-        figure["lpips"] = value
-    summary["training"]["held_out_lpips"] = 0.3
-    _, text = write(tmp_path, summary)
-    training = section(text, "## Training")
-    assert "| p\\|q.jpg | 20.00 dB | 10.0 % | 0.5000 | 0.2500 |" in training
-    assert "| **mean** | 23.00 dB | 7.1 % | 0.6000 | 0.3000 |" in training
-    assert NOT_MEASURED not in training
-
-
-@pytest.mark.parametrize("value", [None, math.nan, "x"])
+@pytest.mark.parametrize("value", [None, "x"])
 def test_one_bad_figure_never_breaks_a_report(tmp_path: Path, value: Any) -> None:
-    """Whatever single value is missing or not finite, the report is written and stays sober."""
     whole = {**full_summary(), "regions": {REGION: full_region()}}
     for path in leaves(whole):
         report = copy.deepcopy(whole)
@@ -335,16 +281,11 @@ def test_what_an_old_report_lacks_is_not_measured(tmp_path: Path, report: dict[s
     [
         (number(0.00012345, "dB"), "1.234e-04 dB"),
         (number(1234567), "1,234,567"),
-        (number(12345.6), "12,346"),
-        (number(2.0), "2"),
         (number(True), NOT_MEASURED),
         (number(math.nan, "s"), NOT_MEASURED),
         (number(10**400), NOT_MEASURED),
         (percent(0.99999), "99.9 %"),
-        (percent(1.0), "100.0 %"),
         (percent(0.00001), "less than 0.1 %"),
-        (percent(0), "0.0 %"),
-        (percent(None), NOT_MEASURED),
         (duration(math.inf), NOT_MEASURED),
         (duration(3661), "1 h 01 min"),
         (escaped("a\nb | `c`"), r"a b \| \`c\`"),
@@ -352,15 +293,6 @@ def test_what_an_old_report_lacks_is_not_measured(tmp_path: Path, report: dict[s
 )
 def test_words(text: str, expected: str) -> None:
     assert text == expected
-
-
-def test_bars_and_tables() -> None:
-    assert bar(0.0).count("█") == 0
-    assert bar(1e-6).count("█") == 1
-    assert bar(0.5).count("█") == bar(0.5).count("░")
-    assert set(bar(1.0)) == {"█"}
-    with pytest.raises(ValueError, match="cells"):
-        table(("a", "b"), [("1",)], "lr")
 
 
 def test_names_that_no_encoding_writes_do_not_stop_the_report(tmp_path: Path) -> None:
@@ -373,72 +305,62 @@ def test_names_that_no_encoding_writes_do_not_stop_the_report(tmp_path: Path) ->
     assert "# Report: photos ?" in text
 
 
-@pytest.mark.parametrize(
-    ("trained", "told"), [(None, ""), ("cuda:1", ""), ("cpu", " Trained on cpu.")]
-)
-def test_where_the_job_computed_and_why_is_said(
-    trained: str | None, told: str, tmp_path: Path
-) -> None:
+def test_where_the_job_computed_and_why_is_said(tmp_path: Path) -> None:
     report = {"version": 1, **full_summary(), "regions": {}}
-    if trained is not None:
+    for trained, told in ((None, ""), ("cuda:1", ""), ("cpu", " Trained on cpu.")):
         report["training"]["device"] = trained
-    line = f"- Device: cuda:1. Some GPU, kernels compiled by libnvrtc.so.13.{told}"
-    assert line in report_markdown(report, tmp_path).splitlines()
+        line = f"- Device: cuda:1. Some GPU, kernels compiled by libnvrtc.so.13.{told}"
+        assert line in report_markdown(report, tmp_path).splitlines()
     del report["device"]  # as version 0.1.0 wrote it
     assert "- Device" not in report_markdown(report, tmp_path)
 
 
 def test_metres_and_how_well_they_are_known_are_said(tmp_path: Path) -> None:
-    gps = {"median_m": 0.351, "used": 18}
     units = {
-        "sources": ["gps", "markers"], "applied": True, "scale_error": 0.0023, "gps": gps,
-        "markers": {"used": 7},
+        "sources": ["gps", "markers"], "applied": True, "scale_error": 0.0023,
+        "gps": {"median_m": 0.351, "used": 18}, "markers": {"used": 7},
         "origin": {"latitude_deg": 46.8426598, "longitude_deg": -91.9940031, "altitude_m": 198.6},
     }  # fmt: skip
-    facts = {"kind": "photos", "georeference": units}
-    text = report_markdown({"cameras": {"facts": facts}}, tmp_path)
+
+    def written(**facts: Any) -> str:
+        report = {"cameras": {"facts": {"kind": "photos", **facts}}}
+        return report_markdown(report, tmp_path)
+
+    text = written(georeference=units)
     assert "One world unit is one metre." in text
     assert "arbitrary length" not in text
-    assert row(text, "Metres from") == "gps, markers"
-    assert row(text, "Error of the scale (standard deviation)") == "0.23 %"
-    assert row(text, "Cameras off their known places, median") == "0.351 m"
-    assert row(text, "Markers measured") == "7 markers"
+    for name, figure in (
+        ("Metres from", "gps, markers"),
+        ("Error of the scale (standard deviation)", "0.23 %"),
+        ("Cameras off their known places, median", "0.351 m"),
+        ("Markers measured", "7 markers"),
+    ):
+        assert row(text, name) == figure
     assert "46.842660, -91.994003" in row(text, "Origin: latitude, longitude (WGS 84)")
-    recorded = {"cameras": {"facts": {**facts, "georeference": {**units, "applied": False}}}}
-    assert "arbitrary length" in report_markdown(recorded, tmp_path)
     broken = {"sources": 3, "applied": "yes", "gps": [], "origin": {"latitude_deg": "x"}}
-    text = report_markdown({"cameras": {"facts": {**facts, "georeference": broken}}}, tmp_path)
-    assert "arbitrary length" in text
-    note = {"kind": "photos", "georeference_note": "too little"}
-    text = report_markdown({"cameras": {"facts": note}}, tmp_path)
-    assert row(text, "GPS is not used") == "too little"
+    for georeference in ({**units, "applied": False}, broken):
+        assert "arbitrary length" in written(georeference=georeference)
+    assert row(written(georeference_note="too little"), "GPS is not used") == "too little"
 
 
 EXPECTED = {"seconds_low": 60.0, "seconds_high": 120.0, "memory_bytes": 2**30}
 
 
-@pytest.mark.parametrize(
-    ("took", "words"), [(59.0, "below it"), (60.0, "within it"), (121.0, "above it")]
-)
-def test_the_comparison_says_where_the_time_lay(took: float, words: str) -> None:
-    text = " ".join(estimate_lines({"estimate": EXPECTED, "seconds_training": took}))
-    assert words in text
-
-
-@pytest.mark.parametrize("training", [{}, {"seconds_training": 5.0}, {"estimate": EXPECTED}])
-def test_without_both_figures_nothing_is_said(training: dict) -> None:
-    assert estimate_lines(training) == []
-
-
-def test_the_report_says_where_the_photos_were() -> None:
+def test_time_and_photos_are_compared_with_what_was_expected() -> None:
+    for took, words in ((59.0, "below it"), (60.0, "within it"), (121.0, "above it")):
+        told = estimate_lines({"estimate": EXPECTED, "seconds_training": took})
+        assert words in " ".join(told)
+    for training in ({}, {"seconds_training": 5.0}, {"estimate": EXPECTED}):
+        assert estimate_lines(training) == []
     photos = {"photos": 400, "all_bytes": 6 * 2**30, "budget_bytes": 3 * 2**30}
     told = {"estimate": {**EXPECTED, "photos": photos}, "seconds_training": 70.0}
-    text = " ".join(estimate_lines(told))
-    assert text.endswith("read on demand: 6.00 GiB decoded, 3.00 GiB of memory for them.")
-    photos["all_bytes"] = 2**29
-    assert " ".join(estimate_lines(told)).endswith("All photos fitted into memory (512 MiB).")
-    photos["all_bytes"] = "much"
-    assert " ".join(estimate_lines(told)).endswith("within it.")
+    for size, end in (
+        (6 * 2**30, "read on demand: 6.00 GiB decoded, 3.00 GiB of memory for them."),
+        (2**29, "All photos fitted into memory (512 MiB)."),
+        ("much", "within it."),
+    ):
+        photos["all_bytes"] = size
+        assert " ".join(estimate_lines(told)).endswith(end)
 
 
 def test_every_warning_is_listed_with_stage_and_next_step(tmp_path: Path) -> None:
@@ -470,6 +392,8 @@ def test_every_warning_is_listed_with_stage_and_next_step(tmp_path: Path) -> Non
     assert all(escaped(w["text"]) in summary for w in report["warnings"])
     for warning, line in zip(report["warnings"], headline(report)[3:], strict=True):
         assert line == f"warning ({warning['stage']}): {warning['text']}"
+        assert warning["code"]
+    assert report["warnings"][0] == {"stage": "cameras", **full_summary()["cameras"]["warnings"][0]}
 
 
 def test_texts_of_version_0_1_0_are_read_with_their_hints(tmp_path: Path) -> None:
@@ -486,18 +410,6 @@ def test_texts_of_version_0_1_0_are_read_with_their_hints(tmp_path: Path) -> Non
     assert [w["text"] for w in report["warnings"]] == [w["text"] for w in whole["warnings"]]
     line = next(x for x in text.splitlines() if escaped(stated) in x and x.startswith("- "))
     assert escaped(hint) in line
-
-
-def test_warnings_of_stages_are_written_as_they_were_made(tmp_path: Path) -> None:
-    report, _ = write(tmp_path)
-    made = report["cameras"]["warnings"][0]
-    assert made == {
-        "code": "photos-not-placed",
-        "text": "2 of 16 photos could not be placed and are not used: a|b.jpg, c.jpg.",
-        "hint": "Take more photos with more overlap there.",
-    }
-    assert report["warnings"][0] == {"stage": "cameras", **made}
-    assert all(warning["code"] for warning in report["warnings"])
 
 
 @pytest.mark.parametrize(
@@ -526,15 +438,12 @@ def good() -> dict[str, Any]:
     return report
 
 
-def test_nothing_is_judged_where_nothing_is_wrong(tmp_path: Path) -> None:
-    assert collect_warnings(good()) == []
-    assert "No stage reported a warning" in section(
-        report_markdown(good(), tmp_path), "## Warnings"
-    )
-
-
-def test_a_boundary_that_is_open_by_request_is_no_defect(tmp_path: Path) -> None:
+def test_nothing_is_judged_where_nothing_is_wrong_or_the_boundary_open_by_request(
+    tmp_path: Path,
+) -> None:
     report = good()
+    assert collect_warnings(report) == []
+    assert "No stage reported a warning" in report_markdown(report, tmp_path)
     region = report["regions"][REGION]
     region["statistics"].update(closed=False, boundary_edges=4)
     region["provenance"].update(boundary="open")
@@ -552,11 +461,7 @@ def test_a_boundary_that_is_open_by_request_is_no_defect(tmp_path: Path) -> None
         (("training", "held_out"), [], "No photo was held out"),
         (("regions", REGION, "texture", "coverage"), 0.499, "filled in"),
         (("regions", REGION, "texture", "coverage"), 0.0, "plain grey"),
-        (
-            ("regions", REGION, "provenance", "level_error_p99"),
-            0.251,
-            "not lie on the reconstructed surface",
-        ),
+        (("regions", REGION, "provenance", "level_error_p99"), 0.251, "not lie on the"),
     ],
 )
 def test_each_judgement_stands_alone(path: tuple[str, ...], value: Any, words: str) -> None:
@@ -575,18 +480,17 @@ NAMES = ("exposure", "multi_view", "growth", "full_size", "dense_start", "refine
 
 
 def training() -> dict[str, Any]:
-    model_selection = ModelSelection()
+    selection = ModelSelection()
     for name in NAMES:
-        model_selection = model_selection.with_decision(
-            decide(name, "auto", True, f"Seen in {name} a|b.")
-        )
-    model_selection = model_selection.with_decision(
-        decide("exposure", "off", True, "Photos differ by 20 %.")
-    )
-    return {"decisions": model_selection.to_json()}
+        selection = selection.with_decision(decide(name, "auto", True, f"Seen in {name} a|b."))
+    chosen = decide("exposure", "off", True, "Photos differ by 20 %.")
+    return {"decisions": selection.with_decision(chosen).to_json()}
 
 
-def test_every_decision_is_listed_with_its_evidence_and_setting() -> None:
+def test_every_decision_is_listed_with_its_evidence_setting_and_who_decided() -> None:
+    summary = full_summary()
+    summary["training"] |= training()
+    assert "\n## Model selection\n" in report_markdown(summary, Path("nowhere"))
     text = "\n".join(selection_lines(training()))
     for name in NAMES:
         if name != "exposure":
@@ -596,10 +500,6 @@ def test_every_decision_is_listed_with_its_evidence_and_setting() -> None:
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     assert len(rows) == 2 + len(NAMES)
     assert text.count("*To change this:*") == len(NAMES)
-
-
-def test_what_a_person_decided_is_told_apart() -> None:
-    text = "\n".join(selection_lines(training()))
     assert "| off | you (off) |" in text
     assert text.count("| the photos |") == len(NAMES) - 1
     assert "Set by you. Evidence from the photos: Photos differ by 20 %." in text
@@ -621,22 +521,10 @@ def test_where_nothing_was_measured_the_photos_say_nothing() -> None:
     assert f"Set by you. Evidence from the photos: {evidence}" in text
 
 
-def test_the_section_stands_between_training_and_regions() -> None:
-    summary = full_summary()
-    summary["training"] |= training()
-    text = report_markdown(summary, Path("nowhere"))
-    order = [text.index(f"\n## {title}") for title in ("Training", "Model selection", "Warnings")]
-    assert order == sorted(order)
+def test_what_is_no_decision_is_passed_over_and_an_unknown_one_shown_as_it_is() -> None:
     assert "## Model selection" not in report_markdown(full_summary(), Path("nowhere"))
-
-
-@pytest.mark.parametrize("decisions", [None, 3, "x", [], [None, 3, {}, {"chosen": "on"}]])
-def test_nothing_is_written_where_nothing_was_decided(decisions: Any) -> None:
-    assert selection_lines({"decisions": decisions}) == []
-
-
-def test_an_unknown_decision_is_shown_as_it_is() -> None:
+    for decisions in (None, 3, "x", [], [None, 3, {}, {"chosen": "on"}]):
+        assert selection_lines({"decisions": decisions}) == []
     text = "\n".join(selection_lines({"decisions": [{"name": "new_one", "chosen": "x`y"}]}))
-    assert "new\\_one" in text
-    assert "x\\`y" in text
-    assert "No evidence was recorded" in text
+    for words in ("new\\_one", "x\\`y", "No evidence was recorded"):
+        assert words in text

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -19,7 +18,14 @@ from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, EXIT_DONE, EXIT_O
 from gaussian_wrapping_addon.core.jobs.parts.graph import code_version
 from gaussian_wrapping_addon.core.names import SHARED_VARIABLE
 from tests.core.jobs.farm_jobs import wait_until
-from tests.core.jobs.test_farm_network import PACKAGE, Farm, descendants, end, free_port
+from tests.core.jobs.test_farm_network import (
+    PACKAGE,
+    Farm,
+    descendants,
+    end,
+    free_port,
+    older_package,
+)
 from tests.proofs import first_then_proofs
 
 pytest.importorskip("distributed", reason="Dask is not installed: set-up-worker --add farm")
@@ -29,8 +35,6 @@ pytestmark = [
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are stopped"),
     pytest.mark.timeout(600),
 ]
-
-
 LIMIT_S = 60
 
 
@@ -69,9 +73,7 @@ def test_each_worker_has_a_line_and_nothing_is_left(farm: Farm, tmp_path: Path) 
     here.mkdir()
     other.mkdir()
     seen.symlink_to(here)  # the same folder by another path
-    older = tmp_path / "older" / PACKAGE.name
-    shutil.copytree(PACKAGE, older, ignore=shutil.ignore_patterns("__pycache__"))
-    (older / "core" / "limits.py").open("a").write("\n# older\n")
+    older = older_package(tmp_path)
     address = f"tcp://127.0.0.1:{free_port()}"
     farm.start("scheduler", address, says="listens at")
     nobody = doctor(here, address)

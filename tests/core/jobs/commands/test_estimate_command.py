@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -21,8 +20,10 @@ from tests.core.training.small_scene import sphere_gaussians
 
 
 def test_a_folder_of_photos(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError):
+        input_facts(tmp_path)
     for index, size in enumerate(((40, 30), (60, 20), (40, 30))):
-        Image.fromarray(np.zeros((size[1], size[0], 3), np.uint8)).save(tmp_path / f"{index}.png")
+        Image.new("RGB", size).save(tmp_path / f"{index}.png")
     facts = input_facts(tmp_path)
     assert (facts.photos, facts.pixels, facts.long_side_px) == (3, 1200.0, 60)
     assert (facts.points, facts.masked) == (0, False)
@@ -48,8 +49,3 @@ def test_what_comes_after_the_training_is_said(
     (line,) = [line for line in lines if line.startswith("mesh and texture")]
     assert line == "mesh and texture: 20 to 90 % more"
     assert "photos: in memory, 0.00 GB" in lines
-
-
-def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError):
-        input_facts(tmp_path)

@@ -31,11 +31,7 @@ pytestmark = [
     pytest.mark.skipif(sys.platform == "win32", reason="the stand-ins are shell scripts"),
     pytest.mark.timeout(600),
 ]
-
-
 WAIT_S = 150.0
-
-
 SSH = """#!/bin/sh
 while [ "$1" != "--" ]; do shift; done
 shift; computer=$1; shift
@@ -45,8 +41,6 @@ case "$computer" in
 esac
 exec sh -c "$*"
 """
-
-
 SUBMIT = """#!/bin/sh
 [ -e "$STUBS/closed" ] && { echo "error: the queue is closed" >&2; exit 1; }
 number=$(ls "$STUBS" | grep -c script)
@@ -55,8 +49,6 @@ setsid sh "$STUBS/script-$number" > "$STUBS/log-$number" 2>&1 < /dev/null &
 echo $! > "$STUBS/pid-$number"
 echo "Submitted batch job $number"
 """
-
-
 CANCEL = """#!/bin/sh
 kill -9 "-$(cat "$STUBS/pid-$1")" && echo "$1" >> "$STUBS/cancelled"
 """
@@ -230,9 +222,7 @@ def test_a_closed_queue_is_told(stubs: Path, run: Callable[..., Running]) -> Non
         ("ssh tcp://127.0.0.1:1", "No computer is named"),
         ("ssh tcp://127.0.0.1:1 a a", "a is named twice"),
         ("ssh tcp://127.0.0.1:1 a;b", "is no name of a computer"),
-        ("ssh tcp://127.0.0.1:1 a --slots 0", "--slots is out of range"),
         ("ssh tcp://127.0.0.1:1 a --limit 0", "--limit is out of range"),
-        ("slurm tcp://127.0.0.1:1 --cores 1 --memory 1GB --time 1", "--workers"),
         ("pbs tcp://127.0.0.1:1 --workers 0 --cores 1 --memory 1GB --time 1", "--workers is out"),
         ("pbs tcp://127.0.0.1:1 --workers 1 --cores 1 --memory 1 --time 1", "is no memory"),
     ],

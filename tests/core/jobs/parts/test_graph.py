@@ -74,25 +74,18 @@ def _set(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
     [
         (_set("version", 2), "version: it is not 1"),
         (_set("parts", []), "not a list of 1 to"),
-        (_set("parts", "all"), "not a list of 1 to"),
         (_set("code", 7), "code: not a short text"),
-        (_set("plan", None), "plan: not a short text"),
         (_set("parts.0.name", "../cameras"), r"parts\[0\]"),
-        (_set("parts.0.name", ""), r"parts\[0\]"),
         (_set("parts.0.kind", "mine"), r"parts\[0\]"),
         (_set("parts.0.outputs", ["/etc/passwd"]), r"parts\[0\]"),
         (_set("parts.0.outputs", ["a/../../b"]), r"parts\[0\]"),
         (_set("parts.0.outputs", ["C:x"]), r"parts\[0\]"),
         (_set("parts.0.needs", "train"), r"parts\[0\]"),
         (_set("parts.0.needs", ["train"]), "cameras, train wait for each other"),
-        (_set("parts.0.needs", ["cameras"]), "cameras wait for each other"),
         (_set("parts.1.needs", ["camera"]), r"parts\[1\]\.needs: 'camera' is no part"),
         (_set("parts.1.name", "cameras"), "two have the same name, but for case"),
         (_set("parts.1.share", -0.1), r"parts\[1\]"),
-        (_set("parts.1.share", True), r"parts\[1\]"),
-        (_set("parts.1.tile", 1e9), r"parts\[1\]"),
         (_set("parts.1.block", 1e9), r"parts\[1\]\.block"),
-        (_set("parts.1.block", True), r"parts\[1\]\.block"),
         (_set("parts.3.region", "a/b"), r"parts\[3\]"),
         (_set("parts.3.seconds", "long"), r"parts\[3\]"),
         (lambda values: values["parts"][2].pop("share"), r"parts\[2\]"),
@@ -147,8 +140,9 @@ def check(graph: PartsGraph) -> None:
     assert sum(part.share for part in graph.parts) == pytest.approx(1.0)
 
 
-def test_a_job_begins_with_its_stages(tmp_path: Path) -> None:
-    graph = plan_parts(tmp_path / "out", job_of(tmp_path, regions=2), {})
+def test_a_job_begins_with_its_stages_and_tiles_that_are_set(tmp_path: Path) -> None:
+    job = job_of(tmp_path, regions=2)
+    graph = plan_parts(tmp_path / "out", job, {})
     check(graph)
     assert [part.name for part in graph.parts] == [
         "cameras", "train", "plan-r0", "mesh-r0", "texture-r0", "plan-r1", "mesh-r1", "texture-r1",
@@ -157,6 +151,13 @@ def test_a_job_begins_with_its_stages(tmp_path: Path) -> None:
     assert graph.part("plan-r1").needs == ("train",)
     assert graph.part("export").needs == ("texture-r0", "texture-r1")
     assert (graph.source, graph.code) == ("../photos", code_version())
+    assert fixed_tiles(job) == fixed_tiles(job_of(tmp_path, "off")) == {}
+    assert fixed_tiles(job_of(tmp_path, "4")) == {"r0": PlannedTiles(4)}
+    # The plan depends on what is to be done alone.
+    elsewhere = dataclasses.replace(job.settings, threads=3, computers="local", processes=5)
+    other = dataclasses.replace(job.settings, seed=1)
+    hashes = [plan_hash(dataclasses.replace(job, settings=s)) for s in (elsewhere, other)]
+    assert hashes[0] == graph.plan != hashes[1]
 
 
 def test_tiles_are_parts_once_they_are_known(tmp_path: Path) -> None:
@@ -176,11 +177,6 @@ def test_tiles_are_parts_once_they_are_known(tmp_path: Path) -> None:
     assert 5.0 < tile.seconds < 20.0
     write_parts(tmp_path, graph)
     assert read_parts(tmp_path) == graph
-
-
-def test_a_number_of_tiles_that_is_set_is_known_before_anything_is_run(tmp_path: Path) -> None:
-    assert fixed_tiles(job_of(tmp_path, "4")) == {"r0": PlannedTiles(4)}
-    assert fixed_tiles(job_of(tmp_path, "auto")) == fixed_tiles(job_of(tmp_path, "off")) == {}
 
 
 def test_a_training_in_blocks_is_parts_from_the_start(tmp_path: Path) -> None:
@@ -208,39 +204,21 @@ def test_a_training_in_blocks_is_parts_from_the_start(tmp_path: Path) -> None:
     assert read_parts(tmp_path) == graph
 
 
-def test_the_plan_depends_on_what_is_to_be_done_alone(tmp_path: Path) -> None:
-    job = job_of(tmp_path)
-    elsewhere = dataclasses.replace(
-        job, settings=dataclasses.replace(job.settings, threads=3, computers="local", processes=5)
-    )
-    other = dataclasses.replace(job, settings=dataclasses.replace(job.settings, seed=1))
-    assert plan_hash(elsewhere) == plan_hash(job) != plan_hash(other)
-
-
 PARTS = {f"block-{k:04d}": Part(f"block-{k:04d}", "block", (), (), 0.2, block=k) for k in range(3)}
 
 
-def told(sent: list[ProgressEvent]) -> JobProgress:
-    progress = JobProgress(sent.append, lambda: False)
-    progress.begin(0.8)
-    return progress
-
-
-def test_a_part_that_runs_here_moves_the_job_by_its_share() -> None:
-    sent: list[ProgressEvent] = []
-    progress = told(sent)
-    progress.report(0.5, {}, 2)
-    progress.part(PARTS["block-0000"]).update(0.5, "iteration 7", iteration=7.0)
-    assert sent[-1].fraction == pytest.approx(0.5 + 0.5 * 0.2 / 0.8)
-    assert sent[-1].figures == {"iteration": 7.0}
-
-
-def test_parts_elsewhere_are_told_by_their_states(
+def test_parts_here_and_elsewhere_move_the_job(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(runner, "STATES_EVERY_S", -1.0)
     sent: list[ProgressEvent] = []
-    report = told(sent).side_by_side(tmp_path)
+    progress = JobProgress(sent.append, lambda: False)
+    progress.begin(0.8)
+    progress.report(0.5, {}, 2)
+    progress.part(PARTS["block-0000"]).update(0.5, "iteration 7", iteration=7.0)
+    assert sent[-1].fraction == pytest.approx(0.5 + 0.5 * 0.2 / 0.8)
+    assert sent[-1].figures == {"iteration": 7.0}
+    report = progress.side_by_side(tmp_path)
     report(0.25, PARTS, 1)
     assert sent[-1].message == ("block-0000: waits for a computer and 2 more; parts done: 1")
     state = dataclasses.replace(
@@ -253,8 +231,9 @@ def test_parts_elsewhere_are_told_by_their_states(
     assert sent[-1].message == "block-0001: iteration 9 and 2 more; parts done: 1"
     assert sent[-1].figures == {"psnr": 24.5}
     assert sent[-1].fraction == pytest.approx(0.25 + 0.5 * 0.2 / 0.8)
+    count = len(sent)
     report(0.5, {}, 2)
-    assert len(sent) == 2, "nothing runs"
+    assert len(sent) == count, "nothing runs"
 
 
 NOW_S = 1010.0
@@ -270,21 +249,11 @@ def reader_of(root: Path) -> PartReader:
     return PartReader(root, lambda: NOW_S)
 
 
-def test_nothing_has_begun(root: Path) -> None:
-    board = reader_of(root).read()
-    assert board.problem == ""
-    assert board.failed == ()
-    assert dict(board.counts) == {
-        "cameras": (0, 0, 0, 1), "train": (0, 0, 0, 1), "plan": (0, 0, 0, 2),
-        "points": (0, 0, 0, 2), "gather": (0, 0, 0, 1), "faces": (0, 0, 0, 2),
-        "mesh": (0, 0, 0, 2), "texture": (0, 0, 0, 2), "export": (0, 0, 0, 1),
-    }  # fmt: skip
-    assert board.totals == (0, 0, 0, 14)
-    assert not board.finished
-
-
 def test_states_are_counted(root: Path) -> None:
     reader = reader_of(root)
+    board = reader.read()
+    assert (board.problem, board.failed, board.totals) == ("", (), (0, 0, 0, 14))
+    assert (dict(board.counts)["mesh"], board.finished) == ((0, 0, 0, 2), False)
     write_state_of(root, "cameras", "DONE")
     write_state_of(root, "train", "DONE")
     write_state_of(root, "points-a-0000", "RUNNING")
@@ -302,8 +271,7 @@ def test_states_are_counted(root: Path) -> None:
     for part in graph({"a": 2, "b": 0})["parts"]:
         write_state_of(root, part["name"], "DONE", seconds=22.0)
     board = reader.read()
-    assert board.finished
-    assert board.failed == ()
+    assert (board.finished, board.failed) == (True, ())
 
 
 def test_a_silent_part_is_left_to_another_computer(root: Path) -> None:
@@ -314,7 +282,7 @@ def test_a_silent_part_is_left_to_another_computer(root: Path) -> None:
 
 
 DAMAGED = (
-    b"", b"[]", b"{", b'{"state": "ASLEEP"}', b'{"state": 7}', b"\xff\xfe", b"[" * 100_000,
+    b"", b"[]", b'{"state": "ASLEEP"}', b'{"state": 7}', b"\xff\xfe", b"[" * 100_000,
     b" " * (limits.MAX_PART_STATE_BYTES + 1), b'{"state": NaN}',
 )  # fmt: skip
 
@@ -339,14 +307,9 @@ def test_odd_entries_do_no_harm(root: Path) -> None:
     board = reader_of(root).read()
     assert board.failed == (FailedPart("train", "host", "x" * states.MAX_TEXT_CHARACTERS),)
     assert board.totals == (0, 0, 1, 13)
-
-
-def test_a_linked_folder_of_states_is_not_read(root: Path, tmp_path: Path) -> None:
-    other = tmp_path / "other"
-    other.mkdir()
-    write_state_of(other, "train", "DONE")
-    (root / "parts").symlink_to(other / "parts")
-    assert reader_of(root).read().totals == (0, 0, 0, 14)
+    (root / "parts").rename(root / "elsewhere")
+    (root / "parts").symlink_to(root / "elsewhere")
+    assert reader_of(root).read().totals == (0, 0, 0, 14), "a linked folder is not read"
 
 
 def test_only_changed_files_are_read_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

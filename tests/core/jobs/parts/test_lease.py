@@ -26,6 +26,7 @@ from gaussian_wrapping_addon.core.jobs.parts.graph import (
 )
 from gaussian_wrapping_addon.core.jobs.parts.lease import PartHeldError, PartLease
 from gaussian_wrapping_addon.core.progress import ProgressEvent
+from tests.core.jobs.farm_jobs import wait_until
 
 TAKEN: list[PartLease] = []
 
@@ -50,9 +51,9 @@ def elsewhere(**changes: object) -> PartState:
     return dataclasses.replace(state, **changes)  # type: ignore[arg-type]
 
 
-def age(path: Path, seconds: float) -> None:
+def silent(root: Path, seconds: float) -> None:
     then_s = time.time() - seconds
-    os.utime(path, (then_s, then_s))
+    os.utime(state_path(root, "train"), (then_s, then_s))
 
 
 def test_a_lease_shows_progress_and_how_the_part_ended(
@@ -104,10 +105,10 @@ def test_another_computer_keeps_its_part_as_long_as_it_shows_life(tmp_path: Path
     write_state(tmp_path, "train", elsewhere())
     with pytest.raises(PartHeldError, match="of other"):
         lease_in(tmp_path).take()
-    age(state_path(tmp_path, "train"), limits.SILENT_S - 20)
+    silent(tmp_path, limits.SILENT_S - 20)
     with pytest.raises(PartHeldError):
         lease_in(tmp_path).take()
-    age(state_path(tmp_path, "train"), limits.SILENT_S + 20)
+    silent(tmp_path, limits.SILENT_S + 20)
     assert lease_in(tmp_path).take()
 
 
@@ -118,10 +119,7 @@ def test_a_process_that_comes_back_finds_its_part_taken_and_leaves_it(
     lease = lease_in(tmp_path)
     assert lease.take()
     write_state(tmp_path, "train", elsewhere(token="theirs"))
-    end_s = time.monotonic() + 5.0
-    while not lease.is_lost:
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
+    wait_until(lambda: lease.is_lost, 5.0)
     lease.finish("FAILED", error="too late")
     state = read_state(tmp_path, "train")
     assert state is not None

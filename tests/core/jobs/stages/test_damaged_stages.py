@@ -76,28 +76,9 @@ def test_damaged_cameras_are_loaded_again(
 
 
 @damaged
+@pytest.mark.parametrize("name", [training.GAUSSIANS_NAME, POSES_NAME])
 def test_a_damaged_training_is_trained_again(
-    folder: JobFolder, damage: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, _, trained = run(folder)
-    path = trained.folder / training.GAUSSIANS_NAME
-    gaussians = load_gaussians(path)
-
-    def train(_: object, stage_folder: Path, *_more: object) -> dict[str, Any]:
-        save_gaussians(stage_folder / training.GAUSSIANS_NAME, gaussians)
-        return {}
-
-    monkeypatch.setattr(training.TrainingStages, "_in_one_piece", train)
-    damage(path)
-    _, cameras, again = run(folder)
-    assert (trained.reused, cameras.reused, again.reused) == (True, True, False)
-    assert np.array_equal(load_gaussians(path).means, gaussians.means)
-    assert run(folder)[2].reused
-
-
-@damaged
-def test_a_training_whose_refined_poses_are_damaged_is_trained_again(
-    folder: JobFolder, damage: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
+    folder: JobFolder, name: str, damage: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, cameras, trained = run(folder)
     scene = scene_file.load_saved_scene(cameras.folder)
@@ -105,8 +86,6 @@ def test_a_training_whose_refined_poses_are_damaged_is_trained_again(
     done = trained.folder / DONE_NAME
     write_json(done, {**read_json(done), training.REFINED: True})
     save_poses(trained.folder, poses)
-    assert run(folder)[2].reused
-
     gaussians = load_gaussians(trained.folder / training.GAUSSIANS_NAME)
 
     def train(_: object, stage_folder: Path, *_more: object) -> dict[str, Any]:
@@ -115,11 +94,16 @@ def test_a_training_whose_refined_poses_are_damaged_is_trained_again(
         return {training.REFINED: True}
 
     monkeypatch.setattr(training.TrainingStages, "_in_one_piece", train)
-    damage(trained.folder / POSES_NAME)
-    again = run(folder)[2]
-    assert not again.reused
+    assert run(folder)[2].reused
+    damage(trained.folder / name)
+    _, cameras, again = run(folder)
+    assert (cameras.reused, again.reused) == (True, False)
+    assert np.array_equal(
+        load_gaussians(again.folder / training.GAUSSIANS_NAME).means, gaussians.means
+    )
     found = load_refined_scene(cameras.folder, again.folder)
     assert np.array_equal([view.camera.cam_from_world for view in found.views], poses)
+    assert run(folder)[2].reused
 
 
 @damaged
@@ -139,15 +123,9 @@ def test_a_damaged_mesh_is_made_again(
 
     def mesh() -> Stage:
         return run_mesh(
-            folder,
-            job,
-            str(path),
-            "ball",
-            trained,
-            Progress(),
-            device=PROCESSOR,
+            folder, job, str(path), "ball", trained, Progress(), device=PROCESSOR,
             load=lambda device: load_region(job, str(path), cameras, trained, device, 1),
-        )
+        )  # fmt: skip
 
     made = mesh()
     first = load_mesh(made.folder / "mesh.npz")

@@ -79,7 +79,7 @@ def folder_in(root: Path) -> JobFolder:
     return folder
 
 
-def test_frames_are_taken_once_and_used_again(
+def test_frames_are_taken_once_and_used_again_also_where_the_folder_is_moved(
     tmp_path: Path, video: Path, loaded: list[Path], extracted: list[Path]
 ) -> None:
     folder = folder_in(tmp_path)
@@ -88,12 +88,24 @@ def test_frames_are_taken_once_and_used_again(
     assert stage.done["facts"]["photos_in_order"] == "frames of a video"
     assert stage.done["facts"]["video_frames_read"] == 30
     assert stage.done["facts"]["video_frames_kept"] == stage.done["views"] == FRAMES
+    text = report_markdown({"cameras": stage.done}, tmp_path)
+    for row in (
+        "| Frames of the video | 30 frames |", "| Frames used as photos | 8 frames |",
+        "| Frames left out as blurred | 0 frames |",
+        "| Frames left out because nothing moved | 0 frames |",
+    ):  # fmt: skip
+        assert row in text
+    assert "solved from the photos alone" in text
     assert run_cameras(folder, job_of(video), Progress(), threads=1).reused
     other = run_cameras(folder, job_of(video, seed=3), Progress(), threads=1)
     assert other.key != stage.key
-    assert len(loaded) == 2
-    assert len(extracted) == 1
+    assert (len(loaded), len(extracted)) == (2, 1)
     assert [path.parent for path in loaded] == [next(folder.stages.glob("frames-*"))] * 2
+    moved = tmp_path / "elsewhere"
+    folder.root.rename(moved)
+    scene = load_saved_scene(moved / "stages" / stage.folder.name)
+    assert len(scene.views) == FRAMES
+    assert all(view.photo_path.resolve().is_relative_to(moved) for view in scene.views)
 
 
 def test_other_frames_and_another_file_are_other_stages(tmp_path: Path, video: Path) -> None:
@@ -108,6 +120,9 @@ def test_other_frames_and_another_file_are_other_stages(tmp_path: Path, video: P
     first = key()
     os.utime(video, ns=(1, 1))
     assert key() != first
+    # Settings of videos that are not given are in no key of trainings made before them.
+    job = job_of(video, video_frames=0)
+    assert frames_request(job) == frames_request(replace(job, command="mesh"))
 
 
 def test_lost_frames_are_taken_again(
@@ -124,44 +139,20 @@ def test_lost_frames_are_taken_again(
     assert len(extracted) == 3
 
 
-def test_a_job_folder_with_frames_can_be_moved(
-    tmp_path: Path, video: Path, loaded: list[Path]
+def test_a_folder_that_holds_a_video_is_the_video_one_named_like_it_is_a_folder(
+    tmp_path: Path, loaded: list[Path]
 ) -> None:
-    folder = folder_in(tmp_path)
-    stage = run_cameras(folder, job_of(video), Progress(), threads=1)
-    moved = tmp_path / "elsewhere"
-    folder.root.rename(moved)
-    scene = load_saved_scene(moved / "stages" / stage.folder.name)
-    assert len(scene.views) == FRAMES
-    assert all(view.photo_path.resolve().is_relative_to(moved) for view in scene.views)
-
-
-def test_the_folder_of_a_video_is_the_video(tmp_path: Path, loaded: list[Path]) -> None:
-    (tmp_path / "filmed").mkdir()
-    video = write(tmp_path / "filmed" / "clip.MOV", pan(range(0, 600, 20)), codec="mpeg4")
-    request = frames_request(job_of(tmp_path / "filmed"))
-    assert request is not None
-    assert request.video == video
-    stage = run_cameras(folder_in(tmp_path), job_of(tmp_path / "filmed"), Progress(), threads=1)
-    assert stage.done["views"] == FRAMES
-
-
-def test_a_folder_named_like_a_video_is_a_folder(tmp_path: Path) -> None:
     folder = tmp_path / "photos.mov"
     folder.mkdir()
     (folder / "a.jpg").write_bytes(b"picture")
     assert frames_request(job_of(folder)) is None
-    write(folder / "clip.mp4", pan([0, 2, 4]))
+    video = write(folder / "clip.MOV", pan(range(0, 600, 20)), codec="mpeg4")
     (folder / "a.jpg").unlink()
     request = frames_request(job_of(folder))
     assert request is not None
-    assert request.video == folder / "clip.mp4"
-
-
-def test_photos_have_no_frames(tmp_path: Path) -> None:
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "a.jpg").write_bytes(b"picture")
-    assert frames_request(job_of(tmp_path / "photos")) is None
+    assert request.video == video
+    stage = run_cameras(folder_in(tmp_path), job_of(folder), Progress(), threads=1)
+    assert stage.done["views"] == FRAMES
 
 
 @pytest.mark.parametrize("gone", ["the video", "its folder"])
@@ -210,23 +201,3 @@ def test_a_resumed_job_whose_control_points_are_gone_says_what_to_do(
     with pytest.raises(DatasetError, match=r"points\.txt cannot be read: No such file") as refused:
         run_cameras(folder_in(tmp_path), job, Progress(), threads=1)
     assert refused.value.hint.startswith("Put the file back and resume the job")
-
-
-def test_the_report_counts_what_was_left_out(
-    tmp_path: Path, video: Path, loaded: list[Path]
-) -> None:
-    stage = run_cameras(folder_in(tmp_path), job_of(video), Progress(), threads=1)
-    text = report_markdown({"cameras": stage.done}, tmp_path)
-    for row in (
-        "| Frames of the video | 30 frames |", "| Frames used as photos | 8 frames |",
-        "| Frames left out as blurred | 0 frames |",
-        "| Frames left out because nothing moved | 0 frames |",
-    ):  # fmt: skip
-        assert row in text
-    assert "solved from the photos alone" in text
-
-
-def test_meshing_again_ignores_how_frames_are_chosen(video: Path) -> None:
-    """Settings of videos that are not given are in no key of trainings made before them."""
-    job = job_of(video, video_frames=0)
-    assert frames_request(job) == frames_request(replace(job, command="mesh"))

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,25 +29,20 @@ from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage
 from gaussian_wrapping_addon.core.masks.mask_folder import read_list, write_list
 from gaussian_wrapping_addon.core.masks.segmentation import encoded
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.scene.scene import Scene, load_saved_scene, save_scene
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
 from tests.core.masks import onnx_files
 from tests.core.masks.test_silhouettes import overlap, sphere_seen
+from tests.core.meshing.meshing_scenes import cube
 from tests.core.training.small_scene import sphere_scene
 
 PROCESSOR = choose_device("cpu")
-
-
 COUNT = 12
-
-
 """Photos of the sphere."""
-
-
 WALL = (60, 120, 200)
-
-
 """Colour of a plain background."""
 
 
@@ -58,16 +53,12 @@ def folder(tmp_path: Path) -> JobFolder:
 
 @pytest.fixture
 def job(tmp_path: Path, folder: JobFolder) -> JobFile:
-    box = write_cube(tmp_path / "box.json")
-    settings = JobSettings(make_masks="region", regions=(str(box),))
-    return make_job("wrap", Path(read_job(folder.job_path).source), settings)
+    return masking(folder, make_masks="region", regions=(str(write_cube(tmp_path / "box.json")),))
 
 
-def left_half(scene: Scene, target: Path) -> None:
-    for index, view in enumerate(scene.views):
-        mask = np.zeros((view.camera.height, view.camera.width), bool)
-        mask[:, : view.camera.width // 2] = True
-        (target / f"{index:06d}.png").write_bytes(encoded(mask))
+def masking(folder: JobFolder, **settings: Any) -> JobFile:
+    """Return a job that wraps the photos of the sphere."""
+    return make_job("wrap", Path(read_job(folder.job_path).source), JobSettings(**settings))
 
 
 @pytest.fixture
@@ -77,7 +68,10 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
     def make(scene: Scene, _job: JobFile, target: Path, *_: object, **__: object) -> None:
         calls.append(target)
-        left_half(scene, target)
+        for index, view in enumerate(scene.views):
+            left = np.zeros((view.camera.height, view.camera.width), bool)
+            left[:, : view.camera.width // 2] = True
+            (target / f"{index:06d}.png").write_bytes(encoded(left))
 
     monkeypatch.setattr(masks, "make_region_masks", make)
     return calls
@@ -99,13 +93,23 @@ def finish_training(folder: JobFolder, job: JobFile, scene: Stage) -> None:
 
 
 def test_all_photos_get_their_mask_and_masks_mean_background(
-    folder: JobFolder, job: JobFile, made: list[Path]
+    folder: JobFolder, job: JobFile, made: list[Path], tmp_path: Path
 ) -> None:
     stage = run(folder, job)
     assert stage.name == MASKED
     assert [earlier.name for earlier in stage.before] == ["cameras", "masks"]
-    scene = load_saved_scene(stage.folder)
-    assert len(scene.views) == COUNT
+    again = run(folder, job)
+    assert (again.reused, again.key, len(made)) == (True, stage.key, 1)
+    listed = read_json(folder.root / "masks" / "masks.json")
+    assert (listed["version"], listed["rejected"]) == (1, [])
+    for entry in listed["masks"]:
+        assert entry["file"] == f"{entry['photo']}.png"
+        assert (folder.root / entry["image"]).is_file()
+        assert (folder.root / "masks" / entry["file"]).is_file()
+    moved = tmp_path / "elsewhere"
+    shutil.move(folder.root, moved)
+    scene = load_saved_scene(moved / "stages" / stage.folder.name)
+    assert len(scene.views) == len(listed["masks"]) == COUNT
     assert scene.mask_mode("auto") == "background"
     assert scene.facts["photos_masked_to_object"] == COUNT
     for view in scene.views:
@@ -114,21 +118,6 @@ def test_all_photos_get_their_mask_and_masks_mean_background(
         mask = np.asarray(Image.open(view.mask_path)) == 255
         assert mask[:, : mask.shape[1] // 2].all()
         assert not mask[:, mask.shape[1] // 2 :].any()
-        assert (folder.root / "masks" / f"{view.camera.name}.png").is_file()
-    again = run(folder, job)
-    assert again.reused
-    assert again.key == stage.key
-    assert len(made) == 1
-
-
-def test_a_moved_job_folder_keeps_its_masked_scene(
-    folder: JobFolder, job: JobFile, made: list[Path], tmp_path: Path
-) -> None:
-    stage = run(folder, job)
-    moved = tmp_path / "elsewhere"
-    shutil.move(folder.root, moved)
-    scene = load_saved_scene(moved / "stages" / stage.folder.name)
-    assert all(view.mask_path is not None and view.mask_path.is_file() for view in scene.views)
 
 
 def test_edits_rejections_and_deleted_files_change_the_key(
@@ -182,20 +171,15 @@ def test_no_masks_are_made_unless_asked_for(folder: JobFolder, made: list[Path])
     assert not (folder.root / "masks").exists()
 
 
-def test_a_mask_of_another_size_is_refused(
+def test_a_mask_of_another_size_or_that_is_no_image_is_refused(
     folder: JobFolder, job: JobFile, made: list[Path]
 ) -> None:
     name = names_of(run(folder, job))[0]
-    Image.new("L", (5, 5), 255).save(folder.root / "masks" / f"{name}.png")
+    path = folder.root / "masks" / f"{name}.png"
+    Image.new("L", (5, 5), 255).save(path)
     with pytest.raises(DatasetError, match=f"{name}.png is 5 x 5 pixels, its photo"):
         run(folder, job)
-
-
-def test_a_mask_that_is_no_image_is_refused(
-    folder: JobFolder, job: JobFile, made: list[Path]
-) -> None:
-    name = names_of(run(folder, job))[0]
-    (folder.root / "masks" / f"{name}.png").write_bytes(b"no image")
+    path.write_bytes(b"no image")
     with pytest.raises(DatasetError):
         run(folder, job)
     (folder.root / "masks" / "masks.json").write_text("[]")
@@ -284,21 +268,17 @@ def test_a_region_with_nothing_in_it_is_refused(
     folder: JobFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(masks.COARSE, "iterations", 5)
-    box = write_cube(tmp_path / "far.json")
-    values = json.loads(box.read_text())
-    values["vertices"] = [[x + 50.0, y, z] for x, y, z in values["vertices"]]
-    box.write_text(json.dumps(values))
-    settings = JobSettings(make_masks="region", regions=(str(box),))
-    job = make_job("wrap", Path(read_job(folder.job_path).source), settings)
+    write_region(tmp_path / "far.json", Region("far", cube(1.4).vertices + np.array([50, 0, 0])))
     with pytest.raises(DatasetError, match="found nothing in the regions"):
-        run(folder, job)
+        run(folder, masking(folder, make_masks="region", regions=(str(tmp_path / "far.json"),)))
 
 
-def test_a_model_masks_the_bright_part(folder: JobFolder, tmp_path: Path) -> None:
+def test_a_model_masks_the_bright_part_and_a_finished_training_needs_it_no_more(
+    folder: JobFolder, tmp_path: Path
+) -> None:
     pytest.importorskip("onnxruntime")
     path = onnx_files.written(tmp_path / "model.onnx", onnx_files.brightness(32))
-    settings = JobSettings(mask_model=str(path), mask_model_range="unit")
-    job = make_job("wrap", Path(read_job(folder.job_path).source), settings)
+    job = masking(folder, mask_model=str(path), mask_model_range="unit")
     check_mask_model(job, folder, Progress())
     stage = run(folder, job)
     for view in load_saved_scene(stage.folder).views:
@@ -306,14 +286,6 @@ def test_a_model_masks_the_bright_part(folder: JobFolder, tmp_path: Path) -> Non
         mask = np.asarray(Image.open(view.mask_path)) == 255
         bright = np.asarray(Image.open(view.photo_path).convert("RGB")).mean(2) >= 127.5
         assert overlap(mask, bright) >= 0.97
-
-
-def test_a_finished_training_needs_its_model_no_more(folder: JobFolder, tmp_path: Path) -> None:
-    pytest.importorskip("onnxruntime")
-    path = onnx_files.written(tmp_path / "model.onnx", onnx_files.brightness(32))
-    settings = JobSettings(mask_model=str(path), mask_model_range="unit")
-    job = make_job("wrap", Path(read_job(folder.job_path).source), settings)
-    stage = run(folder, job)
     finish_training(folder, job, stage)
     path.unlink()
     assert run(folder, dataclasses.replace(job, command="mesh")).key == stage.key
@@ -327,18 +299,5 @@ def test_a_model_that_is_none_is_refused_before_photos_are_read(
 ) -> None:
     pytest.importorskip("onnxruntime")
     path = onnx_files.written(tmp_path / "model.onnx", data)
-    job = make_job(
-        "wrap", Path(read_job(folder.job_path).source), JobSettings(mask_model=str(path))
-    )
     with pytest.raises(DatasetError, match=r"mask model|ONNX model"):
-        check_mask_model(job, folder, Progress())
-
-
-def test_the_list_names_photos_and_files(folder: JobFolder, job: JobFile, made: list[Path]) -> None:
-    run(folder, job)
-    values = read_json(folder.root / "masks" / "masks.json")
-    assert values["version"] == 1
-    assert values["rejected"] == []
-    for entry in values["masks"]:
-        assert entry["file"] == f"{entry['photo']}.png"
-        assert (folder.root / entry["image"]).is_file()
+        check_mask_model(masking(folder, mask_model=str(path)), folder, Progress())

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -13,8 +14,9 @@ import pytest
 import torch
 from PIL import Image
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.devices import DeviceChoice, choice, choose_device
+from gaussian_wrapping_addon.core.devices import DeviceChoice, choose_device
 from gaussian_wrapping_addon.core.errors import (
     DatasetError,
     DeviceError,
@@ -22,18 +24,21 @@ from gaussian_wrapping_addon.core.errors import (
     ResourceError,
 )
 from gaussian_wrapping_addon.core.field import cuda_vacancy, samples
-from gaussian_wrapping_addon.core.field.samples import DepthSamples
-from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField, VacancyResult
+from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
+from gaussian_wrapping_addon.core.jobs.parts.graph import Part, read_state
+from gaussian_wrapping_addon.core.jobs.parts.runner import InProcess, PartResult, PartRunner, Walk
 from gaussian_wrapping_addon.core.jobs.stages import meshing
 from gaussian_wrapping_addon.core.jobs.stages.meshing import (
     field_figures,
     field_views,
     region_field,
+    requested_region,
 )
-from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
+from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage, read_done
 from gaussian_wrapping_addon.core.mesh.surface_mesh import load_mesh
 from gaussian_wrapping_addon.core.meshing import pivot_meshing
 from gaussian_wrapping_addon.core.meshing.delaunay import bounding_points, delaunay
@@ -44,6 +49,7 @@ from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.meshing.surface_points import Field, halo_bounds
 from gaussian_wrapping_addon.core.photos.store import PhotoStore
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.regions.scene_regions import write_region
 from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.render.cuda import device_renderer
 from gaussian_wrapping_addon.core.render.cuda.device_renderer import DeviceRenderer
@@ -53,27 +59,46 @@ from gaussian_wrapping_addon.core.scene.scene import Scene, View, load_saved_sce
 from gaussian_wrapping_addon.core.settings import MeshingSettings, TrainingSettings
 from tests.core.field.field_scenes import camera_at, cameras_around, shell_arrays
 from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
-from tests.core.jobs.mesh_walk import walk_mesh
+from tests.core.jobs.test_device_job import emulate
 from tests.core.meshing.meshing_scenes import ShapeField, cube, gaussians_on, sphere
 from tests.core.render.cuda.emulation import EmulatedKernels
 from tests.proofs import first_then_proofs
 
 PROCESSOR = choose_device("cpu")
-
-
 HELD_OUT = {"000.png", "008.png"}
-
-
 """Of the twelve photos of the sphere, every eighth."""
 
 
+class MeshRunner(PartRunner):
+    """Runs the parts of the mesh; keeps which ones were finished before."""
+
+    reused: dict[str, bool]
+
+    def run(self, part: Part, progress: Progress) -> PartResult:
+        """Run a part; texture and export make nothing."""
+        if part.kind in ("texture", "export"):
+            return PartResult(())
+        result = super().run(part, progress)
+        self.__dict__.setdefault("reused", {})[part.name] = result.reused
+        return result
+
+
 def mesh_of(folder: JobFolder, meshing: MeshingSettings, device: DeviceChoice = PROCESSOR) -> Stage:
-    """Mesh the cube around the sphere."""
+    """Mesh the cube around the sphere in this process, without texture and export."""
     earlier = read_job(folder.job_path)
     path = write_cube(folder.root / "ball.json")
     settings = dataclasses.replace(earlier.settings, meshing=meshing, regions=(str(path),))
-    job: JobFile = make_job("mesh", Path(earlier.source), settings)
-    return walk_mesh(folder, job, "ball", device)
+    job = make_job("mesh", Path(earlier.source), settings)
+    runner = MeshRunner(folder, job, lambda: walk.graph, threads=1, device=device, begun_s=0.0)
+    engine = InProcess(folder.root, runner, lambda part: Progress())
+    walk = Walk(folder, job, engine, engine, lambda *_: None, lambda: False)
+    walk.run()
+    state = read_state(folder.root, "mesh-ball")
+    assert state is not None
+    stage = folder.root / state.outputs[0]
+    key, done = stage.name.rpartition("-")[2], read_done(stage)
+    assert done is not None
+    return Stage("mesh-ball", key, stage, done, runner.reused["plan-ball"])
 
 
 @pytest.mark.parametrize("method", ["pam", "pivots"])
@@ -100,7 +125,7 @@ def test_every_part_of_the_mesh_stage_uses_the_chosen_cameras(
     assert sampled[1] - sampled[0] == HELD_OUT
 
 
-@pytest.mark.parametrize(("pivots", "box"), [(2, "normal"), (9, "normal"), (9, "gof")])
+@pytest.mark.parametrize(("pivots", "box"), [(2, "normal"), (9, "gof")])
 def test_a_job_makes_the_mesh_of_the_pivots_alone(
     pivots: int, box: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,6 +139,10 @@ def test_a_job_makes_the_mesh_of_the_pivots_alone(
     made = mesh_of(folder, settings)
     mesh = load_mesh(made.folder / "mesh.npz")
     assert made.done["check"]["good"] is True
+    expected = made.done["estimate"]
+    tetrahedra = made.done["provenance"]["tetrahedra"]
+    assert expected["tetrahedra_low"] < tetrahedra < expected["tetrahedra_high"]
+    assert expected["free_memory_bytes"] > 0
     # The same by hand: Delaunay tetrahedra of exactly these points, labels, crossing edges.
     arrays = load_gaussians(next(folder.stages.glob("train-*")) / "gaussians.npz").arrays()
     own = pivot_rule(pivots, box)(arrays, np.arange(len(arrays.means)))
@@ -123,31 +152,17 @@ def test_a_job_makes_the_mesh_of_the_pivots_alone(
     field = VacancyField(arrays, ten, threads=1)
     points = np.concatenate([own, bounding_points(own, 0)])
     tetrahedra = delaunay(points, seed=0, progress=Progress())
-    inside = np.zeros(len(points), np.bool_)
-    inside[: len(own)] = ~field.is_empty(own)
+    inside = np.concatenate([~field.is_empty(own), np.zeros(len(points) - len(own), np.bool_)])
     edges, _ = marching_tetrahedra(tetrahedra, inside)
     begin, end = points[edges[:, 0]], points[edges[:, 1]]
     ends = bisect(begin, end, field.is_empty, np.full(len(edges), 1e-5), Progress())
-    expected = (ends[0] + ends[1]) / 2
+    wanted = (ends[0] + ends[1]) / 2
     # The region's corners lie in the ball's shadow: what the cut there adds is left out.
     found = mesh.vertices[np.linalg.norm(mesh.vertices, axis=1) < 1.2]
     tolerance = 0.02 * 4.5 / 48  # the job brackets to this share of a pixel
-    for here, there in ((found, expected), (expected, found)):
+    for here, there in ((found, wanted), (wanted, found)):
         assert np.quantile(cKDTree(there).query(here)[0], 0.99) < tolerance
-    assert len(found) == pytest.approx(len(expected), rel=0.05)
-
-
-class _EmulatedField(cuda_vacancy.CudaVacancyField):
-    """The GPU's field with its kernels on the host; says that it is where it was asked to be."""
-
-    library: Path
-
-    def __init__(self, arrays, cameras, *, device, **options):  # type: ignore[no-untyped-def]
-        super().__init__(
-            arrays, cameras, device="cpu", kernels=EmulatedKernels(self.library),
-            device_cache_bytes=1 << 30, **options,
-        )  # fmt: skip
-        self.device = device
+    assert len(found) == pytest.approx(len(wanted), rel=0.05)
 
 
 GPU = DeviceChoice("cuda:0", "Some GPU", "It passed.")
@@ -166,21 +181,12 @@ GPU = DeviceChoice("cuda:0", "Some GPU", "It passed.")
     ),
 )
 def test_on_a_gpu_the_field_and_the_depth_maps_are_there_if_they_fit(
-    free_gib: int,
-    device: str,
-    renderers: list[type],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    emulator_library: Path,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    free_gib: int, device: str, renderers: list[type], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, emulator_library: Path, caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
     folder = write_finished_sphere(tmp_path)
-    monkeypatch.setattr(_EmulatedField, "library", emulator_library, raising=False)
-    monkeypatch.setattr(cuda_vacancy, "CudaVacancyField", _EmulatedField)
-    monkeypatch.setattr(choice, "_usable", lambda index: (True, "It passed."))
-    monkeypatch.setattr(choice, "_card", lambda index: "Some GPU")
-    free = (free_gib << 30, 8 << 30)
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda index: free)
+    emulate(monkeypatch, emulator_library)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda index: (free_gib << 30, 8 << 30))
     kernels = EmulatedKernels(emulator_library)
     budget = 1 << 28 if free_gib > 1 else 1  # for tile intersections
     asked = []
@@ -204,10 +210,11 @@ def test_on_a_gpu_the_field_and_the_depth_maps_are_there_if_they_fit(
     assert made.done["check"]["good"] is True
     assert sampled == renderers
     assert asked == ["cuda:0"] * (device == "cuda:0")
-    told = [line for line in caplog.messages if line.startswith("Vacancy runs on the processor")]
-    assert len(told) == (device == "cpu")
-    told = [line for line in caplog.messages if line.startswith("Depth maps are rendered on the")]
-    assert len(told) == (len(renderers) == 2)
+    for begins, told in (
+        ("Vacancy runs on the processor", device == "cpu"),
+        ("Depth maps are rendered on the", len(renderers) == 2),
+    ):
+        assert len([line for line in caplog.messages if line.startswith(begins)]) == told
 
 
 class _FailingField(VacancyField):
@@ -263,15 +270,6 @@ def test_what_no_device_would_have_met_ends_the_stage(
         mesh_of(write_finished_sphere(tmp_path), MeshingSettings(points=300), GPU)
 
 
-def test_a_finished_mesh_is_re_used_on_another_device(tmp_path: Path) -> None:
-    folder = write_finished_sphere(tmp_path)
-    settings = MeshingSettings(
-        method="pivots", pivots=2, pivot_samples="none", min_component_share=0.0
-    )
-    assert not mesh_of(folder, settings).reused
-    assert mesh_of(folder, settings, GPU).reused
-
-
 def scene_with_masks(folder: Path, kept: slice) -> Scene:
     """Cameras around the unit shell whose masks keep some columns of each image."""
     views = []
@@ -281,15 +279,7 @@ def scene_with_masks(folder: Path, kept: slice) -> Scene:
         Image.fromarray(mask).save(folder / f"mask{index}.png")
         Image.fromarray(np.stack([mask] * 3, -1)).save(folder / f"{index}.png")
         views.append(View(camera, folder / f"{index}.png", folder / f"mask{index}.png"))
-    return Scene(
-        tuple(views),
-        np.zeros((0, 3)),
-        np.zeros((0, 3), np.uint8),
-        Similarity(1.0, np.eye(3), np.zeros(3)),
-    )
-
-
-POINTS = np.random.default_rng(0).uniform(-1.4, 1.4, (400, 3))
+    return Scene(tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), Similarity())
 
 
 def test_masks_and_their_mode_come_from_the_training(tmp_path: Path) -> None:
@@ -301,11 +291,12 @@ def test_masks_and_their_mode_come_from_the_training(tmp_path: Path) -> None:
         )
         for mode in ("ignore", "background")
     )  # fmt: skip
-    blind = ignoring.vacancy(POINTS)
+    points = np.random.default_rng(0).uniform(-1.4, 1.4, (400, 3))
+    blind, seen = ignoring.vacancy(points), background.vacancy(points).vacancy
     assert (blind.camera < 0).any(), "where all masks are black nobody looks"
     assert (blind.vacancy[blind.camera < 0] == 0.0).all()
-    assert (background.vacancy(POINTS).vacancy >= blind.vacancy).all()
-    assert (background.vacancy(POINTS).vacancy == 1.0).sum() > (blind.vacancy == 1.0).sum()
+    assert (seen >= blind.vacancy).all()
+    assert (seen == 1.0).sum() > (blind.vacancy == 1.0).sum()
 
 
 def test_unseen_space_is_what_the_settings_say_and_is_counted(tmp_path: Path) -> None:
@@ -345,28 +336,7 @@ def scene_looked_into() -> Scene:
     ]
     views = tuple(View(camera, Path("unused.png")) for camera in [*around, *within])
     none = np.zeros((0, 3))
-    return Scene(views, none, none.astype(np.uint8), Similarity(1.0, np.eye(3), np.zeros(3)))
-
-
-def within_reach_of_both() -> np.ndarray:
-    points = np.random.default_rng(2).normal(size=(200, 3))
-    return 0.2 * points / np.linalg.norm(points, axis=1)[:, None]
-
-
-@pytest.mark.parametrize(
-    ("holdout_every", "cameras", "carved"),
-    [(8, "training", False), (8, "all", True), (0, "training", True), (0, "all", True)],
-)
-def test_held_out_cameras_carve_only_if_all_cameras_are_asked_for(
-    holdout_every: int, cameras: str, carved: bool
-) -> None:
-    scene, training = scene_looked_into(), TrainingSettings(holdout_every=holdout_every)
-    field = region_field(
-        scene, shell_arrays(0.95), cube(1.5), training, MeshingSettings(cameras=cameras), threads=1
-    )
-    used = {camera.name for camera in field.cameras}
-    assert used == {f"b{i}" for i in range(7)} | ({"a", "c"} if carved else set())
-    assert (field.is_empty(within_reach_of_both()) == carved).all()
+    return Scene(views, none, none.astype(np.uint8), Similarity())
 
 
 @pytest.mark.parametrize(("cameras", "walls"), [("training", 1), ("all", 2)])
@@ -437,59 +407,23 @@ def test_gaussians_on_a_gpu_get_its_field_with_the_same_options(
     assert np.array_equal(given["region_bounds"], halo_bounds(cube(1.5)))
 
 
-class WatchedField(ShapeField):
-    """Notes the box of all points that are asked for."""
-
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-
-    def distance_of(self, points: np.ndarray) -> None:
-        self.low = np.minimum(self.low, points.min(0, initial=np.inf))
-        self.high = np.maximum(self.high, points.max(0, initial=-np.inf))
-
-    def vacancy(self, points: np.ndarray):  # type: ignore[no-untyped-def]
-        self.distance_of(points)
-        return super().vacancy(points)
-
-
 @pytest.mark.parametrize("method", ["pam", "pivots"])
 def test_nobody_asks_beyond_the_halo(method: str) -> None:
     region = Region.box("part", np.array([0.3, -0.4, -0.4]), np.array([1.2, 0.5, 0.4]))
+    low, high = halo_bounds(region)
+
+    class WatchedField(ShapeField):
+        def vacancy(self, points: np.ndarray) -> VacancyResult:
+            assert ((points >= low) & (points <= high)).all()
+            return super().vacancy(points)
+
     field = WatchedField(sphere(), 0.05)
     arrays = gaussians_on(sphere(), cube(1.5), 3000, 0.05)
+    settings, common = MeshingSettings(points=800), (arrays, field.cameras, region)
     if method == "pam":
-        mesh_region(
-            Field(field, field, 1),
-            arrays,
-            field.cameras,
-            region,
-            MeshingSettings(points=800),
-            Progress(),
-            seed=0,
-        )
+        mesh_region(Field(field, field, 1), *common, settings, Progress(), seed=0)
     else:
-        mesh_by_pivots(field, arrays, field.cameras, region, MeshingSettings(), Progress(), seed=0)
-    low, high = halo_bounds(region)
-    assert (field.low >= low).all()
-    assert (field.high <= high).all()
-
-
-def mesh_here(folder: Path):
-    points = np.random.default_rng(0).normal(size=(500, 3))
-    points /= np.linalg.norm(points, axis=1)[:, None]
-    return meshing.mesh_by_pivots_in_stage(
-        folder, Field(ShapeField(sphere(), 0.05), cast(Any, None), 1),
-        gaussians_on(sphere(), cube(1.5), 800, 0.05), cube(1.5),
-        MeshingSettings(method="pivots"), Progress(), seed=0,
-        depth_samples=DepthSamples(points, -points, np.full(500, 0.02)),
-    )  # fmt: skip
-
-
-def test_the_estimate_goes_with_the_mesh(tmp_path: Path) -> None:
-    mesh, expected = mesh_here(tmp_path)
-    assert expected["tetrahedra_low"] < mesh.provenance["tetrahedra"] < expected["tetrahedra_high"]
-    assert expected["points_low"] < len(mesh.vertices) < expected["points_high"]
-    assert expected["free_memory_bytes"] > 0
-    assert expected["tiled"] is False
+        mesh_by_pivots(field, *common, MeshingSettings(), Progress(), seed=0)
 
 
 def test_too_little_memory_is_refused_before_anything_is_made(
@@ -498,4 +432,22 @@ def test_too_little_memory_is_refused_before_anything_is_made(
     monkeypatch.setattr(meshing, "free_bytes", lambda *_: 1 << 20)
     monkeypatch.setattr(pivot_meshing, "mesh_by_pivots", lambda *_, **__: pytest.fail("began"))
     with pytest.raises(ResourceError, match="by pivots needs at least"):
-        mesh_here(tmp_path)
+        mesh_of(write_finished_sphere(tmp_path), MeshingSettings(method="pivots"))
+
+
+def test_a_region_file_comes_out_of_a_job_bit_by_bit(tmp_path: Path) -> None:
+    """Meshed from what an earlier mesh has left, again and again, a region does not wander."""
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.7]).as_matrix()
+    world_from_scene = Similarity(0.317, turn, np.array([5e5, 4.1e6, 87.3]))
+    vertices = np.random.default_rng(3).normal(size=(30, 3)) * 7.7 + world_from_scene.translation
+    path = tmp_path / "0.json"
+    write_region(path, Region("Würfel 1", vertices))
+    first = path.read_bytes()
+    for number in range(1, 4):
+        scene = cast(Any, SimpleNamespace(world_from_scene=world_from_scene))
+        inside, region = requested_region(str(path), read_json(path), scene, cast(Any, None))
+        back = world_from_scene.points(inside.vertices)
+        np.testing.assert_allclose(back, vertices, rtol=0, atol=4e-6 * region.diagonal)
+        path = tmp_path / f"{number}.json"
+        write_region(path, region)
+        assert path.read_bytes() == first

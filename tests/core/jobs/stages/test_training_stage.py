@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import shutil
+import weakref
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +24,10 @@ from gaussian_wrapping_addon.core.errors import (
 from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.jobs.stages.training import (
-    GAUSSIANS_FACTOR,
     GAUSSIANS_NAME,
-    IMAGE_FACTOR,
     MIN_GAUSSIANS,
     MIN_IMAGE_PX,
     TrainingStages,
-    killed_hint,
     reduced_settings,
     train_with_oom_retry,
 )
@@ -49,6 +48,8 @@ from gaussian_wrapping_addon.core.training.block_plan import (
 from tests.core.jobs.block_jobs import TRAINING, cameras_of, row_job
 from tests.core.training.row_scene import join_blocks, train_block
 from tests.core.training.test_trainer import StopAt, assert_same
+
+Finished = tuple[JobFolder, JobFile, Stage]
 
 
 def stages(folder: JobFolder, job: JobFile) -> TrainingStages:
@@ -85,30 +86,31 @@ def of_library(folder: JobFolder, root: Path, settings: TrainingSettings) -> Ori
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[JobFolder, JobFile, Stage]:
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     folder, job = row_job(tmp_path_factory.mktemp("blocks"))
     return folder, job, trained(folder, job)
 
 
-def copied(finished: tuple[JobFolder, JobFile, Stage], to: Path) -> JobFolder:
+def copied(finished: Finished, to: Path) -> JobFolder:
     shutil.copytree(finished[0].root, to / "out")
     return JobFolder(to / "out")
 
 
-def tokens(folder: JobFolder) -> dict[str, int]:
-    """Return the times of the files that trainings leave."""
-    return {
-        path.relative_to(folder.stages).as_posix(): path.stat().st_mtime_ns
-        for path in folder.stages.rglob("*.npz")
-    }
+def without_joined(finished: Finished, to: Path) -> Finished:
+    """Return a copy whose blocks are still to be joined."""
+    folder = copied(finished, to)
+    shutil.rmtree(folder.stages / finished[2].folder.name)
+    return folder, *finished[1:]
 
 
-def test_the_stages_make_what_the_library_makes(
-    finished: tuple[JobFolder, JobFile, Stage], tmp_path: Path
-) -> None:
+def gaussians_of(stage: Stage) -> OrientedGaussians:
+    return load_gaussians(stage.folder / GAUSSIANS_NAME)
+
+
+def test_the_stages_make_what_the_library_makes(finished: Finished, tmp_path: Path) -> None:
     folder, _, stage = finished
     expected = of_library(folder, tmp_path, TRAINING)
-    assert_same(load_gaussians(stage.folder / GAUSSIANS_NAME), expected)
+    assert_same(gaussians_of(stage), expected)
     assert [before.name for before in stage.before] == ["coarse", "block", "block"]
     figures = stage.done["blocks"]
     assert len(figures) == 2
@@ -123,12 +125,20 @@ def test_the_stages_make_what_the_library_makes(
 
 
 def test_finished_stages_are_used_again_and_blocks_may_go_once_they_are_joined(
-    finished: tuple[JobFolder, JobFile, Stage], tmp_path: Path
+    finished: Finished, tmp_path: Path
 ) -> None:
-    folder, job = copied(finished, tmp_path), finished[1]
-    before = tokens(folder)
+    def times() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in folder.stages.rglob("*.npz")}
+
+    folder, job, stage = copied(finished, tmp_path), *finished[1:]
+    before = times()
     assert trained(folder, job).reused
-    assert tokens(folder) == before
+    assert times() == before
+    # More training joins the same blocks.
+    longer = trained(folder, continue_training_job(folder, job, 10))
+    assert longer.done["iterations"] == stage.done["iterations"] + 10
+    assert stage.done["held_out_psnr"] < longer.done["held_out_psnr"]
+    assert times().items() >= before.items()
     (blocks,) = folder.stages.glob("blocks-*")
     shutil.rmtree(blocks)
     again = trained(folder, job)
@@ -136,36 +146,18 @@ def test_finished_stages_are_used_again_and_blocks_may_go_once_they_are_joined(
     assert not blocks.exists()
 
 
-def test_more_training_joins_the_same_blocks(
-    finished: tuple[JobFolder, JobFile, Stage], tmp_path: Path
-) -> None:
-    folder, job, stage = copied(finished, tmp_path), *finished[1:]
-    blocks = {name: at for name, at in tokens(folder).items() if name.startswith("blocks")}
-    longer = trained(folder, continue_training_job(folder, job, 10))
-    assert longer.done["iterations"] == stage.done["iterations"] + 10
-    assert stage.done["held_out_psnr"] < longer.done["held_out_psnr"]
-    assert {n: at for n, at in tokens(folder).items() if n.startswith("blocks")} == blocks
-
-
 @pytest.mark.parametrize("damaged", ["block-0001/gaussians.npz", "blocks.npz"])
-def test_what_is_damaged_is_made_again(
-    finished: tuple[JobFolder, JobFile, Stage], tmp_path: Path, damaged: str
-) -> None:
-    folder, job, stage = copied(finished, tmp_path), *finished[1:]
-    shutil.rmtree(folder.stages / stage.folder.name)
+def test_what_is_damaged_is_made_again(finished: Finished, tmp_path: Path, damaged: str) -> None:
+    folder, job, stage = without_joined(finished, tmp_path)
     (path,) = folder.stages.glob(f"blocks-*/{damaged}")
     path.write_bytes(path.read_bytes()[:-200])
-    again = trained(folder, job)
-    assert_same(
-        load_gaussians(again.folder / GAUSSIANS_NAME), load_gaussians(stage.folder / GAUSSIANS_NAME)
-    )
+    assert_same(gaussians_of(trained(folder, job)), gaussians_of(stage))
 
 
 def test_an_interrupted_block_goes_on_to_the_same_gaussians(
-    finished: tuple[JobFolder, JobFile, Stage], tmp_path: Path
+    finished: Finished, tmp_path: Path
 ) -> None:
-    folder, job, stage = copied(finished, tmp_path), *finished[1:]
-    shutil.rmtree(folder.stages / stage.folder.name)
+    folder, job, stage = without_joined(finished, tmp_path)
     (block,) = folder.stages.glob("blocks-*/block-0000")
     shutil.rmtree(block)
     with pytest.raises(Cancelled):
@@ -173,30 +165,13 @@ def test_an_interrupted_block_goes_on_to_the_same_gaussians(
     assert list(block.glob("checkpoint-*.json"))
     with pytest.raises(WorkerError, match="missing"):
         stages(folder, job).run(Progress())
-    again = trained(folder, job)
-    assert_same(
-        load_gaussians(again.folder / GAUSSIANS_NAME), load_gaussians(stage.folder / GAUSSIANS_NAME)
-    )
-
-
-def test_a_block_before_the_coarse_training_is_refused(tmp_path: Path) -> None:
-    folder, job = row_job(tmp_path)
-    with pytest.raises(WorkerError, match="not divided into blocks yet"):
-        stages(folder, job).block(0, Progress())
-
-
-@pytest.mark.parametrize("index", [-1, 2])
-def test_a_block_that_is_none_is_refused(tmp_path: Path, index: int) -> None:
-    folder, job = row_job(tmp_path)
-    with pytest.raises(UsageError, match=f"no block {index}, but 2 blocks"):
-        stages(folder, job).block(index, Progress())
+    assert_same(gaussians_of(trained(folder, job)), gaussians_of(stage))
 
 
 def test_too_little_memory_names_the_block_and_may_work_elsewhere(
-    finished: tuple[JobFolder, JobFile, Stage], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, job, stage = copied(finished, tmp_path), *finished[1:]
-    shutil.rmtree(folder.stages / stage.folder.name)
+    folder, job, _ = without_joined(finished, tmp_path)
     shutil.rmtree(next(folder.stages.glob("blocks-*/block-0001")))
 
     def full(*_: object, **__: object) -> None:
@@ -209,10 +184,15 @@ def test_too_little_memory_names_the_block_and_may_work_elsewhere(
     assert caught.value.exit_code == EXIT_RESOURCES
 
 
-def test_more_blocks_than_the_scene_has_are_refused(tmp_path: Path) -> None:
+def test_blocks_that_are_none_are_refused(tmp_path: Path) -> None:
     folder, job = row_job(tmp_path, blocks=500)
     with pytest.raises(UsageError, match="cannot be divided into 500 blocks"):
         stages(folder, job).coarse(Progress())
+    with pytest.raises(WorkerError, match="not divided into blocks yet"):
+        stages(folder, job).block(0, Progress())
+    for index in (-1, 500):
+        with pytest.raises(UsageError, match=f"no block {index}, but 500 blocks"):
+            stages(folder, job).block(index, Progress())
 
 
 def test_a_training_from_a_splat_is_not_divided(tmp_path: Path) -> None:
@@ -249,12 +229,7 @@ def test_all_priors_and_poses_of_the_coarse_training_reach_blocks_and_result(
 
 
 ASKED = TrainingSettings(max_gaussians=10_000, max_image_px=400)
-
-
-FIRST = (6000, 300)
-
-
-SECOND = (3600, 225)
+FIRST, SECOND = (6000, 300), (3600, 225)
 
 
 def failing(error: Exception, times: int) -> tuple[Callable, list[tuple[int, int]]]:
@@ -271,21 +246,25 @@ def failing(error: Exception, times: int) -> tuple[Callable, list[tuple[int, int
 
 
 @pytest.mark.parametrize(
-    "error",
+    ("error", "times"),
     [
-        MemoryError("Unable to allocate 3 GiB"),
-        MemoryError(),
-        ResourceError("9 pairs of Gaussian and tile do not fit.", "Render a smaller image."),
-        RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 3 bytes"),
-        RuntimeError("CUDA out of memory. Tried to allocate"),
+        (MemoryError("Unable to allocate 3 GiB"), 1),
+        (ResourceError("9 pairs of Gaussian and tile do not fit.", "Render a smaller image."), 2),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 3 bytes"), 1),
+        (RuntimeError("CUDA out of memory. Tried to allocate"), 2),
+        (MemoryError(), 9),
     ],
 )
-@pytest.mark.parametrize("times", [1, 2])
 def test_steps_down_and_says_so(tmp_path: Path, error: Exception, times: int) -> None:
     train, seen = failing(error, times)
     forgotten: list[int] = []
-    trained = train_with_oom_retry(train, ASKED, tmp_path, lambda: forgotten.append(len(seen)))
+    told = nullcontext() if times < 3 else pytest.raises(ResourceError, match="at most 3600 Gauss")
+    with told as caught:
+        trained = train_with_oom_retry(train, ASKED, tmp_path, lambda: forgotten.append(len(seen)))
     assert seen == [(10_000, 400), FIRST, SECOND][: times + 1]
+    if caught is not None:
+        assert caught.value.hint
+        return
     assert trained.result == seen[-1]
     assert (trained.settings.max_gaussians, trained.settings.max_image_px) == seen[-1]
     assert forgotten == list(range(1, times + 1))
@@ -293,14 +272,6 @@ def test_steps_down_and_says_so(tmp_path: Path, error: Exception, times: int) ->
     for warning, (gaussians, side_px) in zip(trained.warnings, seen[1:], strict=True):
         assert f"{gaussians} Gaussians" in warning.text
         assert f"{side_px} px" in warning.text
-
-
-def test_the_third_failure_is_told(tmp_path: Path) -> None:
-    train, seen = failing(MemoryError("full"), 9)
-    with pytest.raises(ResourceError, match="even with at most 3600 Gaussians") as caught:
-        train_with_oom_retry(train, ASKED, tmp_path, lambda: None)
-    assert len(seen) == 3
-    assert caught.value.hint
 
 
 @pytest.mark.parametrize(
@@ -314,12 +285,21 @@ def test_other_failures_are_passed_on_at_once(tmp_path: Path, error: Exception) 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_resumed_run_stays_as_small_as_it_was(tmp_path: Path) -> None:
-    sizes: list[int] = []
+def test_a_resumed_run_stays_as_small_as_it_was_and_the_failed_try_is_freed(
+    tmp_path: Path,
+) -> None:
+    class Large:
+        pass
+
+    alive: list[weakref.ref] = []
 
     def interrupted(settings: TrainingSettings) -> None:
-        sizes.append(settings.max_gaussians)
-        raise MemoryError if len(sizes) == 1 else Cancelled
+        if alive:
+            assert alive[0]() is None
+            raise Cancelled
+        large = Large()
+        alive.append(weakref.ref(large))
+        raise MemoryError
 
     with pytest.raises(Cancelled):
         train_with_oom_retry(interrupted, ASKED, tmp_path, lambda: None)
@@ -327,24 +307,6 @@ def test_a_resumed_run_stays_as_small_as_it_was(tmp_path: Path) -> None:
     trained = train_with_oom_retry(train, ASKED, tmp_path, lambda: pytest.fail("kept checkpoints"))
     assert seen == [FIRST]
     assert len(trained.warnings) == 1
-
-
-def test_memory_of_the_failed_try_is_free_before_the_next(tmp_path: Path) -> None:
-    import weakref
-
-    class Large:
-        pass
-
-    alive: list[weakref.ref] = []
-
-    def train(_settings: TrainingSettings) -> int:
-        if alive:
-            return sum(reference() is not None for reference in alive)
-        large = Large()
-        alive.append(weakref.ref(large))
-        raise MemoryError
-
-    assert train_with_oom_retry(train, ASKED, tmp_path, lambda: None).result == 0
 
 
 def test_a_step_has_a_floor_and_never_goes_up() -> None:
@@ -357,8 +319,3 @@ def test_a_step_has_a_floor_and_never_goes_up() -> None:
     assert (settings.max_gaussians, settings.max_image_px) == (MIN_GAUSSIANS, MIN_IMAGE_PX)
     assert 0 < steps < 5
     assert reduced_settings(TrainingSettings(max_gaussians=500, max_image_px=64)) is None
-
-
-def test_a_killed_worker_is_told_a_number() -> None:
-    assert "--max-gaussians 6000" in killed_hint(ASKED)
-    assert (GAUSSIANS_FACTOR, IMAGE_FACTOR) == (0.6, 0.75)

@@ -19,7 +19,6 @@ import pytest
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError, WrapError
 from gaussian_wrapping_addon.core.jobs import client as client_module
-from gaussian_wrapping_addon.core.jobs import worker
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.commands.export_files import result_of
 from gaussian_wrapping_addon.core.jobs.store import job_folder
@@ -101,7 +100,9 @@ def test_a_job_whose_files_are_links_is_refused(
     assert path.is_symlink()
 
 
-@pytest.mark.parametrize("name", ["stages", "result", "result/.earlier", "stages/train-a"])
+@pytest.mark.parametrize(
+    "name", ["stages", "result", "result/.earlier", "stages/train-a", "result/scene.json"]
+)
 def test_a_job_whose_folders_are_links_is_refused(
     folder: JobFolder, outside: Path, name: str
 ) -> None:
@@ -109,10 +110,13 @@ def test_a_job_whose_folders_are_links_is_refused(
     if name == "stages":
         path.rmdir()
     path.parent.mkdir(exist_ok=True)
-    path.symlink_to(outside)
+    path.symlink_to(outside / "profile" if path.suffix == ".json" else outside)
     before = content(outside)
     with pytest.raises(DatasetError, match=f"{path.name} is a link"):
         resume(folder)
+    if "scene" in name:
+        with pytest.raises(DatasetError, match=r"scene\.json is a link"):
+            result_of(folder.root)
     assert content(outside) == before
 
 
@@ -121,22 +125,15 @@ def test_the_swap_deletes_and_moves_nothing_behind_a_link(
     folder: JobFolder, outside: Path, name: str
 ) -> None:
     folder.result.mkdir()
+    (folder.result / "profile").write_text("mine")
     (folder.result / name).symlink_to(outside)
     before = content(outside)
+    recover(folder.result)
+    assert (folder.result / "profile").read_text() == "mine"
     with new_result(folder.result) as new:
         (new / "photo.jpg").write_bytes(b"new")
     assert content(outside) == before
-    assert content(folder.result) == {"photo.jpg": b"new"}
-
-
-def test_an_earlier_result_behind_a_link_is_not_taken(folder: JobFolder, outside: Path) -> None:
-    folder.result.mkdir()
-    (folder.result / "profile").write_text("mine")
-    (folder.result / EARLIER).symlink_to(outside)
-    before = content(outside)
-    recover(folder.result)
-    assert content(outside) == before
-    assert content(folder.result) == {"profile": b"mine"}
+    assert content(folder.result) == {"photo.jpg": b"new", "profile": b"mine"}
 
 
 @pytest.mark.parametrize("name", ["stages", "result", "stages/mesh-album"])
@@ -226,31 +223,17 @@ def test_looking_at_a_job_neither_waits_nor_fills_the_memory(
 
 @pytest.mark.usefixtures("within_3_s")
 @pytest.mark.parametrize("make", [make_pipe, link_to_zero, make_socket, make_large])
-def test_a_job_file_that_is_none_is_refused(
+def test_a_job_file_that_is_none_is_refused_and_such_a_lock_replaced(
     folder: JobFolder, make: Callable[[Path], None]
 ) -> None:
     folder.job_path.unlink()
     make(folder.job_path)
     with pytest.raises(WrapError, match=r"job\.json"):
         client_module.read_job(folder.job_path)
-
-
-@pytest.mark.usefixtures("within_3_s")
-def test_a_lock_that_is_a_pipe_is_replaced(folder: JobFolder) -> None:
-    make_pipe(folder.lock_path)
+    make(folder.lock_path)
     folder.lock()
     assert folder.lock_path.is_file()
     assert folder.locked()
-
-
-@pytest.mark.parametrize("use", [lambda f: result_of(f.root)])
-def test_commands_on_a_job_refuse_links(
-    folder: JobFolder, outside: Path, use: Callable[[JobFolder], None]
-) -> None:
-    folder.result.mkdir()
-    (folder.result / "scene.json").symlink_to(outside / "profile")
-    with pytest.raises(DatasetError, match=r"scene\.json is a link"):
-        use(folder)
 
 
 def test_a_job_folder_may_be_reached_through_a_link(folder: JobFolder, tmp_path: Path) -> None:
@@ -275,25 +258,15 @@ def test_names_cannot_forge_lines_of_the_log(tmp_path: Path) -> None:
         "logging.warning('region %s', name)\n"
         "try:\n    raise ValueError(name)\nexcept ValueError:\n    logging.exception('odd')\n"
     )
+    (tmp_path / "log.txt").write_text("earlier\n")
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "log.txt")], check=True)
     text = (tmp_path / "log.txt").read_text(encoding="utf-8")
-    lines = text.splitlines()
+    first, *lines = text.splitlines()
+    assert first == "earlier", "what was there stays"
     assert r"box\ncurl evil | sh\r\x1b]0;x\x07\u2028\u202e\ud800" in lines[0]
     assert all(line.startswith("| ") for line in lines[2:])
     assert any("curl evil" in line for line in lines[2:])
     assert not set("\x1b\x07\r\u202e") & set(text)
-
-
-def test_the_worker_keeps_its_log_if_the_file_is_its_own(folder: JobFolder) -> None:
-    folder.log_path.write_text("earlier\n")
-    handler = worker._log_to(folder.log_path)
-    try:
-        handler.emit(worker._logger.makeRecord("a", 20, "f", 1, "later", (), None))
-    finally:
-        worker.logging.getLogger().removeHandler(handler)
-        handler.close()
-    assert folder.log_path.read_text().splitlines()[0] == "earlier"
-    assert folder.log_path.read_text().endswith("later\n")
 
 
 def test_a_whole_disk_is_no_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ import json
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,23 +32,33 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings, preset
 
 
-def test_round_trip_keeps_settings_and_region_content(tmp_path: Path) -> None:
-    region = tmp_path / "head.json"
-    body = {
-        "class_name": "GaussianWrappingBoundingVolume",
-        "version": 1,
-        "blender_object_name": "head",
-        "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
-        "hull_simplices": None,
-    }
-    region.write_text(json.dumps(body))
-    settings = preset("fine", regions=("auto", str(region)), export=("glb", "ply"), seed=7)
-    job = make_job("wrap", tmp_path, settings)
+def body_of(name: str, size: float = 1.0) -> dict[str, Any]:
+    return {
+        "class_name": "GaussianWrappingBoundingVolume", "version": 1, "blender_object_name": name,
+        "vertices": [[0, 0, 0], [size, 0, 0], [0, size, 0], [0, 0, size]], "hull_simplices": None,
+    }  # fmt: skip
+
+
+def region_file(path: Path, name: str, size: float = 1.0) -> str:
+    path.write_text(json.dumps(body_of(name, size)))
+    return str(path)
+
+
+def test_round_trip_keeps_settings_region_content_and_own_lengths(tmp_path: Path) -> None:
+    region_file(tmp_path / "head.json", "head")
+    head = str(tmp_path / ".." / tmp_path.name / "head.json")
+    settings = preset("fine", regions=("auto", head), export=("glb", "ply"), seed=7)
+    settings = replace(settings, meshing=MeshingSettings(points=5000))
+    assert "edge_lengths" not in make_job("wrap", tmp_path, settings).to_json()
+    job = make_job("wrap", tmp_path, settings, {head: 0.25})
     write_job(tmp_path / "job.json", job)
-    region.unlink()
+    (tmp_path / "head.json").unlink()
     again = read_job(tmp_path / "job.json")
     assert again == job
-    assert again.region_bodies[str(region.resolve())] == body
+    (_, name) = again.settings.regions
+    assert again.region_bodies[name] == body_of("head"), "the file keeps to version 1"
+    assert again.meshing_of(name) == replace(settings.meshing, edge_length=0.25, points=0)
+    assert again.meshing_of("auto") == settings.meshing
 
 
 @pytest.mark.parametrize(
@@ -70,47 +81,40 @@ def test_what_is_not_a_job_is_refused_by_name(tmp_path: Path, change: dict, word
         JobFile.from_json(json.loads(json.dumps(values)))
 
 
-def test_half_a_job_file_names_the_line(tmp_path: Path) -> None:
+def test_half_a_job_file_names_the_line_and_a_missing_source_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "job.json"
     path.write_text('{"schema_version": 1,\n "command": ')
     with pytest.raises(ParseError, match="line 2"):
         read_job(path)
-
-
-def test_missing_source_and_region_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="does not exist"):
         make_job("wrap", tmp_path / "nothing", JobSettings())
-    with pytest.raises(DatasetError, match="Region file"):
-        make_job("wrap", tmp_path, replace(JobSettings(), regions=("nothing.json",)))
 
 
 @pytest.mark.parametrize(
-    ("request_", "body", "name"),
+    ("request_", "name", "folder"),
     [
         ("auto", None, "auto"),
-        ("all", None, "all"),
-        ("x/Left hand.json", {}, "Left_hand"),
-        ("x/a.json", {"blender_object_name": "Région 1/2"}, "R_gion_1_2"),
-        ("x/a.json", {"blender_object_name": "../../etc"}, "etc"),
+        ("x/Left hand.json", None, "Left_hand"),
+        ("x/a.json", "Région 1/2", "R_gion_1_2"),
+        ("x/a.json", "../../etc", "etc"),
+        ("x/a.json", "Report", "region_Report"),
+        ("x/a.json", "reports", "reports"),
+        ("x/a.json", "com1", "region_com1"),
+        # The number is the one of 0.1.0, so that a region meshed again finds its folder.
+        ("x/\u4e2d.json", None, "region_" + stage_key("x/\u4e2d.json")[:6]),
     ],
 )
-def test_region_names_are_safe_folder_names(request_: str, body: object, name: str) -> None:
-    assert region_name(request_, body) == name
+def test_region_names_are_safe_folder_names_that_nothing_else_has(
+    request_: str, name: str | None, folder: str
+) -> None:
+    assert region_name(request_, {"blender_object_name": name} if name else {}) == folder
+    assert region_name("x/auto.json", {}) not in ("auto", "all", "")
 
 
-@pytest.mark.parametrize("name", ["report", "Report", "CON", "nul", "com1"])
-def test_a_region_never_has_a_folder_that_is_taken(name: str) -> None:
-    assert region_name("x/a.json", {"blender_object_name": name}) == f"region_{name}"
-    assert region_name("x/a.json", {"blender_object_name": f"{name}s"}) == f"{name}s"
-
-
-def test_names_that_differ_in_case_alone_are_one() -> None:
+def test_names_of_one_folder_are_both_told() -> None:
     with pytest.raises(UsageError, match="same name"):
         region_names(["x/Head.json", "x/head.json"], {})
     assert region_names(["x/Head.json", "x/Heads.json"], {}) == ["Head", "Heads"]
-
-
-def test_two_names_for_one_folder_are_both_told() -> None:
     requests = ["x/a b.json", "x/auto.json", "x/a_b.json"]
     with pytest.raises(UsageError, match="a_b: 'a b' and 'a_b' use the same folder"):
         region_names(requests, {})
@@ -119,28 +123,19 @@ def test_two_names_for_one_folder_are_both_told() -> None:
 
 def test_a_job_that_would_replace_another_result_never_starts(tmp_path: Path) -> None:
     """Panel and command line start jobs by this client: no worker has to be asked."""
-    body = {"class_name": "GaussianWrappingBoundingVolume", "version": 1}
-    body |= {"vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]}
     job, photos = tmp_path / "job", tmp_path / "photos"
     photos.mkdir()
     (job / "result" / "a_b").mkdir(parents=True)
     (job / JOB_MARKER).touch()
     (job / "result" / "a_b" / "region.json").write_text('{"blender_object_name": "a_b"}')
-    requests = []
-    for number, name in enumerate(("a b", "a_b")):
-        path = tmp_path / f"{number}.json"
-        path.write_text(json.dumps({**body, "blender_object_name": name}))
-        requests.append(make_job("mesh", photos, JobSettings(regions=(str(path),))))
+    requests = [
+        make_job("mesh", photos, JobSettings(regions=(region_file(tmp_path / "r.json", name),)))
+        for name in ("a b", "a_b")
+    ]
     with pytest.raises(UsageError, match="'a b' would replace the result of region 'a_b'"):
         JobClient.start(job, requests[0], python="none")
     assert not (job / "job.json").exists()
     reject_region_conflicts(job / "result", requests[1])
-
-
-def test_regions_without_a_name_in_ascii_are_told_apart() -> None:
-    """The number is the one of 0.1.0, so that a region meshed again finds its folder."""
-    request = "x/\u4e2d.json"
-    assert region_name(request, {}) == f"region_{stage_key(request)[:6]}"
 
 
 @pytest.mark.parametrize(("new", "refused"), [("Würfel", False), ("Wörfel", True), ("w", False)])
@@ -154,34 +149,21 @@ def test_a_region_does_not_replace_the_result_of_another(
         reject_folder_conflicts(tmp_path, {"auto": "auto", new: folder})
 
 
-def test_a_region_name_never_hides_the_automatic_one() -> None:
-    assert region_name("x/auto.json", {}) not in ("auto", "all", "")
-    assert region_name("x/\u4e2d.json", {}) not in ("auto", "all", "")
-
-
 def test_regions_that_a_training_favours_stay_its_own(tmp_path: Path) -> None:
     """Another region is meshed from the same training: the training's key must not change."""
-    bodies = {}
-    for name, size in (("head", 1.0), ("foot", 2.0)):
-        bodies[name] = {
-            "class_name": "GaussianWrappingBoundingVolume",
-            "version": 1,
-            "blender_object_name": name,
-            "vertices": [[0, 0, 0], [size, 0, 0], [0, size, 0], [0, 0, size]],
-            "hull_simplices": None,
-        }
-        (tmp_path / f"{name}.json").write_text(json.dumps(bodies[name]))
-    settings = preset("draft", regions=(str(tmp_path / "head.json"),))
+    head = region_file(tmp_path / "head.json", "head")
+    foot = region_file(tmp_path / "foot.json", "foot", 2.0)
+    settings = preset("draft", regions=(head,))
     evenly = replace(settings, training=replace(settings.training, region_weight=1.0))
     assert make_job("wrap", tmp_path, evenly).settings.training.focus == ""
     everything = replace(settings, regions=(*settings.regions, "all"))
     assert make_job("wrap", tmp_path, everything).settings.training.focus == ""
     both = make_job("wrap", tmp_path, replace(settings, regions=("auto", *settings.regions)))
-    assert json.loads(both.settings.training.focus) == [bodies["head"], "auto"]
+    assert json.loads(both.settings.training.focus) == [body_of("head"), "auto"]
     assert JobFile.from_json(both.to_json()) == both
     trained = make_job("wrap", tmp_path, settings)
-    assert json.loads(trained.settings.training.focus) == [bodies["head"]]
-    other = replace(trained.settings, regions=(str(tmp_path / "foot.json"),))
+    assert json.loads(trained.settings.training.focus) == [body_of("head")]
+    other = replace(trained.settings, regions=(foot,))
     meshed = make_job("mesh", tmp_path, other)
     assert meshed.settings.training == trained.settings.training
     assert training_keys("cameras", meshed) == training_keys("cameras", trained)
@@ -193,12 +175,9 @@ def test_regions_that_a_training_favours_stay_its_own(tmp_path: Path) -> None:
     ("region", "message"), [("none.json", "does not exist"), (".", "is a folder, not")]
 )
 def test_a_region_that_is_no_file_is_told_by_all_commands(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    region: str,
-    message: str,
-) -> None:
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    region: str, message: str,
+) -> None:  # fmt: skip
     monkeypatch.setattr(run_in_worker, "exit_with_caller", lambda _caller: None)
     path = str(tmp_path / region)
     with pytest.raises(DatasetError, match=message):
@@ -211,12 +190,8 @@ def test_a_region_that_is_no_file_is_told_by_all_commands(
 
 
 def test_two_regions_of_one_name_are_refused_before_anything_starts(tmp_path: Path) -> None:
-    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    for name in ("a", "b", "c"):
-        body = {"class_name": "GaussianWrappingBoundingVolume", "version": 1, "vertices": vertices}
-        body["blender_object_name"] = "head" if name != "c" else "foot"
-        (tmp_path / f"{name}.json").write_text(json.dumps(body))
-    a, b, c = (str(tmp_path / f"{name}.json") for name in ("a", "b", "c"))
+    names = {"a": "head", "b": "head", "c": "foot"}
+    a, b, c = (region_file(tmp_path / f"{file}.json", name) for file, name in names.items())
     with pytest.raises(UsageError, match="same name, head"):
         make_job("mesh", tmp_path, JobSettings(regions=(a, "auto", b)))
     # One file by two spellings is one region.
@@ -225,32 +200,10 @@ def test_two_regions_of_one_name_are_refused_before_anything_starts(tmp_path: Pa
     assert job.settings.regions == (a, c)
 
 
-def test_a_region_has_an_edge_length_of_its_own(tmp_path: Path) -> None:
-    body = {"class_name": "GaussianWrappingBoundingVolume", "version": 1}
-    body |= {"blender_object_name": "head", "hull_simplices": None}
-    body |= {"vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]}
-    (tmp_path / "head.json").write_text(json.dumps(body))
-    head = str(tmp_path / ".." / tmp_path.name / "head.json")
-    settings = JobSettings(regions=("auto", head), meshing=MeshingSettings(points=5000))
-    job = make_job("mesh", tmp_path, settings, {head: 0.25})
-    write_job(tmp_path / "job.json", job)
-    again = read_job(tmp_path / "job.json")
-    assert again == job
-    (_, name) = again.settings.regions
-    assert again.meshing_of(name) == replace(settings.meshing, edge_length=0.25, points=0)
-    assert again.meshing_of("auto") == settings.meshing
-    assert again.region_bodies[name] == body, "the file keeps to version 1"
-
-
-def test_a_job_without_own_lengths_is_written_as_ever(tmp_path: Path) -> None:
-    assert "edge_lengths" not in make_job("wrap", tmp_path, JobSettings()).to_json()
-
-
 @pytest.mark.parametrize(
     "lengths",
-    [{"auto": 0.0}, {"auto": -1.0}, {"auto": float("nan")}, {"auto": float("inf")},
-     {"auto": "1"}, {"auto": True}, {"nobody": 1.0}, [1.0]],
-)  # fmt: skip
+    [*({"auto": one} for one in (0.0, 1e-320, float("nan"), "1", True)), {"nobody": 1.0}, [1.0]],
+)
 def test_impossible_lengths_are_refused(tmp_path: Path, lengths: object) -> None:
     values = {**make_job("mesh", tmp_path, JobSettings()).to_json(), "edge_lengths": lengths}
     with pytest.raises(UsageError, match="edge_lengths"):

@@ -36,29 +36,16 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings, TrainingSettings
 
 
-def test_a_finished_stage_is_not_run_again(tmp_path: Path) -> None:
-    runs = []
-
-    def work(folder: Path, progress: Progress) -> dict:
-        runs.append(folder)
-        return {"figure": 3}
-
-    first = run_stage(tmp_path, "train", "abc", Progress(), work)
-    second = run_stage(tmp_path, "train", "abc", Progress(), work)
-    other = run_stage(tmp_path, "train", "abd", Progress(), work)
-    assert len(runs) == 2
-    assert (first.reused, second.reused, other.reused) == (False, True, False)
-    assert second.done["figure"] == 3
-
-
-def test_an_interrupted_stage_is_run_again_in_the_same_folder(tmp_path: Path) -> None:
+def test_an_interrupted_stage_is_run_again_in_the_same_folder_a_finished_one_never(
+    tmp_path: Path,
+) -> None:
     def interrupted(folder: Path, progress: Progress) -> dict:
         (folder / "checkpoint").write_text("half")
         raise Cancelled
 
     def work(folder: Path, progress: Progress) -> dict:
         assert (folder / "checkpoint").read_text() == "half"
-        return {}
+        return {"figure": 3}
 
     with pytest.raises(Cancelled):
         run_stage(tmp_path, "train", "abc", Progress(), interrupted)
@@ -66,48 +53,27 @@ def test_an_interrupted_stage_is_run_again_in_the_same_folder(tmp_path: Path) ->
     stage = run_stage(tmp_path, "train", "abc", Progress(), work)
     assert not stage.reused
     assert stage.done["seconds"] >= 100.0
+    again = run_stage(tmp_path, "train", "abc", Progress(), interrupted)
+    assert (again.reused, again.done["figure"]) == (True, 3)
+    with pytest.raises(Cancelled):
+        run_stage(tmp_path, "train", "abd", Progress(), interrupted)
 
 
-def test_fingerprint_follows_size_time_and_names(tmp_path: Path) -> None:
+def test_fingerprint_follows_size_time_and_names_of_inputs(tmp_path: Path) -> None:
     photo = tmp_path / "a.jpg"
     photo.write_bytes(b"12")
     before = source_fingerprint(tmp_path)
-    assert source_fingerprint(tmp_path) == before
     os.utime(photo, ns=(1, 1))
-    assert source_fingerprint(tmp_path) != before
-    (tmp_path / "notes.md").write_text("not an input")
     after = source_fingerprint(tmp_path)
-    (tmp_path / "b.jpg").write_bytes(b"1")
-    assert source_fingerprint(tmp_path) != after
-
-
-def test_fingerprint_leaves_out_jobs_notes_and_second_copies(tmp_path: Path) -> None:
-    (tmp_path / "a.jpg").write_bytes(b"1")
-    before = source_fingerprint(tmp_path)
-    (tmp_path / "a.nef").write_bytes(b"22")
-    (tmp_path / "a.xmp").write_text("<x:xmpmeta xmlns:x='adobe:ns:meta/'/>")
-    (tmp_path / "list.csv").write_text("name,stars\na.jpg,5\n")
-    job = tmp_path / "a_wrap"
-    job.mkdir()
-    (job / JOB_MARKER).touch()
-    (job / "frame.jpg").write_bytes(b"333")
-    assert source_fingerprint(tmp_path) == before
+    assert after != before
+    for name in ("notes.md", "a.nef", "a.xmp", "list.csv", "a_wrap/stages/frame.jpg"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("no input, or the same photo again")
+    (tmp_path / "a_wrap" / JOB_MARKER).touch()
+    assert source_fingerprint(tmp_path) == after
+    assert [path.name for path in list_photos(tmp_path / "a_wrap" / "stages")] == ["frame.jpg"]
     (tmp_path / "b.nef").write_bytes(b"4444")
     assert [name for name, _, _ in source_fingerprint(tmp_path)] == ["", "a.jpg", "b.nef"]
-
-
-def test_photos_of_a_job_are_no_input(tmp_path: Path) -> None:
-    job = tmp_path / "clip_wrap" / "stages" / "frames"
-    job.mkdir(parents=True)
-    (tmp_path / "clip_wrap" / JOB_MARKER).touch()
-    (job / "frame.jpg").write_bytes(b"1")
-    assert list_photos(tmp_path) == []
-    assert [path.name for path in list_photos(job)] == ["frame.jpg"]
-
-
-def test_key_depends_on_every_part() -> None:
-    assert stage_key("a", {"x": 1}) == stage_key("a", {"x": 1})
-    assert stage_key("a", {"x": 1}) != stage_key("a", {"x": 2})
     assert stage_key("a", "b") != stage_key("ab")
 
 
@@ -204,39 +170,26 @@ def test_keys_tell_extra_iterations_from_everything_else(tmp_path: Path) -> None
         training_keys("cameras", started)
 
 
-@pytest.fixture
-def result(tmp_path: Path) -> Path:
+@pytest.mark.parametrize("region", ["ball", "cap"])
+def test_a_changed_and_a_new_region_set_the_blend_file_aside(
+    tmp_path: Path, region: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert result_state(tmp_path / "missing") == {}
+    assert not back_up_stale_blend(tmp_path / "missing", {})
     (tmp_path / "ball").mkdir()
     (tmp_path / "ball" / "figures.json").write_text('{"seconds": 1}')
     (tmp_path / "scene.blend").write_bytes(b"first")
-    return tmp_path
-
-
-def test_an_unchanged_result_keeps_its_file(result: Path) -> None:
-    before = result_state(result)
-    (result / "ball" / "figures.json").write_text('{"seconds": 1}')
-    assert not back_up_stale_blend(result, before)
-    assert (result / "scene.blend").read_bytes() == b"first"
-
-
-@pytest.mark.parametrize("region", ["ball", "cap"])
-def test_a_changed_and_a_new_region_set_the_file_aside(
-    result: Path, region: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    before = result_state(result)
-    (result / region).mkdir(exist_ok=True)
-    (result / region / "figures.json").write_text('{"seconds": 2}')
+    before = result_state(tmp_path)
+    (tmp_path / "ball" / "figures.json").write_text('{"seconds": 1}')
+    assert not back_up_stale_blend(tmp_path, before), "nothing has changed"
+    (tmp_path / region).mkdir(exist_ok=True)
+    (tmp_path / region / "figures.json").write_text('{"seconds": 2}')
     with caplog.at_level("INFO", "gaussian_wrapping"):
-        assert back_up_stale_blend(result, before)
-    assert not (result / "scene.blend").exists()
-    assert (result / "scene.blend1").read_bytes() == b"first"
+        assert back_up_stale_blend(tmp_path, before)
+    assert not (tmp_path / "scene.blend").exists()
+    assert (tmp_path / "scene.blend1").read_bytes() == b"first"
     assert "scene.blend1" in caplog.text
-    assert not back_up_stale_blend(result, before), "there is none to set aside"
-    (result / "scene.blend").write_bytes(b"second")
-    assert back_up_stale_blend(result, before)
-    assert (result / "scene.blend1").read_bytes() == b"second"
-
-
-def test_a_folder_without_a_result_is_no_error(tmp_path: Path) -> None:
-    assert result_state(tmp_path / "missing") == {}
-    assert not back_up_stale_blend(tmp_path / "missing", {})
+    assert not back_up_stale_blend(tmp_path, before), "there is none to set aside"
+    (tmp_path / "scene.blend").write_bytes(b"second")
+    assert back_up_stale_blend(tmp_path, before)
+    assert (tmp_path / "scene.blend1").read_bytes() == b"second"

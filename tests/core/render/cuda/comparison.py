@@ -3,17 +3,17 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.gaussians.model import TRAINED, OrientedGaussians
 from gaussian_wrapping_addon.core.render.cuda.device_renderer import render_with
-from gaussian_wrapping_addon.core.render.cuda.kernels import Argument, Kernels
+from gaussian_wrapping_addon.core.render.cuda.kernels import Kernels
 from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
 
@@ -24,6 +24,13 @@ BUDGET_BYTES = 1 << 30
 Renderer = Callable[[OrientedGaussians, Camera, RenderOptions], Render]
 
 
+def slope_of(view: Render) -> Tensor:
+    """Return the slope of -log T at the depths, (h, w), of a rendering by the CUDA text."""
+    slope = view.color.grad_fn.view.images.slope  # type: ignore[union-attr]
+    assert isinstance(slope, Tensor)
+    return slope
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Images and gradients of one rendering; tensors on the CPU."""
@@ -31,12 +38,6 @@ class Outcome:
     images: dict[str, Tensor]
     gradients: dict[str, Tensor]
     render: Render
-
-    def slope(self) -> Tensor:
-        """Return the slope of -log T at the depths, (h, w), of a rendering by the CUDA text."""
-        slope = self.render.color.grad_fn.view.images.slope  # type: ignore[union-attr]
-        assert isinstance(slope, Tensor)
-        return slope.cpu().double()
 
     def values(self) -> list[Tensor]:
         """Return everything that must be reproduced."""
@@ -46,25 +47,6 @@ class Outcome:
             found += [torch.as_tensor(getattr(statistics, name)) for name in STATISTICS]
             found.append(torch.as_tensor(statistics.strongest))
         return found
-
-
-class WatchedKernels(Kernels):
-    """Other kernels, watched: remembers the slopes of log T at the depths, (h, w)."""
-
-    slope: Tensor
-
-    def __init__(self, inner: Kernels) -> None:
-        self._inner = inner
-
-    def launch(self, name: str, blocks: int, *arguments: Argument) -> None:
-        """Launch and look."""
-        self._inner.launch(name, blocks, *arguments)
-        if name == "isosurface_tiles":
-            assert isinstance(arguments[-1], Tensor)
-            self.slope = arguments[-1]
-
-    def _run(self, name: str, blocks: int, parameters: ctypes.Array) -> None:
-        raise AssertionError("launch() hands everything on")
 
 
 def emulated(kernels: Kernels, budget_bytes: int = BUDGET_BYTES) -> Renderer:
@@ -109,10 +91,8 @@ def outcome(
     )
 
 
-def random_weights(
-    camera: Camera, options: RenderOptions, depth_weight: Tensor | None = None
-) -> dict[str, Tensor]:
-    """Return a random linear functional of the images; ``depth_weight`` scales the depth's."""
+def random_weights(camera: Camera, options: RenderOptions) -> dict[str, Tensor]:
+    """Return a random linear functional of the images."""
     generator = torch.Generator().manual_seed(5)
     shape = (camera.height, camera.width)
     weights = {
@@ -121,8 +101,6 @@ def random_weights(
     }
     if not options.depth:
         del weights["depth"]
-    elif depth_weight is not None:
-        weights["depth"] = weights["depth"] * depth_weight
     return weights
 
 
@@ -134,14 +112,23 @@ def depth_weights(
     A depth's gradient is something well conditioned over the slope of log T: each pixel is weighed
     by its slope, and pixels where T is all but flat at the crossing are left out.
     """
-    watched = WatchedKernels(kernels)
-    with torch.no_grad():
-        depth = emulated(watched)(gaussians, camera, options).depth.cpu()
-    slope = torch.where(depth > 0, watched.slope.cpu(), 0.0)
+    leaf = leaves(gaussians, torch.float32, str(gaussians.means.device))
+    view = emulated(kernels)(leaf, camera, options)
+    slope = torch.where(view.depth.detach() > 0, slope_of(view), 0.0).cpu()
     if not (slope > 0).any():
         return slope
     typical = slope[slope > 0].median()
     return torch.where(slope > 0.05 * typical, slope / typical, 0.0)
+
+
+def comparable_weights(
+    kernels: Kernels, gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
+) -> dict[str, Tensor]:
+    """Return random weights, that of the depth times :func:`depth_weights`."""
+    weights = random_weights(camera, options)
+    if options.depth:
+        weights["depth"] *= depth_weights(kernels, gaussians, camera, options)
+    return weights
 
 
 def relative_l2(a: Tensor, b: Tensor) -> float:
@@ -160,13 +147,9 @@ def assert_same_images(
 ) -> None:
     """Compare all images; depths where they exist to 1e-5, or in log T where that is flat.
 
-    Parameters
-    ----------
-    found : Outcome
-        Of the CUDA text: it knows the slopes of log T at its depths.
-    decided : float
-        Share of the pixels in which rounding may decide a threshold the other way: whether an
-        alpha of 1/255 contributes, whether a transmittance of 0.45 has a depth.
+    ``found`` is of the CUDA text. In a share ``decided`` of the pixels rounding may decide a
+    threshold the other way: whether an alpha of 1/255 contributes, whether a transmittance of 0.45
+    has a depth.
     """
     step = 2.0 * limits.ALPHA_MIN  # what a decision changes, times features up to 2
     for name in IMAGES[:4]:
@@ -181,7 +164,7 @@ def assert_same_images(
         return
     error = ((a - b).abs() / b)[both]
     # Where T is nearly flat at the crossing, its rounding is magnified in the depth.
-    residual = (a - b).abs()[both] * found.slope()[both]
+    residual = (a - b).abs()[both] * slope_of(found.render).cpu().double()[both]
     assert float((error >= 1e-5).double().mean()) < 0.01
     assert float(((error >= 1e-5) & (residual >= 1e-5)).double().mean()) <= decided
     assert float(torch.minimum(error, residual).max()) < (step if decided else 5e-5)
@@ -192,6 +175,24 @@ def assert_same_gradients(found: Outcome, wanted: Outcome, tolerance: float = 1e
     for name in TRAINED:
         error = relative_l2(found.gradients[name], wanted.gradients[name])
         assert error < tolerance, f"{name}: {error}"
+
+
+def assert_same_statistics(found: Outcome, cpu: Outcome) -> None:
+    """Compare what was asked for."""
+    a, b = found.render.statistics, cpu.render.statistics
+    assert a is not None
+    assert b is not None
+    assert np.array_equal(a.visible, b.visible)
+    assert np.allclose(a.radii_px, b.radii_px, rtol=1e-6)
+    for name in ("weight_sum", "weight_max", "grad_px", "grad_abs_px"):
+        x, y = getattr(a, name), getattr(b, name)
+        assert (x.dtype, x.shape) == (y.dtype, y.shape)
+        assert np.abs(x - y).max(initial=0.0) <= 1e-4 * np.abs(y).max(initial=0.0), name
+    assert (a.strongest is None) == (b.strongest is None)
+    if a.strongest is not None and b.strongest is not None:
+        assert a.strongest.dtype == b.strongest.dtype
+        # Two equal weights may be ordered either way by rounding.
+        assert (a.strongest == b.strongest).mean() > 0.99
 
 
 def assert_bitwise_equal(found: Outcome, wanted: Outcome) -> None:

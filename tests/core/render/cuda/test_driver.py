@@ -43,8 +43,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> FakeDriver:
 
 def test_kernels_are_loaded_and_launched_in_the_primary_context(fake: FakeDriver) -> None:
     module = DriverModule(1, b"image\0more", ["probe", "other"])
-    names = [name for name, _ in fake.calls]
-    assert names == [
+    assert [name for name, _ in fake.calls] == [
         "cuDeviceGet", "cuDevicePrimaryCtxRetain", "cuCtxPushCurrent_v2", "cuModuleLoadDataEx",
         "cuModuleGetFunction", "cuModuleGetFunction", "cuCtxPopCurrent_v2",
     ]  # fmt: skip
