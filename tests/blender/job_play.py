@@ -11,10 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import bpy
-import pytest
 
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
-from gaussian_wrapping_addon.ops import addon, job_timer
+from gaussian_wrapping_addon.ops import addon, background, job_timer
 
 WAIT_S = float(os.environ.get("GW_WAIT_S", "40"))
 """Longest wait for a state; more where the real worker is at work."""
@@ -37,6 +36,22 @@ def start_wrap(photos: Path, scene: bpy.types.Scene | None = None) -> Path:
     return Path(scene.gwrap.job_folder)
 
 
+def running_job(photos: Path, worker: Callable[..., None], mode: str = "slow") -> Path:
+    """Press Wrap Scene, and tick until the worker has reported; return the job folder."""
+    worker(mode)
+    folder = start_wrap(photos)
+    play_until(lambda: status_of(folder).fraction == 0.25, "never at work")
+    return folder
+
+
+def select(*things: bpy.types.Object) -> None:
+    """Select these objects alone; the first is the active one."""
+    bpy.context.view_layer.update()
+    for thing in bpy.context.view_layer.objects:
+        thing.select_set(thing in things)
+    bpy.context.view_layer.objects.active = things[0] if things else None
+
+
 def status_of(folder: Path) -> JobStatus:
     """Return what the panel would show of a job."""
     found = job_timer.status_of(str(folder))
@@ -44,15 +59,28 @@ def status_of(folder: Path) -> JobStatus:
     return found
 
 
-def play_until(holds: Callable[[], bool], what: str) -> None:
+def play_until(
+    holds: Callable[[], bool], what: str, clock: Callable[[], float] = time.monotonic
+) -> None:
     """Tick until something holds."""
     end_s = time.monotonic() + WAIT_S
     while time.monotonic() < end_s:
-        job_timer.poll_jobs()
+        job_timer.poll_jobs(clock)
         if holds():
             return
         time.sleep(0.02)
     raise AssertionError(f"{what}: {[(f, j.status) for f, j in job_timer.jobs.items()]}")
+
+
+def play_background(holds: Callable[[], bool] | None = None, wait_s: float = WAIT_S) -> None:
+    """Play the timer of background work until something holds, or until it goes out."""
+    end_s = time.monotonic() + wait_s
+    while True:
+        left = background.poll()
+        if left is None if holds is None else holds():
+            return
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
 
 
 def play_to(folder: Path, *states: str) -> JobStatus:
@@ -71,28 +99,11 @@ def meshes() -> int:
     return len(list(addon.objects_of_kind(bpy.context.scene, "mesh")))
 
 
-def status() -> object:
+def status() -> JobStatus:
     """Return what the panel would show of the open scene's job."""
-    return job_timer.status_of(bpy.context.scene.gwrap.job_folder)
+    return status_of(Path(bpy.context.scene.gwrap.job_folder))
 
 
 def wait_for(*states: str, clock: Callable[[], float] = time.monotonic) -> None:
     """Tick until the open scene's job is in one of these states."""
-    end_s = time.monotonic() + 20.0
-    while time.monotonic() < end_s:
-        job_timer.poll_jobs(clock)
-        if status().state in states:  # type: ignore[attr-defined]
-            return
-        time.sleep(0.02)
-    pytest.fail(f"the job is {status()}")
-
-
-def wait_until_it_says_something(folder: Path) -> None:
-    """Tick until the worker has reported."""
-    end_s = time.monotonic() + 20.0
-    while time.monotonic() < end_s:
-        job_timer.poll_jobs()
-        if status().fraction == 0.25:  # type: ignore[attr-defined]
-            return
-        time.sleep(0.02)
-    pytest.fail(f"no word from the worker in {folder}")
+    play_until(lambda: status().state in states, f"never {states}", clock)

@@ -10,11 +10,9 @@ import numpy as np
 from gaussian_wrapping_addon.core.scene.camera import Similarity
 from gaussian_wrapping_addon.core.scene.placement import FILE_NAME, read_placement
 from gaussian_wrapping_addon.ops import addon, placement
-from gaussian_wrapping_addon.ops.region_objects import matrix_of, transformed
+from gaussian_wrapping_addon.ops.region_objects import matrix_of, region_body, transformed
 from gaussian_wrapping_addon.ops.scene_objects import ImportedResult
-from tests.blender.synthetic_result import (
-    WORLD_FROM_SCENE,
-)
+from tests.blender.synthetic_result import WORLD_FROM_SCENE
 from tests.poses import look_at_pose
 
 
@@ -79,3 +77,8 @@ def tilt(imported: ImportedResult) -> Similarity:
     frame.location, frame.rotation_euler, frame.scale = (3, -2, 1), (0.3, -0.4, 0.5), (2, 2, 2)
     bpy.context.view_layer.update()
     return placement.placement_of(frame)
+
+
+def region_from_object(thing: bpy.types.Object) -> np.ndarray:
+    """Return the (n, 3) float64 hull of a region object in the world of the input."""
+    return np.array(region_body(thing)["vertices"])

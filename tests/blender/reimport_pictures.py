@@ -36,7 +36,7 @@ from tests.core.texture.detail_scenes import bumpy_ball, flat_uvs
 PLACEMENT = Similarity(0.9, rotation_about((1, 0.2, 0.5), 1.1), np.array([0.1, 0.2, -0.05]))
 IMPORTERS = {
     "glb": ("import_scene", "gltf"), "obj": ("wm", "obj_import"), "usd": ("wm", "usd_import"),
-    "fbx": ("import_scene", "fbx"),
+    "fbx": ("import_scene", "fbx"), "ply": ("wm", "ply_import"),
 }  # fmt: skip
 
 

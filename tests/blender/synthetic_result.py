@@ -30,25 +30,14 @@ WORLD_FROM_SCENE = Similarity(
 
 # Landscape, portrait with the principal point far off, and pixels that are not square.
 CAMERAS = tuple(
-    Camera(
-        name,
-        width,
-        height,
-        fx,
-        fy,
-        cx,
-        cy,
-        np.concatenate(
-            [rotation_about(axis, angle), np.array([[0.1], [-0.2], [6.0]])], 1
-        ),
+    Camera(name, *lens, np.concatenate([rotation_about(axis, angle), [[0.1], [-0.2], [6.0]]], 1))
+    for name, lens, axis, angle in (
+        ("wide.jpg", (640, 480, 500.0, 500.0, 320.0, 240.0), (0, 1, 0), 0.4),
+        ("tall.jpg", (300, 500, 420.0, 420.0, 190.0, 180.0), (1, 1, 0), -0.8),
+        ("flat pixels.png", (400, 380, 300.0, 360.0, 230.0, 150.0), (1, 0, 1), 2.0),
+        ("tall pixels.png", (400, 380, 360.0, 300.0, 180.0, 222.0), (1, 0.2, 1), 1.0),
     )
-    for name, width, height, fx, fy, cx, cy, axis, angle in (
-        ("wide.jpg", 640, 480, 500.0, 500.0, 320.0, 240.0, (0, 1, 0), 0.4),
-        ("tall.jpg", 300, 500, 420.0, 420.0, 190.0, 180.0, (1, 1, 0), -0.8),
-        ("flat pixels.png", 400, 380, 300.0, 360.0, 230.0, 150.0, (1, 0, 1), 2.0),
-        ("tall pixels.png", 400, 380, 360.0, 300.0, 180.0, 222.0, (1, 0.2, 1), 1.0),
-    )
-)  # fmt: skip
+)
 
 BOX_SCENE = (
     np.array([1.2, 0.9, 0.7]) * CUBE_CORNERS @ rotation_about((0, 0, 1), 0.3).T

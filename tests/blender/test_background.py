@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import bpy
 import pytest
@@ -14,6 +14,7 @@ import pytest
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.ops import background
 from gaussian_wrapping_addon.ops.background import Lane
+from tests.blender.job_play import play_background
 
 WAIT_S = 20.0
 
@@ -30,25 +31,6 @@ def gate() -> Iterator[threading.Event]:
     event = threading.Event()
     yield event
     event.set()
-
-
-def play() -> None:
-    """Play the timer, which never fires in background Blender, until it goes out."""
-    end_s = time.monotonic() + WAIT_S
-    while background.poll() is not None:
-        assert time.monotonic() < end_s
-        time.sleep(0.005)
-
-
-def threads() -> set[threading.Thread]:
-    return set(threading.enumerate())
-
-
-def wait_until(holds: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + WAIT_S
-    while not holds():
-        assert time.monotonic() < end_s
-        time.sleep(0.005)
 
 
 def test_results_and_errors_are_delivered_in_order_on_the_main_thread(
@@ -68,7 +50,7 @@ def test_results_and_errors_are_delivered_in_order_on_the_main_thread(
         lane.submit(lambda: 5, tell)
         assert lane.busy
         assert bpy.app.timers.is_registered(background.poll)
-        play()
+        play_background()
     assert told == [(True, True), (True, ZeroDivisionError), (True, 3), (True, 5)]
     assert caplog.text.count("ZeroDivisionError") == 2, "of a call and of a receiver"
     assert not lane.busy
@@ -83,7 +65,7 @@ def test_a_tick_waits_for_nothing(lane: Lane, gate: threading.Event) -> None:
     assert time.perf_counter() - begun_s < 1.0
     assert told == []
     gate.set()
-    play()
+    play_background()
     assert told == [True]
 
 
@@ -114,7 +96,7 @@ def test_cancelled_tasks_are_not_run_and_not_delivered(lane: Lane, gate: threadi
     assert told == ["ended"]
     assert not lane.busy
     lane.submit(lambda: "next", told.append)
-    play()
+    play_background()
     assert told == ["ended", "next"], "the next one did not wait for the one that was given up"
     assert running.result() == "late"
     with pytest.raises(Cancelled):
@@ -132,13 +114,13 @@ def test_another_file_cancels_what_is_about_this_one(addon: object, gate: thread
     bpy.ops.wm.read_homefile(use_empty=True)
     assert [lane.busy for lane in lanes] == [False, True]
     gate.set()
-    play()
+    play_background()
     assert told == ["machine"]
 
 
 def test_nothing_is_left_when_the_addon_is_disabled(addon: object, gate: threading.Event) -> None:
     addon.unregister()  # type: ignore[attr-defined]
-    before = threads()
+    before = set(threading.enumerate())
     addon.register()  # type: ignore[attr-defined]
     told: list[object] = []
     done: list[str] = []
@@ -152,7 +134,7 @@ def test_nothing_is_left_when_the_addon_is_disabled(addon: object, gate: threadi
 
     addon.unregister()  # type: ignore[attr-defined]
     assert not bpy.app.timers.is_registered(background.poll)
-    wait_until(lambda: threads() <= before)
+    play_background(lambda: set(threading.enumerate()) <= before)
     assert background.poll() is None
     assert (told, done) == ([], ["ended"])
 
@@ -193,5 +175,5 @@ def test_deliveries_start_no_thread(
         raise AssertionError("the timer starts a thread")
 
     monkeypatch.setattr(threading.Thread, "start", refuse)
-    play()
+    play_background()
     assert told == [2]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,36 +14,20 @@ import bpy
 import pytest
 
 import gaussian_wrapping_addon
-from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.settings import preset
-from gaussian_wrapping_addon.ops import addon, cli_command, job_timer
+from gaussian_wrapping_addon.ops import cli_command, job_timer
 from gaussian_wrapping_addon.ui import training_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import (
     meshes,
     play_to,
-    play_until,
-    start_wrap,
+    running_job,
     status_of,
-    write_fake_python,
 )
 
 BATCH = Path(gaussian_wrapping_addon.__file__).with_name("batch.py")
-
-
-@pytest.fixture
-def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    monkeypatch.setattr(addon, "_session", [])
-    monkeypatch.setenv(PYTHON_VARIABLE, str(write_fake_python(tmp_path)))
-    monkeypatch.setenv("GW_FAKE", "quick")
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    yield folder
-    for job in job_timer.jobs.values():
-        job.client.kill()
-    job_timer.forget_all_jobs()
 
 
 def batch(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -84,18 +68,15 @@ def test_the_command_has_the_exit_codes_of_batch(
     assert run(["check", str(tmp_path)]) == 3
 
 
-def test_a_job_of_the_button_goes_on_in_batch(
-    addon: object, photos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("GW_FAKE", "slow")
-    folder = start_wrap(photos)
-    play_until(lambda: status_of(folder).fraction == 0.25, "never at work")
+@pytest.mark.usefixtures("ended_workers")
+def test_a_job_of_the_button_goes_on_in_batch(photos: Path, worker: Callable[..., None]) -> None:
+    folder = running_job(photos, worker)
     refused = batch("resume", str(folder))
     assert refused.returncode == 2
     assert "A job is running in" in refused.stdout
     bpy.ops.gwrap.cancel_job()
     play_to(folder, "CANCELLED")
-    monkeypatch.setenv("GW_FAKE", "quick")
+    worker("quick")
     done = batch("resume", str(folder))
     assert done.returncode == 0, done.stdout + done.stderr
     assert (folder / "result" / "scene.blend").is_file()
@@ -103,7 +84,8 @@ def test_a_job_of_the_button_goes_on_in_batch(
     assert status_of(folder).state == "DONE"
 
 
-def test_a_job_of_batch_is_opened_by_the_button(addon: object, photos: Path) -> None:
+@pytest.mark.usefixtures("ended_workers", "worker")
+def test_a_job_of_batch_is_opened_by_the_button(photos: Path) -> None:
     folder = photos.with_name("job")
     target = JobFolder(folder)
     target.create()

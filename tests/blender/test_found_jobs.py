@@ -10,20 +10,20 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
 
 import bpy
 import pytest
 
-from gaussian_wrapping_addon.ops import addon, job_timer, jobs
-from gaussian_wrapping_addon.ops import addon as tags
+from gaussian_wrapping_addon.ops import addon, job_timer
 from gaussian_wrapping_addon.ui import training_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import (
+    meshes,
+    play_to,
+    running_job,
     start_wrap,
     status,
     wait_for,
-    wait_until_it_says_something,
 )
 
 pytestmark = pytest.mark.usefixtures("ended_workers")
@@ -32,24 +32,18 @@ pytestmark = pytest.mark.usefixtures("ended_workers")
 def test_a_file_finds_its_running_job_again(
     photos: Path, tmp_path: Path, worker: Callable[[str], None]
 ) -> None:
-    worker("slow")
-    start_wrap(photos)
-    wait_until_it_says_something(photos)
-    folder = Path(bpy.context.scene.gwrap.job_folder)
+    folder = running_job(photos, worker)
     blend = tmp_path / "work.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
     bpy.ops.wm.read_homefile(use_empty=True)
     (folder / "finish").touch()
-    end_s = time.monotonic() + 20
-    while job_timer.jobs[str(folder)].status.state != "DONE" and time.monotonic() < end_s:
-        job_timer.poll_jobs()
-        time.sleep(0.02)
+    play_to(folder, "DONE")
     assert len(bpy.data.objects) == 0, "another file gets nothing"
     bpy.ops.wm.open_mainfile(filepath=str(blend))
-    assert status().state == "DONE"  # type: ignore[attr-defined]
+    assert status().state == "DONE"
     job_timer.poll_jobs()
     wait_for("DONE")
-    assert len(list(tags.objects_of_kind(bpy.context.scene, "mesh"))) == 1
+    assert meshes() == 1
 
 
 def test_another_blender_finds_the_job_and_offers_its_result(
@@ -61,7 +55,7 @@ def test_another_blender_finds_the_job_and_offers_its_result(
     wait_for("DONE")
     job_timer.forget_all_jobs()  # as after a crash of Blender
     bpy.ops.wm.open_mainfile(filepath=str(blend))
-    assert status().state == "DONE"  # type: ignore[attr-defined]
+    assert status().state == "DONE"
     assert not job_timer.poll_jobs()
     assert len(bpy.data.objects) == 0, "opening a file imports nothing by itself"
     assert "Import Finished Result" in draw(training_panel.GWRAP_PT_train).texts
@@ -83,10 +77,10 @@ def test_a_project_folder_that_was_moved_asks_before_its_job_is_read(
     assert job_timer.jobs == {}, "a downloaded folder beside a file looks the same"
     assert "gwrap.find_job" in draw(training_panel.GWRAP_PT_train).operators
     bpy.ops.gwrap.find_job(directory=str(tmp_path / "moved" / "job"))
-    assert status().state == "DONE"  # type: ignore[attr-defined]
+    assert status().state == "DONE"
     job_timer.forget_all_jobs()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "moved" / "work.blend"))
-    assert status().state == "DONE"  # type: ignore[attr-defined]
+    assert status().state == "DONE"
     assert Path(bpy.context.scene.gwrap.job_folder) == tmp_path / "moved" / "job"
 
 
@@ -175,27 +169,9 @@ def test_a_file_from_elsewhere_opens_no_job_unasked(
     if bpy.context.scene.gwrap.job_folder:
         assert "gwrap.find_job" in draw(training_panel.GWRAP_PT_train).operators
     bpy.ops.gwrap.find_job(directory=folder)
-    assert status().state == "DONE"  # type: ignore[attr-defined]
+    assert status().state == "DONE"
 
 
 def test_find_job_refuses_other_folders(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="holds no job"):
         bpy.ops.gwrap.find_job(directory=str(tmp_path))
-
-
-def test_disabling_the_addon_leaves_the_job_to_be_found(
-    photos: Path, tmp_path: Path, worker: Callable[[str], None], addon: ModuleType
-) -> None:
-    worker("slow")
-    start_wrap(photos)
-    wait_until_it_says_something(photos)
-    folder = Path(bpy.context.scene.gwrap.job_folder)
-    client = job_timer.jobs[str(folder)].client
-    addon.unregister()
-    assert client.poll().active, "the worker goes on"
-    addon.register()
-    jobs.attach_later()
-    assert job_timer.is_running(bpy.context.scene.gwrap.job_folder)
-    (folder / "finish").touch()
-    wait_for("DONE")
-    assert len(list(tags.objects_of_kind(bpy.context.scene, "mesh"))) == 1

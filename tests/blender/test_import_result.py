@@ -11,8 +11,6 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from bpy_extras.object_utils import world_to_camera_view
-from mathutils import Vector
 
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, WrapError
 from gaussian_wrapping_addon.ops import addon
@@ -25,7 +23,7 @@ from gaussian_wrapping_addon.ops.scene_objects import (
     texture_of,
     write_blend,
 )
-from tests.blender.region_shapes import region_from_object
+from tests.blender.placed_scene import region_from_object
 from tests.blender.synthetic_result import (
     BOX_SCENE,
     CAMERAS,
@@ -45,7 +43,7 @@ def edge_face_counts(mesh: bpy.types.Mesh) -> set[int]:
     return set(counts.values())
 
 
-def test_mesh_has_geometry_uvs_texture_and_material(tmp_path: Path) -> None:
+def test_a_result_has_mesh_texture_material_and_region(tmp_path: Path) -> None:
     imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
     (thing,) = imported.meshes
     assert [o for o in bpy.data.objects if o.type == "MESH"] == [thing]
@@ -67,25 +65,14 @@ def test_mesh_has_geometry_uvs_texture_and_material(tmp_path: Path) -> None:
     assert np.round(pixels[15, 0, :3] * 255).tolist() == [200, 30, 40]
     assert shading_of(mesh.materials[0]) == "LIT"
     assert thing.parent == imported.frame
+    (region,) = imported.regions
+    assert (region.type, region.empty_display_type) == ("EMPTY", "CUBE")
+    assert min(region.scale) > 0
+    world, expected = region_from_object(region), WORLD_FROM_SCENE.points(BOX_SCENE)
+    distances = np.linalg.norm(world[:, None] - expected[None], axis=2)
+    assert distances.min(0).max() < 1e-5 * np.linalg.norm(np.ptp(expected, 0))
     assert imported.frame.matrix_world == imported.frame.matrix_world.Identity(4)
     assert addon.world_from_scene(imported.frame).translation.tolist() == [500000.25, 4000000.5, 30]
-
-
-def test_cameras_project_as_the_photos(tmp_path: Path) -> None:
-    imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
-    scene = bpy.context.scene
-    points = np.random.default_rng(3).uniform(-1, 1, (20, 3))
-    assert len(imported.cameras) == len(CAMERAS)
-    for thing, camera in zip(imported.cameras, CAMERAS, strict=True):
-        look_through(scene, thing)
-        bpy.context.view_layer.update()
-        pixels, depth = camera.project(points)
-        assert (depth > 0).all()
-        for point, pixel, z in zip(points, pixels, depth, strict=True):
-            x, y, z_blender = world_to_camera_view(scene, thing, Vector(point))
-            assert x * camera.width == pytest.approx(pixel[0], abs=2e-3)
-            assert (1.0 - y) * camera.height == pytest.approx(pixel[1], abs=2e-3)
-            assert z_blender == pytest.approx(z, abs=1e-4)
 
 
 @pytest.mark.parametrize("index", range(len(CAMERAS)))
@@ -109,18 +96,6 @@ def test_a_render_shows_the_cube_where_the_camera_says(tmp_path: Path, index: in
     high = np.clip(pixels.max(0), 0, (camera.width, camera.height))
     assert [columns.min(), rows.min()] == pytest.approx(low, abs=1.5)
     assert [columns.max() + 1, rows.max() + 1] == pytest.approx(high, abs=1.5)
-
-
-def test_region_box_round_trip(tmp_path: Path) -> None:
-    imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
-    (region,) = imported.regions
-    assert region.type == "EMPTY"
-    assert region.empty_display_type == "CUBE"
-    assert min(region.scale) > 0
-    world = region_from_object(region)
-    expected = WORLD_FROM_SCENE.points(BOX_SCENE)
-    distances = np.linalg.norm(world[:, None] - expected[None], axis=2)
-    assert distances.min(0).max() < 1e-5 * np.linalg.norm(np.ptp(expected, 0))
 
 
 def test_import_again_updates_and_keeps_what_the_user_did(tmp_path: Path) -> None:
@@ -173,6 +148,20 @@ def break_npz(result: Path, **changes: np.ndarray) -> None:
     np.savez(result / "auto" / "mesh.npz", **arrays)
 
 
+def write_second_atlas(region: Path) -> np.ndarray:
+    """Put half of the cube's faces into a second, green atlas; return the faces' atlases."""
+    owner = (np.arange(12) // 6).astype(np.uint8)
+    break_npz(region.parent, face_atlas=owner)
+    green = np.full((8, 8, 3), (10, 200, 20), np.uint8)
+    (region / "albedo-2.png").write_bytes(png_bytes(green))
+    return owner
+
+
+def lose_an_atlas(result: Path) -> None:
+    write_second_atlas(result / "auto")
+    (result / "auto" / "albedo-2.png").unlink()
+
+
 def turn_a_bit(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
@@ -201,7 +190,6 @@ HUGE_UVS = np.full((12, 3, 2), np.inf, np.float32)
         (lambda r: break_npz(r, faces=np.zeros((0, 3), int)), "corner_uvs|none"),
         (lambda r: break_npz(r, faces=np.zeros((12, 3))), "integers"),
         (lambda r: break_npz(r, vertices=np.array([None] * 8)), r"mesh\.npz.*damaged"),
-        (lambda r: (r / "auto" / "mesh.npz").write_bytes(b""), r"mesh\.npz.*damaged"),
         (lambda r: (r / "auto" / "mesh.npz").write_bytes(b"PK\x03\x04junk"), r"mesh\.npz.*damaged"),
         (lambda r: turn_a_bit(r / "auto" / "mesh.npz"), r"mesh\.npz.*damaged"),
         (lambda r: (r / "auto" / "albedo.png").unlink(), "albedo.png"),
@@ -210,10 +198,13 @@ HUGE_UVS = np.full((12, 3, 2), np.inf, np.float32)
         (lambda r: (r / "scene.json").unlink(), "scene.json"),
         (lambda r: (r / "scene.json").write_text("[1"), "line 1"),
         (lambda r: set_scene(r, radius="x"), "scene file"),
-        (lambda r: set_scene(r, cameras=3), "scene file"),
         (lambda r: set_scene(r, cameras=[{"photo": "a"}]), "scene file"),
         (lambda r: set_scene(r, world_from_scene={"scale": 0}), "scene file"),
         (lambda r: (r / "auto" / "mesh.npz").unlink(), "holds no mesh"),
+        (lambda r: break_npz(r, face_atlas=np.zeros(11, np.uint8)), "atlas"),
+        (lambda r: break_npz(r, face_atlas=np.zeros(12)), "atlas"),
+        (lambda r: break_npz(r, face_atlas=np.full(12, 200)), "atlas"),
+        (lose_an_atlas, r"albedo-2\.png"),
     ],
 )
 def test_damaged_results_are_refused_and_change_nothing(
@@ -264,54 +255,17 @@ def test_usd_of_each_region(tmp_path: Path) -> None:
         assert Path(bpy.path.abspath(image.filepath)).resolve() == path.with_name("albedo.png")
 
 
-def test_gltf_export_of_both_shadings(tmp_path: Path) -> None:
-    imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
-    material = imported.meshes[0].data.materials[0]
-    for shading in ("LIT", "UNLIT"):
-        assert set_shading(material, shading)
-        assert shading_of(material) == shading
-        path = tmp_path / f"{shading}.gltf"
-        bpy.ops.export_scene.gltf(
-            filepath=str(path), export_format="GLTF_SEPARATE", export_cameras=False
-        )
-        (written,) = json.loads(path.read_text())["materials"]
-        unlit = "KHR_materials_unlit" in written.get("extensions", {})
-        assert unlit == (shading == "UNLIT")
-        assert "baseColorTexture" in written["pbrMetallicRoughness"]
-
-
-def write_second_atlas(region: Path) -> np.ndarray:
-    """Put half of the cube's faces into a second, green atlas; return the faces' atlases."""
-    vertices, faces, corner_uvs = cube_mesh()
-    owner = (np.arange(12) // 6).astype(np.uint8)
-    np.savez(
-        region / "mesh.npz", vertices=vertices, faces=faces, corner_uvs=corner_uvs,
-        face_atlas=owner,
-    )  # fmt: skip
-    green = np.full((8, 8, 3), (10, 200, 20), np.uint8)
-    (region / "albedo-2.png").write_bytes(png_bytes(green))
-    return owner
-
-
-def test_two_atlases_are_two_materials(tmp_path: Path) -> None:
-    result = write_result(tmp_path / "job")
-    owner = write_second_atlas(result / "auto")
-    (thing,) = import_result(result, bpy.context.scene).meshes
-    assert [p.material_index for p in thing.data.polygons] == owner.tolist()
-    images = [texture_of(slot.material) for slot in thing.material_slots]
-    assert [Path(i.filepath).name for i in images] == ["albedo.png", "albedo-2.png"]
-    assert [slot.material.name for slot in thing.material_slots] == ["auto", "auto 2"]
-    assert edge_face_counts(thing.data) == {2}
-    assert [shading_of(slot.material) for slot in thing.material_slots] == ["LIT", "LIT"]
-
-
-def test_an_atlas_more_or_less_changes_the_materials(tmp_path: Path) -> None:
+def test_each_atlas_is_a_material_and_more_or_less_change_them(tmp_path: Path) -> None:
     result = write_result(tmp_path / "job")
     (thing,) = import_result(result, bpy.context.scene).meshes
     first = thing.material_slots[0].material
     set_shading(first, "UNLIT")
-    write_second_atlas(result / "auto")
+    owner = write_second_atlas(result / "auto")
     import_result(result, bpy.context.scene)
+    assert [p.material_index for p in thing.data.polygons] == owner.tolist()
+    images = [texture_of(slot.material) for slot in thing.material_slots]
+    assert [Path(i.filepath).name for i in images] == ["albedo.png", "albedo-2.png"]
+    assert edge_face_counts(thing.data) == {2}
     assert [slot.material.name for slot in thing.material_slots] == ["auto", "auto 2"]
     assert thing.material_slots[0].material == first
     assert [shading_of(slot.material) for slot in thing.material_slots] == ["UNLIT", "UNLIT"]
@@ -319,23 +273,3 @@ def test_an_atlas_more_or_less_changes_the_materials(tmp_path: Path) -> None:
     import_result(result, bpy.context.scene)
     assert [slot.material for slot in thing.material_slots] == [first]
     assert {p.material_index for p in thing.data.polygons} == {0}
-
-
-@pytest.mark.parametrize("bad", [np.zeros(11, np.uint8), np.zeros(12), np.full(12, 200)])
-def test_atlases_that_cannot_be_are_refused(bad: np.ndarray, tmp_path: Path) -> None:
-    result = write_result(tmp_path / "job")
-    vertices, faces, corner_uvs = cube_mesh()
-    np.savez(
-        result / "auto" / "mesh.npz", vertices=vertices, faces=faces, corner_uvs=corner_uvs,
-        face_atlas=bad,
-    )  # fmt: skip
-    with pytest.raises(ParseError, match="atlas"):
-        import_result(result, bpy.context.scene)
-
-
-def test_an_atlas_without_its_image_is_refused(tmp_path: Path) -> None:
-    result = write_result(tmp_path / "job")
-    write_second_atlas(result / "auto")
-    (result / "auto" / "albedo-2.png").unlink()
-    with pytest.raises(DatasetError, match=r"albedo-2\.png"):
-        import_result(result, bpy.context.scene)

@@ -77,9 +77,9 @@ def kill_and_reopen(
 
 
 @pytest.mark.parametrize(("keep", "found"), [("end", "CANCELLED"), ("keep", "RUNNING")])
-def test_a_killed_blender_finds_its_job_again(tmp_path: Path, keep: str, found: str) -> None:
-    photos = tmp_path / "photos"
-    photos.mkdir()
+def test_a_killed_blender_finds_its_job_again(
+    tmp_path: Path, photos: Path, keep: str, found: str
+) -> None:
     env = environment(tmp_path, write_fake_python(tmp_path))
     begun, end = kill_and_reopen(tmp_path, photos, env, keep)
     assert end["found"] == found
@@ -89,9 +89,7 @@ def test_a_killed_blender_finds_its_job_again(tmp_path: Path, keep: str, found: 
     assert not JobFolder(Path(begun["folder"])).locked()
 
 
-def test_quitting_leaves_no_process_behind(tmp_path: Path) -> None:
-    photos = tmp_path / "photos"
-    photos.mkdir()
+def test_quitting_leaves_no_process_behind(tmp_path: Path, photos: Path) -> None:
     done = subprocess.run(
         [sys.executable, str(SCRIPT), "quit", str(tmp_path / "work.blend"), str(photos), "end"],
         env=environment(tmp_path, write_fake_python(tmp_path)),

@@ -19,21 +19,12 @@ from gaussian_wrapping_addon.ops import job_timer, jobs
 from gaussian_wrapping_addon.ops.scene_objects import import_result
 from gaussian_wrapping_addon.ui import job_view
 from tests.blender.fake_layout import FakeLayout
+from tests.blender.panel_states import Client
 from tests.blender.synthetic_result import write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
 
 RUNNING = JobStatus("RUNNING", "train", 0.3, "iteration 750/3000", 90.0)
-
-
-class Client:
-    """Answers with the status that a test sets."""
-
-    def __init__(self, status: JobStatus) -> None:
-        self.status = status
-
-    def poll(self) -> JobStatus:
-        return self.status
 
 
 def watch(folder: Path, status: JobStatus = RUNNING, scene: Any = None) -> Client:
@@ -128,15 +119,6 @@ def test_another_file_shows_neither_points_nor_progress(tmp_path: Path) -> None:
     assert job_view.running_jobs() == []
 
 
-def test_points_lie_where_the_result_will_be(tmp_path: Path) -> None:
-    watch(tmp_path / "job")
-    assert job_timer.frame_of_job(bpy.context.scene) is None
-    import_result(write_result(tmp_path / "elsewhere"), bpy.context.scene)
-    assert job_timer.frame_of_job(bpy.context.scene) is None, "another job's result"
-    imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
-    assert job_timer.frame_of_job(bpy.context.scene) == imported.frame
-
-
 class Gpu:
     """Stands for Blender's modules ``gpu`` and ``gpu_extras.batch``, and notes what is drawn."""
 
@@ -199,9 +181,11 @@ def test_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known: s
     job_view.VIEW.draw(context(overlays=False))
     assert gpu.drawn == []
     job_view._draw_points(context())
+    import_result(write_result(tmp_path / "elsewhere"), bpy.context.scene).frame.location.x = 9
+    bpy.context.view_layer.update()
     job_view._draw_points(context())
     assert gpu.made == 1, "one batch for as long as the points are the same"
-    assert [matrix for _, matrix in gpu.drawn] == [None, None]
+    assert all(matrix is None for _, matrix in gpu.drawn)
     imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
     imported.frame.location = (1, 2, 3)
     bpy.context.view_layer.update()
@@ -238,33 +222,19 @@ def bar() -> FakeLayout:
     return layout
 
 
-@pytest.mark.parametrize("state", ["NEW", "RUNNING", "CANCELLING"])
-def test_a_running_job_is_in_the_status_bar(tmp_path: Path, state: str) -> None:
+def test_running_jobs_are_in_the_status_bar(tmp_path: Path) -> None:
     assert bar().log == []
-    client = watch(tmp_path, replace(RUNNING, state=state, fraction=0.256))
-    (name, _, keywords) = bar().log[-1]
-    assert name == "progress"
-    assert keywords["text"] == "Train · 26 % · 1 min 30 s left"
-    assert keywords["factor"] == 0.256
-    for ended in ("DONE", "CANCELLED", "FAILED", "LOST"):
-        client.status = replace(RUNNING, state=ended)
-        job_timer.jobs[str(tmp_path)].status = client.status
-        assert bar().log == []
-
-
-def test_the_newest_of_several_jobs_is_shown_and_the_others_are_counted(tmp_path: Path) -> None:
-    watch(tmp_path / "a")
+    for state in ("NEW", "RUNNING", "CANCELLING"):
+        watch(tmp_path / "a", replace(RUNNING, state=state, fraction=0.256))
+        (name, _, keywords) = bar().log[-1]
+        assert name == "progress"
+        assert keywords["text"] == "Train · 26 % · 1 min 30 s left"
+        assert keywords["factor"] == 0.256
     watch(tmp_path / "b", replace(RUNNING, fraction=1.7), bpy.data.scenes.new("other"))
     (_, _, keywords) = bar().log[-1]
-    assert keywords["text"] == "Train · 100 % · 1 min 30 s left (+1)"
+    assert keywords["text"] == "Train · 100 % · 1 min 30 s left (+1)", "the newest"
     assert keywords["factor"] == 1.0
-
-
-def test_nothing_stays_in_the_status_bar(addon: Any) -> None:
-    functions = bpy.types.STATUSBAR_HT_header._dyn_ui_initialize()
-    assert functions.count(job_view.draw) == 1
-    addon.register()
-    assert functions.count(job_view.draw) == 1
-    addon.unregister()
-    assert functions.count(job_view.draw) == 0
-    assert job_view.VIEW.handle is None
+    for ended in ("DONE", "CANCELLED", "FAILED", "LOST"):
+        for job in job_timer.jobs.values():
+            job.status = replace(RUNNING, state=ended)
+        assert bar().log == []

@@ -9,31 +9,19 @@ from types import SimpleNamespace
 import bpy
 import pytest
 
-from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.core.jobs.commands.doctor import Diagnosis
 from gaussian_wrapping_addon.core.jobs.store.job_folder import STATES, JobStatus
-from gaussian_wrapping_addon.ops import addon, job_timer, worker_setup
+from gaussian_wrapping_addon.ops import job_timer, worker_setup
 from gaussian_wrapping_addon.ops.scene_objects import import_result
 from gaussian_wrapping_addon.ui import mesh_panel, preferences, result_panel, training_panel
 from gaussian_wrapping_addon.ui.panel_base import progress_text
 from tests.blender.fake_layout import FakeLayout, draw
+from tests.blender.panel_states import Client
 from tests.blender.synthetic_result import write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
 
-PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel)]
-REGION = next(cls for cls in PANELS if cls.bl_label == "Region")
 TRAIN, MESH = training_panel.GWRAP_PT_train, mesh_panel.GWRAP_PT_mesh
-
-
-class FakeClient:
-    """Answers with one status."""
-
-    def __init__(self, status: JobStatus) -> None:
-        self.status = status
-
-    def poll(self) -> JobStatus:
-        return self.status
 
 
 @pytest.fixture(autouse=True)
@@ -44,94 +32,52 @@ def _no_jobs() -> None:
 def show(status: JobStatus, command: str = "WRAP") -> None:
     scene = bpy.context.scene
     scene.gwrap.job_command = command
-    job_timer.watch(scene, Path("/tmp/gwrap-none"), FakeClient(status), imports=False)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("panel", [p for p in PANELS if p.bl_label != "Details"])
-def test_every_panel_draws_in_an_empty_file(panel: type) -> None:
-    layout = draw(panel)
-    assert layout.log
-    assert not [t for t in layout.texts.split() if t.isupper() and len(t) > 4], "no ALL CAPS"
+    job_timer.watch(scene, Path("/tmp/gwrap-none"), Client(status), imports=False)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("state", STATES)
-@pytest.mark.parametrize("command", ["WRAP", "MESH"])
-def test_job_states(state: str, command: str) -> None:
+def test_states_of_a_mesh_job(state: str) -> None:
     error = "It broke." if state in ("FAILED", "LOST") else ""
     hint = "Do that." if state in ("FAILED", "LOST", "CANCELLED") else ""
-    show(JobStatus(state, "train", 1.0000001, "step 5", 75.0, error, hint), command)
-    here, other = map(draw, (TRAIN, MESH) if command == "WRAP" else (MESH, TRAIN))
+    show(JobStatus(state, "train", 1.0000001, "step 5", None, error, hint), "MESH")
+    mesh, train = draw(MESH), draw(TRAIN)
     running = state in ("NEW", "RUNNING", "CANCELLING")
-    assert ("gwrap.cancel_job" in here.operators) == running
-    assert "gwrap.cancel_job" not in other.operators
-    assert ("Train · 100 %" in here.texts) == running
-    assert ("Cancelling…" in here.texts) == (state == "CANCELLING")
-    assert error in here.texts
-    assert hint in here.texts
-    assert ("gwrap.resume_job" in here.operators) == (state in ("FAILED", "LOST", "CANCELLED"))
-    assert error == "" or error not in other.texts
+    assert ("gwrap.cancel_job" in mesh.operators) == running
+    assert "gwrap.cancel_job" not in train.operators
+    assert ("Train · 100 %" in mesh.texts) == running
+    assert ("Cancelling…" in mesh.texts) == (state == "CANCELLING")
+    assert "left" not in mesh.texts
+    assert error in mesh.texts
+    assert hint in mesh.texts
+    assert ("gwrap.resume_job" in mesh.operators) == (state in ("FAILED", "LOST", "CANCELLED"))
+    assert error == "" or error not in train.texts
 
 
-@pytest.mark.parametrize("left", [None, 0.0, 1e6])
-def test_any_time_left_is_drawn(left: float | None) -> None:
-    show(JobStatus("RUNNING", "train", -0.5, "step 5", left))
-    assert ("left" in draw(TRAIN).texts) == (left is not None)
+def fields(panel: type) -> set[str]:
+    return {field.name for field in draw(panel).fields}
 
 
-def test_a_first_wrap_can_be_started_at_one_glance() -> None:
-    layout = draw(TRAIN)
-    assert layout.operators == ["gwrap.wrap_scene"]
-    assert [field.name for field in layout.fields] == ["preset", "output"]
-
-
-@pytest.mark.parametrize(
-    ("resolution", "shown"),
-    [("AUTOMATIC", set()), ("EDGE_LENGTH", {"edge_length"}), ("POINTS", {"points"})],
-)
-def test_mesh_panel_shows_what_decides(resolution: str, shown: set[str]) -> None:
-    bpy.context.scene.gwrap.resolution = resolution
-    properties = {a[1] for name, a, _ in draw(MESH).log if name == "prop"}
-    assert properties == {"resolution"} | shown
-
-
-@pytest.mark.parametrize("method", ["PAM", "PIVOTS"])
-def test_advanced_panel_asks_for_what_counts_by_the_method(method: str) -> None:
-    bpy.context.scene.gwrap.method = method
-    log = draw(mesh_panel.GWRAP_PT_mesh_advanced).log
-    properties = {a[1] for name, a, _ in log if name == "prop"}
-    own = {"PAM": {"spacing"}, "PIVOTS": {"pivots", "pivot_box", "pivot_samples"}}[method]
+def test_panels_ask_for_what_decides() -> None:
+    gwrap = bpy.context.scene.gwrap
+    assert fields(TRAIN) == {"preset", "output"}
+    for resolution, name in (
+        ("AUTOMATIC", None),
+        ("EDGE_LENGTH", "edge_length"),
+        ("POINTS", "points"),
+    ):
+        gwrap.resolution = resolution
+        assert fields(MESH) == {"resolution", name} - {None}
     shared = {
         "most_parts", "decimate", "smooth_steps", "method", "boundary", "unseen", "mesh_cameras",
     }  # fmt: skip
-    assert properties == shared | own
-
-
-def test_texture_panel_has_every_map() -> None:
-    names = [field.name for field in draw(mesh_panel.GWRAP_PT_texture).fields]
-    assert names == [
-        "texture_size",
-        "max_atlases",
-        "texture_source",
-        "normal_map",
-        "ambient_occlusion",
-        "lods",
-    ]
-
-
-@pytest.mark.parametrize("decimate", [False, True])
-def test_mesh_panel_asks_for_faces_only_where_they_are_limited(decimate: bool) -> None:
-    bpy.context.scene.gwrap.decimate = decimate
-    log = draw(mesh_panel.GWRAP_PT_mesh_advanced).log
-    properties = {a[1] for name, a, _ in log if name == "prop"}
-    assert ("target_faces" in properties) == decimate
-
-
-def test_region_and_result_panels_with_a_result(tmp_path: Path) -> None:
-    import_result(write_result(tmp_path / "job"), bpy.context.scene)
-    bpy.context.view_layer.update()
-    assert "auto region" in draw(REGION).texts
-    layout = draw(result_panel.GWRAP_PT_result)
-    assert layout.operators.count("gwrap.set_shading") == 2
+    for method, own in (("PAM", {"spacing"}), ("PIVOTS", {"pivots", "pivot_box", "pivot_samples"})):
+        gwrap.method, gwrap.decimate = method, False
+        assert fields(mesh_panel.GWRAP_PT_mesh_advanced) == shared | own
+        gwrap.decimate = True
+        assert fields(mesh_panel.GWRAP_PT_mesh_advanced) == shared | own | {"target_faces"}
+    assert fields(mesh_panel.GWRAP_PT_texture) == {
+        "texture_size", "max_atlases", "texture_source", "normal_map", "ambient_occlusion", "lods",
+    }  # fmt: skip
 
 
 def test_scene_tools_with_a_result(tmp_path: Path) -> None:
@@ -158,18 +104,6 @@ def test_scene_tools_with_a_result(tmp_path: Path) -> None:
     assert "Select vertices" in draw(result_panel.GWRAP_PT_scene_tools).texts
 
 
-@pytest.mark.parametrize(
-    "text", ["", "[]", "{", "[" * 5000, "3", '{"psnr": "x", "regions": {"a": 3}}']
-)
-def test_result_panel_survives_edited_properties(tmp_path: Path, text: str) -> None:
-    imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
-    imported.frame[addon.FIGURES] = text
-    imported.frame[addon.RESULT] = 5
-    imported.meshes[0].data.materials.clear()
-    for panel in PANELS:
-        draw(panel)
-
-
 def test_preferences_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [Diagnosis("torch", False, "cannot be imported", "pip install torch")]
     monkeypatch.setattr(worker_setup, "_findings", [*found, Diagnosis("numpy", True, "1.26.4")])
@@ -184,23 +118,12 @@ def test_preferences_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     assert worker_setup.as_text().splitlines()[0].startswith("BAD  torch: cannot be imported")
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (0, "0 s"),
-        (59.4, "59 s"),
-        (59.6, "1 min 00 s"),
-        (599, "9 min 59 s"),
-        (600, "10 min"),
-        (3599, "1 h 00 min"),
-        (7260, "2 h 01 min"),
-        (-5, "0 s"),
-    ],
-)
-def test_time_span(seconds: float, text: str) -> None:
-    assert progress_text("train", 0.5, seconds).endswith(f" {text} left")
-
-
 def test_progress_text() -> None:
-    assert progress_text("train", 0.256, 90) == "Train · 26 % · 1 min 30 s left"
     assert progress_text("", 0.0, None) == "Starting · 0 %"
+    show(JobStatus("RUNNING", "train", -0.5, "step 5", 1e6))
+    assert "left" in draw(TRAIN).texts
+    for seconds, text in (
+        (59.4, "59 s"), (59.6, "1 min 00 s"), (600, "10 min"), (3599, "1 h 00 min"),
+        (-5, "0 s"),
+    ):  # fmt: skip
+        assert progress_text("train", 0.256, seconds) == f"Train · 26 % · {text} left"

@@ -28,8 +28,6 @@ pytestmark = pytest.mark.usefixtures("addon")
 
 POSE = np.concatenate([rotation_about((1, 2, 0.5), 0.6), np.array([[0.1], [-0.2], [6.0]])], 1)
 SHAPES = [
-    Camera("landscape", 4000, 3000, 3200.0, 3200.0, 2000.0, 1500.0, POSE),
-    Camera("portrait", 3000, 4000, 3200.0, 3200.0, 1500.0, 2000.0, POSE),
     Camera("square", 1024, 1024, 900.0, 900.0, 512.0, 512.0, POSE),
     Camera("off centre", 4000, 3000, 3200.0, 3200.0, 2310.5, 1203.25, POSE),
     Camera("portrait off centre", 3000, 4000, 2900.0, 2900.0, 900.75, 2444.5, POSE),
@@ -174,7 +172,5 @@ def test_without_cameras_the_next_step_is_named(result: ImportedResult) -> None:
         bpy.data.objects.remove(camera)
     with pytest.raises(RuntimeError, match="Import the result again"):
         bpy.ops.gwrap.view_photo()
-
-
-def test_without_a_result_there_is_nothing_to_look_through() -> None:
-    assert not bpy.ops.gwrap.view_photo.poll()
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    assert not bpy.ops.gwrap.view_photo.poll(), "without a result"

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,10 +13,11 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from gaussian_wrapping_addon.core.jobs import client as job_client
-from gaussian_wrapping_addon.ops import background, dataset
+from gaussian_wrapping_addon.ops import dataset
 from gaussian_wrapping_addon.ops.addon import properties_of
 from gaussian_wrapping_addon.ui import dataset_panel
 from tests.blender.fake_layout import draw
+from tests.blender.job_play import play_background
 
 pytestmark = pytest.mark.usefixtures("addon")
 
@@ -42,19 +42,11 @@ def photos(folder: Path) -> Path:
     return folder
 
 
-def wait_for_the_end() -> None:
-    until_s = time.monotonic() + 60
-    while dataset.is_checking() or dataset.is_busy():
-        assert time.monotonic() < until_s
-        background.poll()
-        time.sleep(0.02)
-
-
 def test_findings_of_the_worker_join_those_of_the_check(tmp_path: Path) -> None:
     properties = properties_of(bpy.context.scene)
     properties.source = str(photos(tmp_path / "set"))
     dataset.start_check(bpy.context.scene)
-    wait_for_the_end()
+    play_background(lambda: not (dataset.is_checking() or dataset.is_busy()), 60.0)
     texts = draw(dataset_panel.GWRAP_PT_dataset).texts.replace("\n", " ")
     assert "1 photo is much less sharp than the photos beside: p3.jpg." in texts
     assert "Look at these" in texts
@@ -69,7 +61,7 @@ def test_without_a_worker_the_check_goes_on(
     monkeypatch.setattr(job_client, "_has_torch", lambda: False)
     properties_of(bpy.context.scene).source = str(photos(tmp_path / "set"))
     dataset.start_check(bpy.context.scene)
-    wait_for_the_end()
+    play_background(lambda: not (dataset.is_checking() or dataset.is_busy()), 60.0)
     severities = {f.severity for f in properties_of(bpy.context.scene).findings}
     assert severities == {"fact"}
 

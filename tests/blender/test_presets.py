@@ -14,7 +14,7 @@ import pytest
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
 from gaussian_wrapping_addon.core.settings.job import savable_settings
-from gaussian_wrapping_addon.ops import job_timer, presets
+from gaussian_wrapping_addon.ops import job_timer
 from gaussian_wrapping_addon.ops.panel_settings import job_settings
 from gaussian_wrapping_addon.ops.presets import (
     MOST_PRESETS,
@@ -89,18 +89,13 @@ def test_every_setting_comes_back() -> None:
     assert preset_names() == []
 
 
-def test_the_file_is_text_and_holds_no_path(folder: Path) -> None:
+def test_the_file_is_text_and_holds_no_path_and_applying_keeps_folders(folder: Path) -> None:
     gwrap = bpy.context.scene.gwrap
     gwrap.source, gwrap.output, gwrap.training.start_splat = "/secret/a", "/secret/b", "/secret/c"
     save_preset(bpy.context.scene, "one")
     text = (folder / "one.json").read_text()
     assert "secret" not in text
     assert json.loads(text)["settings"]["preset"] == "standard"
-
-
-def test_applying_keeps_folders_and_regions() -> None:
-    gwrap = bpy.context.scene.gwrap
-    save_preset(bpy.context.scene, "one")
     gwrap.source, gwrap.output, gwrap.job_folder = "/a", "/b", "/c"
     apply_preset(bpy.context.scene, "one")
     assert (gwrap.source, gwrap.output, gwrap.job_folder) == ("/a", "/b", "/c")
@@ -132,37 +127,30 @@ def test_a_hostile_file_is_refused_and_changes_nothing(folder: Path, text: str) 
     assert panel_values() == before
 
 
-def test_python_presets_are_neither_shown_nor_run(folder: Path, tmp_path: Path) -> None:
+def test_python_and_links_are_neither_shown_nor_run(folder: Path, tmp_path: Path) -> None:
     (folder / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
-    assert preset_names() == []
-    with pytest.raises(UsageError, match="There is no preset 'evil'"):
-        apply_preset(bpy.context.scene, "evil")
-    assert not (tmp_path / "ran").exists()
-
-
-@pytest.mark.parametrize("name", ["", "../one", "/etc/passwd", "none", "one.json"])
-def test_only_listed_presets_can_be_named(folder: Path, name: str) -> None:
-    save_preset(bpy.context.scene, "one")
-    (folder.parent / "one.json").write_text("{}")
-    for call in (lambda: apply_preset(bpy.context.scene, name), lambda: delete_preset(name)):
-        with pytest.raises(UsageError, match="There is no preset"):
-            call()
-    assert (folder.parent / "one.json").exists()
-    assert preset_names() == ["one"]
-    (folder.parent / "one.json").unlink()
-
-
-def test_links_are_neither_shown_nor_deleted(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "there.json").write_text("{}")
     (folder / "linked.json").symlink_to(tmp_path / "there.json")
     assert preset_names() == []
-    (folder / "linked.json").unlink()
+    for name in ("evil", "linked"):
+        with pytest.raises(UsageError, match=f"There is no preset '{name}'"):
+            apply_preset(bpy.context.scene, name)
+    assert not (tmp_path / "ran").exists()
 
 
-@pytest.mark.parametrize("name", ["", "  "])
-def test_a_preset_needs_a_name(name: str) -> None:
+def test_only_listed_presets_can_be_named(folder: Path) -> None:
+    save_preset(bpy.context.scene, "one")
+    (folder.parent / "one.json").write_text("{}")
+    for name in ("", "../one", "/etc/passwd", "none", "one.json"):
+        with pytest.raises(UsageError, match="There is no preset"):
+            apply_preset(bpy.context.scene, name)
+        with pytest.raises(UsageError, match="There is no preset"):
+            delete_preset(name)
+    assert (folder.parent / "one.json").exists()
+    assert preset_names() == ["one"]
+    (folder.parent / "one.json").unlink()
     with pytest.raises(RuntimeError, match="has no name"):
-        bpy.ops.gwrap.save_preset(name=name)
+        bpy.ops.gwrap.save_preset(name="  ")
 
 
 def test_a_preset_of_the_same_name_is_replaced_and_there_is_a_limit(folder: Path) -> None:
@@ -172,13 +160,6 @@ def test_a_preset_of_the_same_name_is_replaced_and_there_is_a_limit(folder: Path
     assert json.loads((folder / "p3.json").read_text())["version"] == 1
     with pytest.raises(UsageError, match="100 presets already"):
         save_preset(bpy.context.scene, "another")
-
-
-def test_no_folder_for_presets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(presets, "_folder", lambda create=False: None)
-    assert preset_names() == []
-    with pytest.raises(UsageError, match="no folder for presets"):
-        save_preset(bpy.context.scene, "one")
 
 
 def test_no_preset_is_applied_while_a_job_runs() -> None:

@@ -45,8 +45,9 @@ def corners(thing: bpy.types.Object) -> np.ndarray:
     return hull_in_blender(thing)[0]
 
 
-@pytest.mark.parametrize("parent", [False, True])
-@pytest.mark.parametrize("scale", [(0.5, 2.0, 0.1), (-0.5, 2.0, 0.1), (-1, -1, -1)])
+@pytest.mark.parametrize(
+    ("parent", "scale"), [(False, (0.5, 2.0, 0.1)), (True, (-0.5, 2.0, 0.1)), (True, (-1, -1, -1))]
+)
 def test_the_cage_is_the_box_and_moves_one_side(parent: bool, scale: tuple) -> None:
     thing = make_box(parent=parent, scale=scale)
     cage = cage_matrix(thing)

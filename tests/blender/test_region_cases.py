@@ -23,10 +23,11 @@ from gaussian_wrapping_addon.ops.region_objects import (
 from tests.blender.job_play import (
     play_to,
     play_until,
+    select,
     start_wrap,
     status_of,
 )
-from tests.blender.region_shapes import region_from_object
+from tests.blender.placed_scene import region_from_object
 from tests.blender.synthetic_result import WORLD_FROM_SCENE
 
 pytestmark = pytest.mark.usefixtures("ended_workers")
@@ -210,13 +211,6 @@ def box_at(x: float, name: str) -> bpy.types.Object:
     thing.name = name
     bpy.context.view_layer.update()
     return thing
-
-
-def select(*things: bpy.types.Object) -> None:
-    bpy.context.view_layer.update()
-    for thing in bpy.context.view_layer.objects:
-        thing.select_set(thing in things)
-    bpy.context.view_layer.objects.active = things[0]
 
 
 @pytest.mark.parametrize("change", ["deleted", "renamed", "moved away", "collection deleted"])

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import logging
-from types import SimpleNamespace
 from typing import Any
 
 import bpy
@@ -36,17 +34,6 @@ def mesh_region() -> bpy.types.Object:
 def names() -> list[str]:
     found = region_panel.visible_regions(bpy.context.scene, bpy.context.view_layer)
     return [thing.name for thing in found]
-
-
-def test_a_box_is_its_twelve_edges() -> None:
-    edges = region_panel.edges_of(box())
-    assert edges is not None
-    assert edges.shape == (12, 2, 3)
-    assert edges.dtype == np.float32
-    steps = np.abs(edges[:, 1] - edges[:, 0])
-    assert ((steps > 0).sum(1) == 1).all(), "along the axes, none across a side"
-    assert len(np.unique(np.sort(edges.reshape(12, 6), axis=1), axis=0)) <= 12
-    assert len({tuple(sorted(map(tuple, edge))) for edge in edges.tolist()}) == 12
 
 
 def test_a_convex_mesh_is_its_own_edges_and_a_dent_is_none() -> None:
@@ -106,6 +93,11 @@ def test_edges_are_made_anew_only_where_the_shape_changes(monkeypatch: pytest.Mo
     made: list[Any] = []
     monkeypatch.setattr(region_panel, "_made", lambda edges: made.append(edges) or len(made))
     cube, ball = box(), mesh_region()
+    edges = region_panel.edges_of(cube)
+    assert edges is not None
+    steps = np.abs(edges[:, 1] - edges[:, 0])
+    assert ((steps > 0).sum(1) == 1).all(), "along the axes, none across a side"
+    assert len({tuple(sorted(map(tuple, edge))) for edge in edges.tolist()}) == 12
     first = region_panel._batch(cube), region_panel._batch(ball)
     assert len(made) == 2
     cube.location.x, ball.location.x = 3, 4  # the matrix moves what is drawn
@@ -123,30 +115,3 @@ def test_edges_are_made_anew_only_where_the_shape_changes(monkeypatch: pytest.Mo
     region_panel._batch(cube)
     assert len(region_panel._drawing.batches) <= 4
     region_operators.forget()
-
-
-def test_the_handler_goes_with_the_addon(addon: Any) -> None:
-    assert region_panel.VIEW.handle is not None
-    handle = region_panel.VIEW.handle
-    addon.unregister()
-    assert region_panel.VIEW.handle is None
-    assert not region_panel._drawing.batches
-    with pytest.raises((ValueError, RuntimeError)):
-        bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
-    addon.register()
-    assert region_panel.VIEW.handle is not None
-
-
-def test_an_error_while_drawing_is_told_once(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def broken(_context: object) -> None:
-        raise RuntimeError("no such shader")
-
-    monkeypatch.setattr(region_panel, "_draw", broken)
-    space = SimpleNamespace(overlay=SimpleNamespace(show_overlays=True))
-    with caplog.at_level(logging.ERROR):
-        for _ in range(3):
-            region_panel.VIEW.draw(SimpleNamespace(space_data=space))
-    assert [r.getMessage() for r in caplog.records] == ["regions cannot be drawn"]
-    assert "no such shader" in caplog.text

@@ -8,8 +8,7 @@ import json
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from gaussian_wrapping_addon.core.scene.camera import Similarity
 from gaussian_wrapping_addon.core.worker.helper_process import child_command
 from gaussian_wrapping_addon.ops import addon, background, meshing
 from gaussian_wrapping_addon.ops.region_objects import create_region
+from tests.blender.job_play import play_background
 
 pytestmark = pytest.mark.usefixtures("addon")
 
@@ -31,14 +31,6 @@ WAIT_S = 120.0
 def _no_questions() -> Iterator[None]:
     yield
     meshing.stop()
-
-
-def play_until(holds: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + WAIT_S
-    while not holds():
-        assert time.monotonic() < end_s
-        background.poll()
-        time.sleep(0.05)
 
 
 def region_of(folder: Path) -> bpy.types.Object:
@@ -72,7 +64,7 @@ def test_the_workers_answer_is_shown_until_something_changes(tmp_path: Path) -> 
     assert bpy.ops.gwrap.estimate_regions() == {"FINISHED"}
     assert meshing.is_waiting(region)
     assert not bpy.ops.gwrap.estimate_regions.poll()
-    play_until(lambda: not meshing.is_busy())
+    play_background(lambda: not meshing.is_busy(), WAIT_S)
     estimate, holds = meshing.estimate_for(scene, region)
     assert estimate is not None
     assert holds
@@ -94,9 +86,6 @@ def test_the_workers_answer_is_shown_until_something_changes(tmp_path: Path) -> 
     assert not still()
     scene.gwrap.resolution = "AUTOMATIC"
     assert still()
-    region.gwrap.own_edge_length = True
-    assert not still()
-    region.gwrap.own_edge_length = False
     method = scene.gwrap.method
     scene.gwrap.method = "PIVOTS"
     assert not still()
@@ -104,13 +93,13 @@ def test_the_workers_answer_is_shown_until_something_changes(tmp_path: Path) -> 
     assert still()
     region.gwrap.own_edge_length, region.gwrap.edge_length = True, 0.6  # of a diagonal of 4.85
     assert bpy.ops.gwrap.estimate_regions() == {"FINISHED"}
-    play_until(lambda: not meshing.is_busy())
+    play_background(lambda: not meshing.is_busy(), WAIT_S)
     estimate, _ = meshing.estimate_for(scene, region)
     assert estimate is not None
     assert not estimate.warnings
     region.gwrap.edge_length = 1.0
     assert bpy.ops.gwrap.estimate_regions() == {"FINISHED"}
-    play_until(lambda: not meshing.is_busy())
+    play_background(lambda: not meshing.is_busy(), WAIT_S)
     estimate, _ = meshing.estimate_for(scene, region)
     assert estimate is not None
     assert "reduced" in " ".join(estimate.warnings)
@@ -126,7 +115,7 @@ def test_disabling_the_addon_ends_the_process(
     child = background.Child()
     monkeypatch.setattr(meshing, "Child", lambda: child)
     meshing.start(bpy.context.scene, [region], folder, sys.executable)
-    play_until(lambda: child.process is not None)
+    play_background(lambda: child.process is not None, WAIT_S)
     process = child.process
     assert process is not None
     os.kill(process.pid, 0)
@@ -150,7 +139,7 @@ def test_a_worker_that_says_nothing_is_an_answer(
     ):
         monkeypatch.setattr(meshing, "child_command", lambda *_, c=command, **__: c)
         meshing.start(bpy.context.scene, [region], tmp_path, sys.executable)
-        play_until(lambda: not meshing.is_busy())
+        play_background(lambda: not meshing.is_busy(), WAIT_S)
         estimate, _ = meshing.estimate_for(bpy.context.scene, region)
         assert estimate is not None
         assert estimate.warnings

@@ -13,7 +13,7 @@ import pytest
 import gaussian_wrapping_addon
 from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.ops import background, job_timer, jobs
-from gaussian_wrapping_addon.ui import job_view
+from gaussian_wrapping_addon.ui import job_view, region_panel
 
 REPOSITORY = Path(gaussian_wrapping_addon.__file__).resolve().parents[1]
 
@@ -27,7 +27,9 @@ def left_behind() -> list[str]:
             found += [name for h in handlers if "gaussian_wrapping" in h.__module__]
     bar = bpy.types.STATUSBAR_HT_header._dyn_ui_initialize()
     found += [f.__name__ for f in bar if "gaussian_wrapping" in f.__module__]
-    found += ["points"] if job_view.VIEW.handle is not None else []
+    views = (job_view.VIEW, region_panel.VIEW)
+    found += ["drawing" for view in views if view.handle is not None]
+    found += ["batches"] if region_panel._drawing.batches else []
     if bpy.app.timers.is_registered(background.poll):
         found.append("poll")
     return found
@@ -54,6 +56,7 @@ def test_register_and_unregister_twice() -> None:
     for _ in range(2):
         gaussian_wrapping_addon.register()
         assert [cls.__name__ for cls in registration.CLASSES if not is_there(cls)] == []
+        assert None not in (job_view.VIEW.handle, region_panel.VIEW.handle)
         for name, handler in registration.HANDLERS:
             assert getattr(bpy.app.handlers, name).count(handler) == 1
         job_timer.start_timer()
@@ -68,6 +71,8 @@ def test_register_after_register_doubles_nothing() -> None:
     gaussian_wrapping_addon.register()
     gaussian_wrapping_addon.register()
     assert bpy.app.handlers.load_post.count(jobs.after_load) == 1
+    bar = bpy.types.STATUSBAR_HT_header._dyn_ui_initialize()
+    assert bar.count(job_view.draw) == 1
     gaussian_wrapping_addon.unregister()
     assert left_behind() == []
 

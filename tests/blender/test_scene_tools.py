@@ -18,7 +18,6 @@ from gaussian_wrapping_addon.core.scene.camera import Similarity
 from gaussian_wrapping_addon.core.scene.placement import FILE_NAME, read_placement
 from gaussian_wrapping_addon.ops import addon, placement
 from gaussian_wrapping_addon.ops.region_objects import matrix_of, transformed
-from gaussian_wrapping_addon.ops.region_operators import own_lengths
 from gaussian_wrapping_addon.ops.scene_objects import (
     ImportedResult,
     export_usd,
@@ -29,13 +28,13 @@ from tests.blender.placed_scene import (
     in_blender,
     pick_vertices,
     put_points,
+    region_from_object,
     same_matrix,
     state,
     stored,
     tilt,
     upright_cameras,
 )
-from tests.blender.region_shapes import region_from_object
 from tests.blender.synthetic_result import (
     WORLD_FROM_SCENE,
     rotation_about,
@@ -65,8 +64,9 @@ def result(job: Path) -> ImportedResult:
     return imported
 
 
-@pytest.mark.parametrize("by_hand", [False, True])
-@pytest.mark.parametrize("way", ["vertices", "points", "own empties"])
+@pytest.mark.parametrize(
+    ("way", "by_hand"), [("vertices", True), ("points", False), ("own empties", True)]
+)
 def test_two_points_get_their_true_distance(
     result: ImportedResult, way: str, by_hand: bool
 ) -> None:
@@ -117,10 +117,8 @@ def test_scaling_again_replaces_the_first_distance(result: ImportedResult) -> No
     assert placement.placement_of(result.frame).scale == pytest.approx(expected, rel=1e-7)
 
 
-@pytest.mark.parametrize("by_hand", [False, True])
-def test_three_points_become_the_floor(result: ImportedResult, by_hand: bool) -> None:
-    if by_hand:
-        tilt(result)
+def test_three_points_become_the_floor(result: ImportedResult) -> None:
+    tilt(result)
     pick_vertices(result.meshes[0], [0, 2, 4])  # the face at the cube's lowest z
     before = placement.placement_of(result.frame).scale
     assert bpy.ops.gwrap.set_ground() == {"FINISHED"}
@@ -146,25 +144,10 @@ def test_scale_keeps_ground_and_origin(result: ImportedResult) -> None:
     assert in_blender(result, 0) == pytest.approx(0.0, abs=1e-5)
     assert in_blender(result, 2)[2] == pytest.approx(0.0, abs=1e-5)
     assert np.linalg.norm(in_blender(result, 4)) == pytest.approx(10.0, rel=1e-6)
-
-
-def test_origin_at_the_cursor(result: ImportedResult) -> None:
-    tilt(result)
+    bpy.ops.object.mode_set(mode="OBJECT")
     bpy.context.scene.cursor.location = in_blender(result, 3)
     assert bpy.ops.gwrap.set_origin(target="CURSOR") == {"FINISHED"}
     assert in_blender(result, 3) == pytest.approx(0.0, abs=1e-5)
-
-
-def test_auto_ground_rights_what_was_tilted(result: ImportedResult) -> None:
-    """No level plane is clear on a cube: it comes to stand on the ground."""
-    tilt(result)
-    assert bpy.ops.gwrap.auto_ground() == {"FINISHED"}
-    up = matrix_of(result.frame)[:3, 2]
-    assert up / np.linalg.norm(up) == pytest.approx([0, 0, 1], abs=1e-5)
-    assert min(in_blender(result, v)[2] for v in range(8)) == pytest.approx(0.0, abs=1e-5)
-    again = placement.placement_of(result.frame)
-    assert bpy.ops.gwrap.auto_ground() == {"FINISHED"}
-    assert same_matrix(result.frame, again)
 
 
 def test_auto_ground_without_meshes_takes_the_region(result: ImportedResult) -> None:
@@ -180,6 +163,11 @@ def test_auto_ground_without_meshes_takes_the_region(result: ImportedResult) -> 
 
 
 def test_auto_ground_finds_the_floor_of_a_mesh(result: ImportedResult) -> None:
+    tilt(result)
+    assert bpy.ops.gwrap.auto_ground() == {"FINISHED"}, "a cube has no clear floor, and stands"
+    up = matrix_of(result.frame)[:3, 2]
+    assert up / np.linalg.norm(up) == pytest.approx([0, 0, 1], abs=1e-5)
+    assert min(in_blender(result, v)[2] for v in range(8)) == pytest.approx(0.0, abs=1e-5)
     work = bmesh.new()
     bmesh.ops.create_grid(work, x_segments=20, y_segments=20, size=2.0)
     bmesh.ops.create_uvsphere(work, u_segments=24, v_segments=12, radius=0.5)
@@ -196,7 +184,6 @@ def test_auto_ground_finds_the_floor_of_a_mesh(result: ImportedResult) -> None:
 @pytest.mark.parametrize(
     ("tool", "places", "text"),
     [
-        ("set_scale", [], "No point is picked"),
         ("set_scale", [[0, 0, 0]], "One point is picked"),
         ("set_scale", [[1, 0, 0], [1, 0, 0]], "coincide"),
         ("set_scale", [[0, 0, 0], [1, 0, 0], [2, 0, 0]], "3 are picked"),
@@ -217,29 +204,49 @@ def test_wrong_picks_change_nothing(
     assert stored(result) is None
 
 
-@pytest.mark.parametrize("distance", [0.0, 1e-30, 1e30])
-def test_distances_that_cannot_be(result: ImportedResult, distance: float) -> None:
+def uneven(result: ImportedResult) -> None:
+    result.frame.scale = (1, 2, 1)
+
+
+def held(result: ImportedResult) -> None:
+    result.frame.constraints.new("LIMIT_SCALE").use_max_x = True
+    result.frame.constraints[0].max_x = 0.5
+
+
+def nothing(_result: ImportedResult) -> None:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("spoil", "distance", "words"),
+    [
+        (nothing, 0.0, "not a distance"),
+        (nothing, 1e30, "would be scaled"),
+        (uneven, 1.0, "scaled differently"),
+        (held, 50.0, "scaled differently|held in place"),
+    ],
+)
+def test_scales_that_cannot_be_are_refused_and_reset_helps(
+    result: ImportedResult,
+    spoil: Callable[[ImportedResult], None],
+    distance: float,
+    words: str,
+) -> None:
+    spoil(result)
+    bpy.context.view_layer.update()
     pick_vertices(result.meshes[0], [0, 7])
-    with pytest.raises(RuntimeError, match=r"not a distance|would be scaled"):
+    before = matrix_of(result.frame)
+    with pytest.raises(RuntimeError, match=words):
         bpy.ops.gwrap.set_scale(distance=distance)
-    assert same_matrix(result.frame, Similarity())
-
-
-def test_a_mesh_of_something_else_is_refused(result: ImportedResult) -> None:
+    if spoil is not held:
+        assert (matrix_of(result.frame) == before).all()
+        assert bpy.ops.gwrap.reset_placement() == {"FINISHED"}
+        assert same_matrix(result.frame, Similarity())
+    bpy.ops.object.mode_set(mode="OBJECT")
     bpy.ops.mesh.primitive_cube_add()
     pick_vertices(bpy.context.view_layer.objects.active, [0, 1])
     with pytest.raises(RuntimeError, match="is not part of the result"):
         bpy.ops.gwrap.set_scale(distance=1.0)
-
-
-def test_a_parent_scaled_unevenly_is_refused_and_reset_helps(result: ImportedResult) -> None:
-    result.frame.scale = (1, 2, 1)
-    bpy.context.view_layer.update()
-    pick_vertices(result.meshes[0], [0, 7])
-    with pytest.raises(RuntimeError, match="scaled differently"):
-        bpy.ops.gwrap.set_scale(distance=1.0)
-    assert bpy.ops.gwrap.reset_placement() == {"FINISHED"}
-    assert same_matrix(result.frame, Similarity())
 
 
 def test_reset_leads_back_to_metres(job: Path, result: ImportedResult) -> None:
@@ -258,14 +265,6 @@ def test_reset_leads_back_to_metres(job: Path, result: ImportedResult) -> None:
     assert same_matrix(result.frame, Similarity())
 
 
-def test_a_parent_that_is_held_is_refused(result: ImportedResult) -> None:
-    result.frame.constraints.new("LIMIT_SCALE").use_max_x = True
-    result.frame.constraints[0].max_x = 0.5
-    pick_vertices(result.meshes[0], [0, 7])
-    with pytest.raises(RuntimeError, match=r"scaled differently|held in place"):
-        bpy.ops.gwrap.set_scale(distance=50.0)
-
-
 def test_the_frame_under_a_parent_of_the_user(result: ImportedResult) -> None:
     holder = bpy.data.objects.new("set", None)
     bpy.context.scene.collection.objects.link(holder)
@@ -282,6 +281,12 @@ def push(message: str) -> None:
     bpy.ops.ed.undo_push(message=message)
 
 
+def kept_in(job: Path) -> Similarity:
+    found = read_placement(job / "result" / FILE_NAME, WORLD_FROM_SCENE)
+    assert found is not None
+    return found
+
+
 def frame_now() -> bpy.types.Object:
     """Undo replaces objects: find the frame anew."""
     return next(o for o in bpy.data.objects if addon.kind_of(o) == "frame")
@@ -289,7 +294,6 @@ def frame_now() -> bpy.types.Object:
 
 @pytest.mark.parametrize("mode", ["OBJECT", "EDIT"])
 def test_undo_and_redo_take_the_file_along(job: Path, result: ImportedResult, mode: str) -> None:
-    path = job / "result" / FILE_NAME
     push("import")
     if mode == "EDIT":
         pick_vertices(result.meshes[0], [0, 7])
@@ -302,21 +306,16 @@ def test_undo_and_redo_take_the_file_along(job: Path, result: ImportedResult, mo
     assert placed.scale == pytest.approx(np.sqrt(3.0), rel=1e-6)
     bpy.ops.ed.undo()
     assert same_matrix(frame_now(), Similarity())
-    kept = read_placement(path, WORLD_FROM_SCENE)
-    assert kept is not None
-    assert kept.scale == 1.0
+    assert kept_in(job).scale == 1.0
     bpy.ops.ed.redo()
     assert same_matrix(frame_now(), placed)
-    kept = read_placement(path, WORLD_FROM_SCENE)
-    assert kept is not None
-    assert kept.to_json() == placed.to_json()
+    assert kept_in(job).to_json() == placed.to_json()
 
 
 def test_undo_of_something_else_leaves_what_another_empty_has_written(
     job: Path, result: ImportedResult
 ) -> None:
     """A copied parent is of the same result: it must not write its own placement over this one."""
-    path = job / "result" / FILE_NAME
     twin = result.frame.copy()
     bpy.context.scene.collection.objects.link(twin)
     name = result.frame.name
@@ -326,8 +325,7 @@ def test_undo_of_something_else_leaves_what_another_empty_has_written(
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("other", None))
     push("added")
     bpy.ops.ed.undo()
-    kept = read_placement(path, WORLD_FROM_SCENE)
-    assert kept is not None
+    kept = kept_in(job)
     assert kept.scale == pytest.approx(np.sqrt(3.0), rel=1e-6)
     assert same_matrix(bpy.data.objects[name], kept)
 
@@ -351,6 +349,10 @@ def test_an_import_into_another_file_is_placed_the_same(job: Path, result: Impor
     assert placement.placement_of(again.frame).to_json() == expected.to_json(), "in double"
     assert same_matrix(again.frame, expected)
     assert [c.data.clip_end for c in again.cameras] == pytest.approx(lengths, rel=1e-5)
+    values = json.loads((job / "result" / "scene.json").read_text())
+    values["world_from_scene"]["scale"] *= 1.5
+    (job / "result" / "scene.json").write_text(json.dumps(values))
+    assert same_matrix(start_again(job).frame, Similarity()), "a placement of other cameras"
 
 
 def test_keep_what_was_moved_by_hand(job: Path, result: ImportedResult) -> None:
@@ -361,15 +363,6 @@ def test_keep_what_was_moved_by_hand(job: Path, result: ImportedResult) -> None:
     bpy.context.view_layer.objects.active = again.frame
     assert bpy.ops.gwrap.keep_placement() == {"FINISHED"}
     assert same_matrix(start_again(job).frame, expected)
-
-
-def test_a_placement_of_other_cameras_is_not_used(job: Path, result: ImportedResult) -> None:
-    pick_vertices(result.meshes[0], [0, 7])
-    bpy.ops.gwrap.set_scale(distance=3.0)
-    values = json.loads((job / "result" / "scene.json").read_text())
-    values["world_from_scene"]["scale"] *= 1.5
-    (job / "result" / "scene.json").write_text(json.dumps(values))
-    assert same_matrix(start_again(job).frame, Similarity())
 
 
 def test_a_broken_placement_file_is_told_before_anything_changes(job: Path) -> None:
@@ -452,16 +445,6 @@ def test_blend_and_usd_of_a_placed_result_are_placed(job: Path, result: Imported
     bpy.context.view_layer.update()
     (mesh,) = [o for o in bpy.data.objects if o.type == "MESH"]
     assert list(mesh.dimensions) == pytest.approx([0.5] * 3, rel=1e-5)
-
-
-def test_an_edge_length_is_one_of_the_placed_scene(result: ImportedResult) -> None:
-    """0.01 as seen in Blender is 0.01 / scale in the scene frame."""
-    pick_vertices(result.meshes[0], [0, 4])  # a side of 1 scene unit
-    bpy.ops.gwrap.set_scale(distance=0.5)
-    region = result.regions[0]
-    region.gwrap.own_edge_length, region.gwrap.edge_length = True, 0.01
-    (world,) = own_lengths(bpy.context.scene, [region], result.frame)
-    assert world == pytest.approx(0.02 * WORLD_FROM_SCENE.scale, rel=1e-5)
 
 
 def test_many_steps_do_not_drift(result: ImportedResult) -> None:

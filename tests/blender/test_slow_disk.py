@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +14,9 @@ import pytest
 
 import gaussian_wrapping_addon
 from gaussian_wrapping_addon.core import limits
-from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
 from gaussian_wrapping_addon.ops import job_timer
-from tests.blender.job_play import play_until, start_wrap, status_of, write_fake_python
+from tests.blender.job_play import running_job, status_of
 
 STALL_S = 0.05
 POLL_WAIT_S = job_timer.POLL_WAIT_S
@@ -27,14 +26,9 @@ pytestmark = pytest.mark.usefixtures("ended_workers")
 
 
 @pytest.fixture
-def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def running(photos: Path, worker: Callable[..., None]) -> Path:
     """A job at work."""
-    monkeypatch.setenv(PYTHON_VARIABLE, str(write_fake_python(tmp_path)))
-    monkeypatch.setenv("GW_FAKE", "slow")
-    (tmp_path / "photos").mkdir()
-    folder = start_wrap(tmp_path / "photos")
-    play_until(lambda: status_of(folder).fraction == 0.25, "never at work")
-    return folder
+    return running_job(photos, worker)
 
 
 class SleepingDisk:

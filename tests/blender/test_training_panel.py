@@ -35,23 +35,14 @@ from gaussian_wrapping_addon.ui import training_panel
 from gaussian_wrapping_addon.ui.job_view import live_rows
 from tests.blender.fake_layout import draw
 from tests.blender.fake_worker import LIVE, picture
-from tests.blender.job_play import write_fake_python
+from tests.blender.job_play import play_background, write_fake_python
+from tests.blender.panel_states import Client, words
 from tests.blender.synthetic_result import npy_bytes, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
 
 PANEL = training_panel.GWRAP_PT_train_advanced
 TRAIN = training_panel.GWRAP_PT_train
-
-
-class Client:
-    """Answers with one status."""
-
-    def __init__(self, status: JobStatus) -> None:
-        self.status = status
-
-    def poll(self) -> JobStatus:
-        return self.status
 
 
 @pytest.fixture(autouse=True)
@@ -83,96 +74,53 @@ def test_untouched_choices_are_the_preset() -> None:
 
 
 def test_each_choice_changes_its_setting_and_no_other(tmp_path: Path) -> None:
-    splat = tmp_path / "splat.PLY"
+    splat, points = tmp_path / "splat.PLY", tmp_path / "gcp.txt"
     splat.write_bytes(b"ply")
+    points.write_text("LOCAL\n")
     base = to_json(preset("standard"))
-    changes = {
+    of_training: dict[str, object] = {
         **dict.fromkeys(DECIDED, "OFF"),
         "mask_mode": "BACKGROUND",
         "iterations": 77,
         "max_gaussians": 7777,
         "max_image_px": 333,
     }
-    for name, value in changes.items():
+    of_job = {
+        "start_splat": (str(splat), str(splat)),
+        "georeference": ("OFF", "off"),
+        "markers": ("DICT_4X4_50:0.05", "4x4_50:0.05"),
+        "control_points": (str(points), str(points)),
+    }
+    for name, value in {**of_training, **{k: chosen for k, (chosen, _) in of_job.items()}}.items():
         setattr(training(), name, value)
-        found = to_json(panel_settings.job_settings(bpy.context.scene, 0).validated())
         wanted = value.lower() if isinstance(value, str) else value
-        assert found == {**base, "training": {**base["training"], name: wanted}}
+        change = {"training": {**base["training"], name: wanted}}
+        if name in of_job:
+            change = {name: of_job[name][1]}
+        found = to_json(panel_settings.job_settings(bpy.context.scene, 0))
+        assert found == {**base, **change}
         training().property_unset(name)
-    training().start_splat = str(splat)
-    found = to_json(panel_settings.job_settings(bpy.context.scene, 0))
-    assert found == {**base, "start_splat": str(splat)}
+    training().iterations = 77
     assert bpy.ops.gwrap.reset_training() == {"FINISHED"}
     assert to_json(panel_settings.job_settings(bpy.context.scene, 0)) == base
-
-
-def test_metres_are_asked_for_in_the_panel(tmp_path: Path) -> None:
-    points = tmp_path / "gcp.txt"
-    points.write_text("LOCAL\n")
-    base = to_json(panel_settings.job_settings(bpy.context.scene, 0))
-    changes = (
-        ("georeference", "OFF"),
-        ("markers", "DICT_4X4_50:0.05"),
-        ("control_points", str(points)),
-    )
-    for name, value in changes:
-        setattr(training(), name, value)
-    found = to_json(panel_settings.job_settings(bpy.context.scene, 0).validated())
-    wanted = {"georeference": "off", "markers": "4x4_50:0.05", "control_points": str(points)}
-    assert found == {**base, **wanted}
+    assert "80,000" in draw(PANEL).texts, "what the preset has"
 
 
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("markers", "4x4_51:0.05", "no marker dictionary '4x4_51'"),
         ("markers", "4x4_50:0", "marker size '0' is not a length"),
-        ("markers", "4x4_50", "have no size"),
         ("control_points", "/nowhere/gcp.txt", "does not exist"),
         ("control_points", r"\\server\share\gcp.txt", "another computer"),
+        ("start_splat", "/nowhere/x.obj", "not a PLY"),
+        ("start_splat", "/nowhere/missing.ply", "does not exist"),
+        ("start_splat", r"\\server\share\x.ply", "another computer"),
     ],
 )
-def test_metres_that_cannot_be_had_are_refused(name: str, value: str, words: str) -> None:
+def test_what_cannot_be_used_is_refused(name: str, value: str, words: str) -> None:
     setattr(training(), name, value)
     with pytest.raises(UsageError, match=words):
         panel_settings.job_settings(bpy.context.scene, 0)
-
-
-@pytest.mark.parametrize(
-    ("path", "words"),
-    [
-        ("/nowhere/x.obj", "not a PLY"),
-        ("/nowhere/missing.ply", "does not exist"),
-        (r"\\server\share\x.ply", "another computer"),
-    ],
-)
-def test_a_splat_that_cannot_be_used_is_refused(path: str, words: str) -> None:
-    training().start_splat = path
-    with pytest.raises(UsageError, match=words):
-        panel_settings.job_settings(bpy.context.scene, 0)
-
-
-def test_the_panel_shows_every_choice_and_reads_no_file(monkeypatch: pytest.MonkeyPatch) -> None:
-    training().start_splat = "/nowhere/missing.ply"
-    bpy.context.scene.gwrap.source = "/nowhere"
-
-    def refuse(*_arguments: object, **_keywords: object) -> None:
-        raise AssertionError("drawing read the disk")
-
-    with monkeypatch.context() as patch:
-        for name in ("stat", "is_file", "exists", "open", "glob", "iterdir"):
-            patch.setattr(Path, name, refuse)
-        layout = draw(PANEL)
-        train = draw(TRAIN)
-    assert train.operators == ["gwrap.estimate", "gwrap.wrap_scene"]
-    shown = {a[1] for name, a, _ in layout.log if name == "prop"}
-    assert shown == set(training().bl_rna.properties.keys()) - {
-        "rna_type",
-        "name",
-        "more_iterations",
-    }
-    assert "80,000" in layout.texts
-    assert layout.operators == ["gwrap.reset_training"]
 
 
 def test_every_choice_has_a_tooltip_in_words() -> None:
@@ -185,9 +133,8 @@ def test_every_choice_has_a_tooltip_in_words() -> None:
             assert len(item.description.split()) >= 3, item.identifier
 
 
-@pytest.mark.parametrize(
-    ("figures", "rows"),
-    [
+def test_live_rows() -> None:
+    for figures, rows in (
         ({}, {}),
         (5, {}),
         ({"iteration": "x"}, {}),
@@ -202,15 +149,11 @@ def test_every_choice_has_a_tooltip_in_words() -> None:
                 "Training Left": "2 min 18 s",
             },
         ),
-        ({"iteration": 5.0, "iterations": 9.0, "iterations_per_s": 0.0}, None),
-    ],
-)
-def test_live_rows(figures: object, rows: dict[str, str] | None) -> None:
-    found = dict(live_rows(JobStatus("RUNNING", "train", figures=figures)))  # type: ignore[arg-type]
-    if rows is None:
-        assert "Training Left" not in found
-    else:
-        assert found == rows
+    ):
+        status = JobStatus("RUNNING", "train", figures=figures)  # type: ignore[arg-type]
+        assert dict(live_rows(status)) == rows
+    still = JobStatus("RUNNING", "train", figures={**LIVE, "iterations_per_s": 0.0})
+    assert "Training Left" not in dict(live_rows(still))
     assert live_rows(JobStatus("DONE", "train", figures=LIVE)) == ()
 
 
@@ -340,15 +283,6 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "asked.json"
 
 
-def wait_for_answer() -> str:
-    """Play the timer, which never fires in background Blender; return what is drawn."""
-    end_s = time.monotonic() + 30.0
-    while background.poll() is not None:
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
-    return draw(TRAIN).texts.replace("\n", " ")
-
-
 def test_estimate_asks_the_worker_and_shows_its_words(
     worker: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -362,7 +296,8 @@ def test_estimate_asks_the_worker_and_shows_its_words(
     assert bpy.ops.gwrap.estimate() == {"FINISHED"}
     assert "Estimating…" in draw(TRAIN).texts
     assert not bpy.ops.gwrap.estimate.poll(), "one at a time"
-    texts = wait_for_answer()
+    play_background()
+    texts = words(draw(TRAIN))
     for text in ("Training 4 to 6 min", "Memory 1.2 GB", "Full"):
         assert text in texts
     asked = JobFile.from_json(json.loads(worker.read_text()))
@@ -374,7 +309,8 @@ def test_estimate_asks_the_worker_and_shows_its_words(
     assert "4 to 6 min" in draw(TRAIN).texts, "going back shows it again"
     monkeypatch.setenv("GW_ANSWER", json.dumps({"error": "No photos.", "hint": "Add some."}))
     assert bpy.ops.gwrap.estimate() == {"FINISHED"}
-    assert "No photos. Add some." in wait_for_answer()
+    play_background()
+    assert "No photos. Add some." in words(draw(TRAIN))
 
 
 def test_an_estimate_without_words_says_so() -> None:

@@ -12,18 +12,15 @@ import pytest
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.ops import addon
 from gaussian_wrapping_addon.ops.scene_objects import import_result
-from tests.blender.job_play import meshes, play_to, play_until, start_wrap, write_fake_python
+from tests.blender.job_play import meshes, play_to, play_until, start_wrap
 from tests.blender.synthetic_result import write_region_result
 
 pytestmark = pytest.mark.usefixtures("addon")
 
 
 @pytest.fixture
-def job(addon: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def job(ended_workers: None, worker: object, tmp_path: Path) -> Path:
     """The folder of a finished job whose result the scene shows."""
-    assert addon  # registered before anything starts
-    monkeypatch.setenv("GAUSSIAN_WRAPPING_PYTHON", str(write_fake_python(tmp_path)))
-    monkeypatch.setenv("GW_FAKE", "quick")
     folder = start_wrap(_photos(tmp_path / "first"))
     play_to(folder, "DONE")
     play_until(lambda: meshes() > 0, "the result is imported")

@@ -25,6 +25,7 @@ from gaussian_wrapping_addon.core.worker.environment import (
 from gaussian_wrapping_addon.ops import background, worker_setup
 from gaussian_wrapping_addon.ui import dataset_panel, worker_setup_view
 from tests.blender.fake_layout import FakeLayout, draw
+from tests.blender.job_play import play_background
 from tests.core.setup.wheels import write_wheel
 
 pytestmark = pytest.mark.usefixtures("addon")
@@ -114,9 +115,7 @@ def test_only_what_we_made_can_be_removed(root: Path) -> None:
     WorkerEnvironment(root).marker_path.write_text('{"made_by": "gaussian_wrapping_addon"}')
     assert bpy.ops.gwrap.remove_worker.poll()
     assert bpy.ops.gwrap.remove_worker() == {"FINISHED"}
-    while worker_setup.state.is_busy:
-        background.poll()
-        time.sleep(0.02)
+    play_background(lambda: not worker_setup.state.is_busy)
     assert not root.exists()
     assert "The worker is removed" in drawn().texts
 
@@ -176,15 +175,20 @@ def test_extras_have_a_button_each_until_they_are_there(
     assert "--find-links/wheels--no-depsrawpy==" in text
 
 
+def small_request(root: Path, folder: Path) -> SetupRequest:
+    """Ask for an environment with one package, from a folder of wheels."""
+    write_wheel(folder / "wheels", "gwalpha", "1.0")
+    requirements = folder / "r.txt"
+    requirements.write_text("gwalpha==1.0\n")
+    python = probe(sys.executable).path
+    return SetupRequest(str(root), python, str(requirements), "cpu", str(folder / "wheels"))
+
+
 def test_a_set_up_from_start_to_end_in_blender(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Driven by the timer, as in a window; the doctor looks at the result by itself."""
-    write_wheel(tmp_path / "wheels", "gwalpha", "1.0")
-    requirements = tmp_path / "r.txt"
-    requirements.write_text("gwalpha==1.0\n")
-    real = probe(sys.executable)
-    request = SetupRequest(str(root), real.path, str(requirements), "cpu", str(tmp_path / "wheels"))
+    request = small_request(root, tmp_path)
     asked = []
     monkeypatch.setattr(worker_setup, "start", asked.append)
     no_worker(monkeypatch)
@@ -206,19 +210,11 @@ def test_a_set_up_from_start_to_end_in_blender(
 
 
 def test_a_set_up_is_cancelled(root: Path, tmp_path: Path) -> None:
-    write_wheel(tmp_path / "wheels", "gwalpha", "1.0")
-    requirements = tmp_path / "r.txt"
-    requirements.write_text("gwalpha==1.0\n")
-    python = probe(sys.executable).path
-    worker_setup.start_setup(
-        SetupRequest(str(root), python, str(requirements), "cpu", str(tmp_path / "wheels"))
-    )
+    worker_setup.start_setup(small_request(root, tmp_path))
     assert bpy.ops.gwrap.cancel_setup() == {"FINISHED"}
     assert not bpy.ops.gwrap.cancel_setup.poll(), "once is enough"
     assert "Cancelling…" in drawn().texts
-    while worker_setup.state.is_busy:
-        background.poll()
-        time.sleep(0.05)
+    play_background(lambda: not worker_setup.state.is_busy)
     assert worker_setup.state.task is not None
     assert worker_setup.state.task.status.state == "CANCELLED"
     assert not root.exists()
@@ -229,7 +225,5 @@ def test_pythons_are_searched_in_the_background(monkeypatch: pytest.MonkeyPatch)
     worker_setup.state.pythons, worker_setup.state.has_searched = None, False
     worker_setup.search_pythons()
     worker_setup.search_pythons()
-    while worker_setup.state.pythons is None:
-        background.poll()
-        time.sleep(0.01)
+    play_background(lambda: worker_setup.state.pythons is not None)
     assert worker_setup.state.pythons == [PYTHON, PYTHON]

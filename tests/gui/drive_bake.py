@@ -25,7 +25,7 @@ WAIT_S = 240.0
 def steps() -> Iterator[float]:
     """The visit; each value is the time to let Blender live."""
     os.environ["GAUSSIAN_WRAPPING_PYTHON"] = os.environ["GW_GUI_WORKER"]
-    open_only("GWRAP_PT_bake")
+    driving.show_only("bake")
     yield from driving.open_tab()
     press(bpy.ops.gwrap.import_result, directory=str(FOLDER / "ball" / "result"))
     yield 0.5
@@ -129,17 +129,6 @@ def uv_names(name: str) -> list[str]:
     """Return the names of an object's UV maps."""
     mesh: Any = bpy.data.objects[name].data
     return [layer.name for layer in mesh.uv_layers]
-
-
-def open_only(panel: str) -> None:
-    """Register the panels anew, one open and the others closed; before the tab is first shown."""
-    classes = driving.module("registration").CLASSES
-    panels = [cls for cls in classes if issubclass(cls, bpy.types.Panel)]
-    for cls in reversed(panels):
-        bpy.utils.unregister_class(cls)
-    for cls in panels:
-        cls.bl_options = set() if cls.__name__ == panel else {"DEFAULT_CLOSED"}
-        bpy.utils.register_class(cls)
 
 
 driving.run(steps())

@@ -18,21 +18,10 @@ import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
 import driving
-from driving import FOLDER, execute, press, screenshot, until
+from driving import FOLDER, execute, press, screenshot, show_only, until
 
 PLACES: dict[str, list[int]] = {}
 """x, y from above, width, height of the side panel, by screenshot."""
-
-
-def show_only(names: str) -> None:
-    """Register the panels again, those named open and all others closed."""
-    panels = [c for c in driving.module("registration").CLASSES if issubclass(c, bpy.types.Panel)]
-    for panel in reversed(panels):
-        bpy.utils.unregister_class(panel)
-    for panel in panels:
-        name = panel.__name__.removeprefix("GWRAP_PT_")
-        panel.bl_options = set() if name in names.split(",") else {"DEFAULT_CLOSED"}
-        bpy.utils.register_class(panel)
 
 
 def shot(name: str) -> Iterator[float]:

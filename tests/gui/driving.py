@@ -108,6 +108,17 @@ def objects(kind: str) -> list[bpy.types.Object]:
     return [o for o in bpy.data.objects if o.get("gwrap_kind") == kind]
 
 
+def show_only(names: str) -> None:
+    """Register the panels again, those named open and all others closed, before they are shown."""
+    panels = [c for c in module("registration").CLASSES if issubclass(c, bpy.types.Panel)]
+    for panel in reversed(panels):
+        bpy.utils.unregister_class(panel)
+    for panel in panels:
+        name = panel.__name__.removeprefix("GWRAP_PT_")
+        panel.bl_options = set() if name in names.split(",") else {"DEFAULT_CLOSED"}
+        bpy.utils.register_class(panel)
+
+
 def open_tab() -> Iterator[float]:
     """Empty the file and show the add-on's tab."""
     _, area, _ = view()

@@ -30,26 +30,28 @@ def fake_worker(folder: Path) -> str:
     return str(worker)
 
 
+def not_empty(visit: Visit, *names: str, colours: int = 100) -> None:
+    for name in names:
+        assert colours_of(visit.folder / f"{name}.png") > colours, f"{name} is (nearly) empty"
+
+
 def test_every_button_with_a_fake_worker(visit: Visit) -> None:
     worker = fake_worker(visit.folder)
     outcome = visit.run("drive_blender.py", deadline_s=240, GAUSSIAN_WRAPPING_PYTHON=worker)
     assert len(outcome["checks"]) >= 12
-    for name in SCREENSHOTS:
-        assert colours_of(visit.folder / f"{name}.png") > 100, f"{name} is (nearly) empty"
+    not_empty(visit, *SCREENSHOTS)
 
 
 def test_the_panel_in_other_languages(visit: Visit) -> None:
     worker = fake_worker(visit.folder)
     visit.run("drive_languages.py", deadline_s=240, GAUSSIAN_WRAPPING_PYTHON=worker)
-    for name in ("1-de_DE", "2-de_DE", "1-ja_JP", "2-ja_JP"):
-        assert colours_of(visit.folder / f"{name}.png") > 100, f"{name} is (nearly) empty"
+    not_empty(visit, "1-de_DE", "2-de_DE", "1-ja_JP", "2-ja_JP")
 
 
 def test_regions_are_drawn_and_dragged(visit: Visit) -> None:
     synthetic_result.write_result(visit.folder)
     visit.run("drive_regions.py", "--enable-event-simulate", deadline_s=240)
-    for name in ("8-regions", "9-dragged"):
-        assert colours_of(visit.folder / f"{name}.png") > 100, f"{name} is (nearly) empty"
+    not_empty(visit, "8-regions", "9-dragged")
 
 
 @pytest.mark.timeout(900)
@@ -57,8 +59,7 @@ def test_photos_are_baked_onto_meshes_of_the_scene(visit: Visit) -> None:
     """A monkey without UVs, and a ball made lighter and made of quads, with the real worker."""
     write_ball_job(visit.folder).root.rename(visit.folder / "ball")
     visit.run("drive_bake.py", deadline_s=800, GW_GUI_WORKER=sys.executable)
-    for name in ("1-bake", "2-baking", "3-baked", "4-lighter", "5-quads"):
-        assert colours_of(visit.folder / f"{name}.png") > 100, f"{name} is (nearly) empty"
+    not_empty(visit, "1-bake", "2-baking", "3-baked", "4-lighter", "5-quads")
 
 
 @pytest.mark.timeout(2000)
@@ -70,8 +71,9 @@ def test_photos_to_a_textured_region_with_the_real_worker(visit: Visit) -> None:
     assert stalls["looks"] > 20
     assert stalls["longest_look_s"] < 0.05, stalls
     assert max(stalls["imports_s"]) < 1.0, stalls
-    for name in ("1-checked", "2-training", "3-wrapped", "4-region", "5-region-meshed"):
-        assert colours_of(visit.folder / f"{name}.png") > 1000, f"{name} is (nearly) empty"
+    not_empty(
+        visit, "1-checked", "2-training", "3-wrapped", "4-region", "5-region-meshed", colours=1000
+    )
     assert (visit.folder / "session.blend").is_file()
 
 

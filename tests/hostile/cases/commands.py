@@ -150,7 +150,6 @@ _BLENDER_STEPS = Case(
         "tests/blender/test_killed_blender.py::test_quitting_leaves_no_process_behind",
         "tests/blender/test_killed_blender.py::test_a_killed_blender_finds_its_job_again",
         "tests/blender/test_jobs.py::test_undo_does_not_lose_a_running_job",
-        "tests/blender/test_found_jobs.py::test_disabling_the_addon_leaves_the_job_to_be_found",
     ),
 )
 
