@@ -24,11 +24,15 @@ stand before, and are lit by, need not be sharp."""
 WHOLE_SHARE = 0.85
 """A photo of which the regions cover more is trained on whole, as if there were none."""
 
+MOST_SHOWN = 0.6
+"""Share of the photos' pixels that look through the regions from which a training is for all that
+they show: what lies behind the regions fills these pixels, too."""
+
 SURROUNDINGS_BUDGET = 0.35
 """Of the largest number of Gaussians, for surroundings; what regions cover of the photos comes on
 top."""
 
-_SMALL_PX = 128
+_SMALL_PX = 64
 """Longest side of the photos in which regions are looked for."""
 
 OUTSIDE_SIZE = 3.0
@@ -72,10 +76,9 @@ class Focus:
             return [Window(0, 0, camera.width, camera.height)]
         return found
 
-    def budget_share(self, cameras: Sequence[Camera]) -> float:
-        """Return the share of the largest number of Gaussians that photos of these need."""
-        shares = [self.shown(_small(camera)).mean() for camera in cameras]
-        return min(1.0, float(np.mean(shares)) + SURROUNDINGS_BUDGET)
+    def share_of(self, cameras: Sequence[Camera]) -> float:
+        """Return the share of the pixels of photos that look through a region."""
+        return float(np.mean([self.shown(_small(camera)).mean() for camera in cameras]))
 
     def shown(self, camera: Camera) -> np.ndarray:
         """Return which pixels of a photo look through a region, (h, w) bool."""

@@ -39,7 +39,7 @@ from .camera_poses import PosedPhotos
 from .cpu_backend import CpuBackend
 from .exposure import Exposure
 from .exposure_selection import first_decisions
-from .focus import Focus
+from .focus import MOST_SHOWN, SURROUNDINGS_BUDGET, Focus
 from .growth_selection import photo_detail, select_image_size
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import LiveView, divisor_for, held_out_metrics, measure_held_out
@@ -156,7 +156,7 @@ class _Trainer:
         self.progress = progress or Progress()
         self.photos = CancellablePhotos(self.posed, self.progress)
         self.folder, self.seed, self.threads = folder, seed, threads
-        self.start_splat, self.handover = start_splat, handover
+        self.start_splat, self.handover, self.focus = start_splat, handover, focus
         if handover is not None and handover.views is not None:
             self.held_out, self.views = [], list(handover.views)
         else:
@@ -170,11 +170,13 @@ class _Trainer:
         numbers = np.array(self.views)
         self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
         self.image_decision, finest = self._image_size(side_px)
-        share = 1.0 if focus is None else focus.budget_share(sizes)
-        self.schedule = Schedule(settings, side_px, finest, start_splat is not None, share)
+        share = 1.0 if focus is None else focus.share_of(sizes)
+        favoured = focus if share <= MOST_SHOWN else None
+        budget = 1.0 if favoured is None else share + SURROUNDINGS_BUDGET
+        self.schedule = Schedule(settings, side_px, finest, start_splat is not None, budget)
         self.stepper = Stepper(
             self.posed, self.schedule, self.views, self.neighbours,
-            backend or CpuBackend(threads), threads, focus,
+            backend or CpuBackend(threads), threads, favoured,
         )  # fmt: skip
         self.live_figures: dict[str, float] = {}
         self.live = LiveView(
@@ -289,7 +291,7 @@ class _Trainer:
         held_out, lpips_note = held_out_metrics(
             gaussians, self.photos, names, self.progress,
             threads=self.threads, renderer=self.stepper.renderer,
-            exposed=state.exposure is not None, focus=self.stepper.focus,
+            exposed=state.exposure is not None, focus=self.focus,
         )  # fmt: skip
         return TrainingResult(
             gaussians, self.schedule.total, tuple(state.history), tuple(held_out), seconds,

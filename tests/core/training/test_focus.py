@@ -15,10 +15,10 @@ from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.training.backend import OVERLAP_PX, Window
 from gaussian_wrapping_addon.core.training.cpu_backend import CpuBackend
-from gaussian_wrapping_addon.core.training.focus import SURROUNDINGS_BUDGET, WHOLE_SHARE, Focus
+from gaussian_wrapping_addon.core.training.focus import MOST_SHOWN, WHOLE_SHARE, Focus
 from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.training.small_scene import PhotosInMemory, sphere_scene
-from tests.core.training.test_trainer import SETTINGS
+from tests.core.training.test_trainer import SETTINGS, assert_same
 from tests.synthetic import look_at
 
 
@@ -83,13 +83,12 @@ def test_a_photo_filled_by_regions_is_used_whole() -> None:
     assert Focus(halves).rectangles(camera) == whole
 
 
-def test_the_number_of_gaussians_follows_from_what_regions_cover() -> None:
+def test_what_regions_cover_is_a_share_of_the_pixels() -> None:
     cameras = [_camera([0, 0, -1], [0, 0, 0]), _camera([0, 0, 1], [0, 0, 0])]
-    # Seen at 1 m with a focal length of 160 pixels: 64 of 200 x 150 pixels squared.
+    # Seen from 1 m with a focal length of 160 pixels: 64 of 200 x 150 pixels squared.
     sheet = Region.box("sheet", np.array([-0.2, -0.2, -0.001]), np.array([0.2, 0.2, 0.001]))
-    share = Focus([sheet]).budget_share(cameras)
-    assert share == pytest.approx(SURROUNDINGS_BUDGET + 64**2 / (200 * 150), abs=0.02)
-    assert Focus([_box([0, 0, 0], 3.0)]).budget_share(cameras) == 1.0
+    assert Focus([sheet]).share_of(cameras) == pytest.approx(64**2 / (200 * 150), abs=0.02)
+    assert Focus([_box([0, 0, 0], 3.0)]).share_of(cameras) == 1.0
 
 
 class _Watched(CpuBackend):
@@ -138,3 +137,18 @@ def test_most_iterations_see_the_region_at_full_size_and_the_others_all_at_half(
     assert 0.6 * 60 < len(parts) < 0.95 * 60
     for view, window in parts:
         assert [window] == focus.rectangles(photos.camera(view, 1))
+
+
+def test_regions_that_fill_the_photos_are_trained_for_as_if_there_were_none(tmp_path: Path) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    settings = dataclasses.replace(SETTINGS, multi_view="off", dense_start="off")
+    focus = Focus([_box([0.0, 0.0, 0.0], 9.0)])
+    assert focus.share_of([photos.camera(view, 1) for view in range(9)]) > MOST_SHOWN
+    for name in ("found", "plain"):
+        (tmp_path / name).mkdir()
+    found, plain = (
+        train(scene, photos, settings, tmp_path / name, Progress(), seed=1, threads=2, focus=given)
+        for name, given in (("found", focus), ("plain", None))
+    )
+    assert_same(found.gaussians, plain.gaussians)
+    assert found.region_psnr == pytest.approx(found.held_out_psnr)
