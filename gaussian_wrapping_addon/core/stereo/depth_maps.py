@@ -583,15 +583,24 @@ class DensePoints:
         )  # fmt: skip
 
 
-def fuse(depth_maps: Sequence[DepthMap], wanted: int) -> DensePoints:
+def fuse(
+    depth_maps: Sequence[DepthMap], wanted: int,
+    apart: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> DensePoints:  # fmt: skip
     """Fuse depth maps into about ``wanted`` points.
 
     One point for each cell of an octree whose level follows the footprint of a pixel, so that
     points are even in the resolution of the photos, not in space. The most confident pixel of a
     cell leads; its place along its normal is the trimmed mean of the cell's pixels of like normal.
     Their number is the wanted one within some per cent; fewer where there are fewer pixels.
+
+    ``apart`` returns for points (n, 3), scene frame, how many times as far from each other they
+    are to be; by default they are even.
     """
-    return merged(lifted(depth_maps, [m.confidence for m in depth_maps]), wanted)
+    pixels = lifted(depth_maps, [m.confidence for m in depth_maps])
+    if apart is not None:
+        pixels = replace(pixels, sizes=apart(pixels.positions) * pixels.sizes)
+    return merged(pixels, wanted)
 
 
 def merged(pixels: DensePoints, wanted: int) -> DensePoints:

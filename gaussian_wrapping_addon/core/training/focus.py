@@ -36,7 +36,7 @@ _SMALL_PX = 64
 """Longest side of the photos in which regions are looked for."""
 
 OUTSIDE_SIZE = 3.0
-"""Distance of the first Gaussians outside the regions over that inside, in pixels."""
+"""Distance of the first Gaussians outside the regions over that inside."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,10 @@ class Focus:
         for region in self.regions:
             found |= region.contains(points)
         return found
+
+    def apart(self, points: np.ndarray) -> np.ndarray:
+        """Return how many times as far apart the first Gaussians are at (n, 3) points, (n,)."""
+        return np.where(self.contains(points), 1.0, OUTSIDE_SIZE)
 
     def rectangles(self, camera: Camera) -> list[Window]:
         """Return the rectangles of a photo that show the regions, with a border for SSIM.

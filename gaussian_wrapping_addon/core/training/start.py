@@ -28,10 +28,9 @@ from ..stereo.depth_maps import (
     cells_of,
     estimate_depth_maps,
     fill_gaps,
-    lifted,
+    fuse,
     load_priors,
     matching_divisor,
-    merged,
     open_cells,
     priors_of,
     save_priors,
@@ -39,7 +38,7 @@ from ..stereo.depth_maps import (
 from ..stereo.plane_filling import fill_plain_parts
 from .background import inside_masks
 from .exposure import Exposure
-from .focus import OUTSIDE_SIZE, Focus
+from .focus import Focus
 from .model_selection import Decision, ModelSelection, decide
 
 # -- What a training takes over from another one, instead of starting and deciding for itself -----
@@ -222,7 +221,7 @@ def dense_start(
         return DenseStart(None, {}, decision)
     maps = fill_plain_parts(maps, points, progress, seed=seed)
     wanted = start_budget(max_gaussians)
-    found = _fused(maps, wanted, focus)
+    found = fuse(maps, wanted, None if focus is None else focus.apart)
     guesses = fill_gaps(maps, found, round(GUESS_SHARE * wanted))
     known = np.concatenate([found.positions, points])
     shell, _ = far_shell(maps, known, round(SHELL_SHARE * wanted))
@@ -243,15 +242,6 @@ def dense_start(
         kept = np.sort(random.choice(len(gaussians), max_gaussians, replace=False))
         gaussians = gaussians.select(torch.from_numpy(kept))
     return DenseStart(gaussians, priors_of(views, maps), decision)
-
-
-def _fused(maps: Sequence[DepthMap], wanted: int, focus: Focus | None) -> DensePoints:
-    """Return about ``wanted`` points on confirmed depths, farther apart outside the focus."""
-    pixels = lifted(maps, [m.confidence for m in maps])
-    if focus is not None:
-        apart = np.where(focus.contains(pixels.positions), 1.0, OUTSIDE_SIZE)
-        pixels = dataclasses.replace(pixels, sizes=apart * pixels.sizes)
-    return merged(pixels, wanted)
 
 
 def start_budget(max_gaussians: int) -> int:
