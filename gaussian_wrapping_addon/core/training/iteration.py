@@ -155,8 +155,8 @@ class Stepper:
             rate = exposure_rate(iteration, self.settings.iterations, len(self.views))
             state.exposure.step(sample.view, state.rate_factor * rate)
         state.iteration = iteration + 1
-        if self._is_empty(sample):
-            return  # no pixel was compared, so there is no error to record
+        if self._is_empty(sample) or sample.of_surroundings:
+            return  # no pixel was compared, or growth is not for what was
         window_id = sample.view * _MAX_WINDOWS + sample.number
         error = float(found[1])
         state.error_history.add(iteration, window_id, len(adam), error, sample.divisor)

@@ -216,10 +216,8 @@ def held_out_metrics(
         mask = photos.mask(view, 1)
         if mask is not None and not mask.any():
             continue
-        image, photo = (
-            _rendered(renderer, raw, photos, view, 1, threads, exposed),
-            photos.photo(view, 1),
-        )
+        image = _rendered(renderer, raw, photos, view, 1, threads, exposed)
+        photo = photos.photo(view, 1)
         scores = score_images(image, photo, mask, lpips=lpips, threads=threads)
         of_regions = None
         if focus is not None:

@@ -171,7 +171,16 @@ class _Trainer:
         self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
         self.image_decision, finest = self._image_size(side_px)
         share = 1.0 if focus is None else focus.share_of(sizes)
-        favoured = focus if share <= MOST_SHOWN else None
+        # Masks leave no surroundings, and a splat brings its own number of Gaussians.
+        masked = any(photos.mask(view, 1) is not None for view in self.views)
+        favoured = focus if 0.0 < share <= MOST_SHOWN and not masked else None
+        if start_splat is not None:
+            favoured = None
+        if focus is not None:
+            _logger.info(
+                "%.0f %% of the photos look through the regions: the training is for %s",
+                100.0 * share, "all" if favoured is None else "them",
+            )  # fmt: skip
         budget = 1.0 if favoured is None else share + SURROUNDINGS_BUDGET
         self.schedule = Schedule(settings, side_px, finest, start_splat is not None, budget)
         self.stepper = Stepper(

@@ -581,7 +581,7 @@ class TrainingStages:
         from ...training.focus import Focus
         from .cameras import regions_listed
 
-        if not self._settings.focus:
+        if not self._settings.focus or self._settings.region_weight == 1.0:
             return None
         return Focus(regions_listed(self._settings.focus, self._scene))
 
