@@ -65,6 +65,7 @@ from tests.core.render.cuda.emulation import EmulatedKernels
 from tests.proofs import first_then_proofs
 
 PROCESSOR = choose_device("cpu")
+GPU = DeviceChoice("cuda:0", "Some GPU", "It passed.")
 HELD_OUT = {"000.png", "008.png"}
 """Of the twelve photos of the sphere, every eighth."""
 
@@ -137,6 +138,7 @@ def test_a_job_makes_the_mesh_of_the_pivots_alone(
         method="pivots", pivots=pivots, pivot_box=box, pivot_samples="none", min_component_share=0.0
     )
     made = mesh_of(folder, settings)
+    assert mesh_of(folder, settings, GPU).reused, "a finished mesh is one on another device, too"
     mesh = load_mesh(made.folder / "mesh.npz")
     assert made.done["check"]["good"] is True
     expected = made.done["estimate"]
@@ -163,9 +165,6 @@ def test_a_job_makes_the_mesh_of_the_pivots_alone(
     for here, there in ((found, wanted), (wanted, found)):
         assert np.quantile(cKDTree(there).query(here)[0], 0.99) < tolerance
     assert len(found) == pytest.approx(len(wanted), rel=0.05)
-
-
-GPU = DeviceChoice("cuda:0", "Some GPU", "It passed.")
 
 
 @pytest.mark.parametrize(
