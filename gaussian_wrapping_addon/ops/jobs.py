@@ -3,9 +3,10 @@
 
 import contextlib
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import bpy
 from bpy.app.handlers import persistent
@@ -247,6 +248,35 @@ def start_mesh(
     start_on_regions(scene, regions, choice, "mesh", earlier.source, settings)
 
 
+CAMERA_SETTINGS: Final = (
+    "seed", "turntable", "equirectangular", "mask_invert", "mask_grow_px", "georeference",
+    "markers", "control_points", "video_frames", "video_fps",
+)  # fmt: skip
+"""What a job's cameras depend on besides its input."""
+
+
+def start_wrap_for(
+    scene: bpy.types.Scene,
+    regions: list[bpy.types.Object],
+    choice: WorkerChoice,
+    changed: Mapping[str, Any],
+) -> None:
+    """Train a finished job's photos anew for regions, with ``changed`` settings, and mesh these.
+
+    Cameras are re-used; so are masks that were made of the same regions.
+
+    Raises WrapError: a region or a setting cannot be used, or the job folder holds no job.
+    """
+    folder = job_folder_of(common_frame(regions))
+    refuse_running(folder)
+    earlier = finished_job(JobFolder(folder))
+    # The region lies in the world of the job's cameras, which would move with any of these.
+    same = {name: getattr(earlier.settings, name) for name in CAMERA_SETTINGS}
+    settings = job_settings(scene, choice.threads, choice.device)
+    settings = with_values(settings, {**same, **changed})
+    start_on_regions(scene, regions, choice, "wrap", earlier.source, settings)
+
+
 def start_on_regions(
     scene: bpy.types.Scene,
     regions: list[bpy.types.Object],
@@ -427,6 +457,29 @@ class GWRAP_OT_mesh_region(OnRegions, bpy.types.Operator):
         self.report({"INFO"}, f"Meshing {', '.join(r.name for r in regions)}")
 
 
+class GWRAP_OT_train_for_regions(OnRegions, bpy.types.Operator):
+    bl_idname = "gwrap.train_for_regions"
+    bl_label = "Train for Regions"
+    bl_description = (
+        "Train again, most of all for what stands in the checked regions, and mesh these; cameras "
+        "are kept"
+    )
+
+    @classmethod
+    def why_not(cls, context: bpy.types.Context) -> str:
+        if not checked_regions(context):
+            return "Check a region in the list"
+        return why_no_start(context)
+
+    def regions(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+        return checked_regions(context)
+
+    def work(self, context: bpy.types.Context) -> None:
+        regions = self.regions(context)
+        start_wrap_for(context.scene, regions, worker_choice(context), {})
+        self.report({"INFO"}, f"Training for {', '.join(r.name for r in regions)}")
+
+
 class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.cancel_job"
     bl_label = "Cancel"
@@ -489,6 +542,6 @@ class GWRAP_OT_find_job(ReportsErrors, bpy.types.Operator):
 
 
 CLASSES: Final = (
-    GWRAP_OT_wrap_scene, GWRAP_OT_mesh_region, GWRAP_OT_cancel_job, GWRAP_OT_resume_job,
-    GWRAP_OT_find_job,
+    GWRAP_OT_wrap_scene, GWRAP_OT_mesh_region, GWRAP_OT_train_for_regions, GWRAP_OT_cancel_job,
+    GWRAP_OT_resume_job, GWRAP_OT_find_job,
 )  # fmt: skip

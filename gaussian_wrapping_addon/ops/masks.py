@@ -11,53 +11,18 @@ import numpy as np
 from bpy.props import BoolProperty, IntProperty
 
 from ..core.errors import DatasetError, UsageError
-from ..core.jobs.store.job_folder import JobFolder
-from ..core.jobs.store.rollback import finished_job
 from ..core.masks.mask_folder import FOLDER, MadeMask, MaskList, read_list, write_list
-from ..core.settings import with_values
 from . import addon
 from .addon import ReportsErrors
 from .job_timer import new_icon
 from .jobs import (
     OnRegions,
     OnSceneJob,
-    common_frame,
-    refuse_running,
     selected_regions,
-    start_on_regions,
+    start_wrap_for,
     why_no_start,
 )
-from .panel_settings import job_folder_of, job_settings
-from .worker_setup import WorkerChoice, worker_choice
-
-# -- Start a job that masks the photos to what stands in regions, and trains anew -----------------
-
-
-CAMERA_SETTINGS: Final = (
-    "seed", "turntable", "equirectangular", "mask_invert", "mask_grow_px", "georeference",
-    "markers", "control_points", "video_frames", "video_fps",
-)  # fmt: skip
-"""What a job's cameras depend on besides its input."""
-
-
-def start_region_masks(
-    scene: bpy.types.Scene, regions: list[bpy.types.Object], choice: WorkerChoice
-) -> None:
-    """Train a finished job's photos anew, masked to regions, and mesh these.
-
-    Cameras are re-used; so are masks that were made of the same regions.
-
-    Raises WrapError: a region or a setting cannot be used, or the job folder holds no job.
-    """
-    folder = job_folder_of(common_frame(regions))
-    refuse_running(folder)
-    earlier = finished_job(JobFolder(folder))
-    # The region lies in the world of the job's cameras, which would move with any of these.
-    changed = {name: getattr(earlier.settings, name) for name in CAMERA_SETTINGS}
-    changed |= {"make_masks": "region", "mask_model": ""}
-    settings = with_values(job_settings(scene, choice.threads, choice.device), changed)
-    start_on_regions(scene, regions, choice, "wrap", earlier.source, settings)
-
+from .worker_setup import worker_choice
 
 # -- Look at made masks over their photos; decisions go into the job's folder at once -------------
 #
@@ -261,7 +226,8 @@ class GWRAP_OT_masks_from_region(OnRegions, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         regions = self.regions(context)
-        start_region_masks(context.scene, regions, worker_choice(context))
+        changed = {"make_masks": "region", "mask_model": ""}
+        start_wrap_for(context.scene, regions, worker_choice(context), changed)
         self.report({"INFO"}, f"Masking to {', '.join(r.name for r in regions)}")
 
 

@@ -30,6 +30,7 @@ MAX_ROWS = 100
 _DECISIONS = {
     "exposure": "Exposure", "multi_view": "Compare Photos", "growth": "Add Gaussians",
     "full_size": "Photo Size", "dense_start": "Dense Start", "refine_poses": "Refine Cameras",
+    "region_weight": "Regions First",
 }  # fmt: skip
 """Labels of what was decided, as the panel Training has them."""
 

@@ -101,6 +101,8 @@ class GWRAP_PT_region(TabPanel, bpy.types.Panel):
                 text = tr(text, count=len(checked))
                 button: Any = row.operator(operator, text=text, icon=icon)
                 button.checked = True
+            text = tr("Train for {count} Checked", count=len(checked))
+            layout.operator("gwrap.train_for_regions", text=text, icon="MOD_MESHDEFORM")
         draw_masks(layout, characters_of(context))
         if active is not None and active.type == "MESH" and not addon.kind_of(active):
             layout.operator("gwrap.use_as_region", icon="MESH_ICOSPHERE")

@@ -21,7 +21,7 @@ from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.settings import to_json
 from gaussian_wrapping_addon.ops import addon, background, job_timer, jobs, worker_setup
-from gaussian_wrapping_addon.ui import mesh_panel, result_panel, training_panel
+from gaussian_wrapping_addon.ui import mesh_panel, region_panel, result_panel, training_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import (
     running_job,
@@ -158,6 +158,28 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     assert meshes == {"auto", "Front_Door"}
     regions = list(addon.objects_of_kind(bpy.context.scene, "region"))
     assert len(regions) == 2, "the automatic box comes back, the edited one is not doubled"
+
+
+@pytest.mark.usefixtures("worker")
+def test_train_for_regions_trains_the_same_photos_for_the_checked_ones(photos: Path) -> None:
+    region = finished_wrap(photos)
+    folder = Path(bpy.context.scene.gwrap.job_folder)
+    first = read_job(folder / "job.json")
+    assert first.settings.training.focus == '["auto"]'
+    assert not bpy.ops.gwrap.train_for_regions.poll()
+    region.gwrap.checked = True
+    region.name = "Head"
+    assert "Train for 1 Checked" in draw(region_panel.GWRAP_PT_region).texts
+    assert bpy.ops.gwrap.train_for_regions() == {"FINISHED"}
+    job = read_job(folder / "job.json")
+    assert (job.command, job.source) == ("wrap", str(photos))
+    ((_, body),) = job.region_bodies.items()
+    (shape,) = json.loads(job.settings.training.focus)
+    assert body["blender_object_name"] == "Head"
+    assert shape.items() <= body.items()
+    assert "blender_object_name" not in shape
+    assert Path(bpy.context.scene.gwrap.job_folder) == folder
+    wait_for("DONE")
 
 
 def test_a_name_that_is_no_folder_name_is_kept_and_protected(photos: Path, worker: object) -> None:

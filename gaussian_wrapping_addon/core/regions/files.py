@@ -196,6 +196,8 @@ def _text(numbers: Any) -> str:
 
 CLASS_NAME = "GaussianWrappingBoundingVolume"
 VERSION = 1
+SHAPE_ENTRIES = ("class_name", "version", "vertices")
+"""Of a region file's values, those that say where it is."""
 
 
 @dataclass(frozen=True)

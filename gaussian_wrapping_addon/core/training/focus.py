@@ -6,8 +6,9 @@ See docs/method.md, section 4.7.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,9 @@ import numpy as np
 from .. import limits
 from ..regions.shapes import Region
 from ..scene.camera import Camera
+from ..scene.scene import PhotoSource
 from .backend import OVERLAP_PX, Window
+from .model_selection import OFF, ON, Decision
 
 SURROUNDINGS_SHARE = 0.25
 """Share of the iterations in which a photo is trained on whole, at half the size: what the regions
@@ -70,7 +73,7 @@ class Focus:
         """
         small, found = _small(camera), []
         for region in self.regions:
-            rows, columns = np.nonzero(Focus([region]).shown(small))
+            rows, columns = np.nonzero(_shown(region, small))
             if len(rows):
                 top, height = _reach(rows, camera.height, small.height)
                 left, width = _reach(columns, camera.width, small.width)
@@ -80,25 +83,87 @@ class Focus:
             return [Window(0, 0, camera.width, camera.height)]
         return found
 
+    def rectangles_in(self, photos: PhotoSource) -> Callable[[int, int], list[Window]]:
+        """Return :meth:`rectangles` as a function of photo and divisor that remembers them."""
+
+        @functools.cache
+        def of_photo(view: int, divisor: int) -> list[Window]:
+            return self.rectangles(photos.camera(view, divisor))
+
+        return of_photo
+
     def share_of(self, cameras: Sequence[Camera]) -> float:
         """Return the share of the pixels of photos that look through a region."""
         return float(np.mean([self.shown(_small(camera)).mean() for camera in cameras]))
 
     def shown(self, camera: Camera) -> np.ndarray:
         """Return which pixels of a photo look through a region, (h, w) bool."""
-        rays = camera.rays() @ camera.rotation  # (h, w, 3) scene frame, of depth 1
-        found = np.zeros(rays.shape[:2], np.bool_)
-        for region in self.regions:
-            begin, end = np.full(found.shape, limits.NEAR_Z), np.full(found.shape, np.inf)
-            for normal, offset in zip(*region.half_spaces, strict=True):
-                room, rise = offset - normal @ (camera.center - region.center), rays @ normal
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    depth = room / rise
-                end = np.where(rise > 0.0, np.minimum(end, depth), end)
-                begin = np.where(rise < 0.0, np.maximum(begin, depth), begin)
-                end[(rise == 0.0) & (room < 0.0)] = -np.inf
-            found |= begin < end
-        return found
+        return np.any([_shown(region, camera) for region in self.regions], axis=0)
+
+
+@dataclass(frozen=True)
+class Favour:
+    """What a training is for, how many Gaussians that needs, and why."""
+
+    focus: Focus | None = None
+    """``None``: for all that the photos show."""
+    budget_share: float = 1.0
+    """Of the settings' largest number of Gaussians."""
+    decision: Decision | None = None
+    """``None`` where no regions were given."""
+
+
+def favour(
+    focus: Focus | None, cameras: Sequence[Camera], is_masked: Callable[[], bool], *, refines: bool
+) -> Favour:
+    """Decide whether a training is for the regions it was given (docs/method.md, section 4.7).
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Of the photos to train on.
+    is_masked : callable
+        Whether any of them has a mask; asked only where that decides.
+    refines : bool
+        Whether the training starts from a splat.
+    """
+    if focus is None:
+        return Favour()
+    share = focus.share_of(cameras)
+    through = f"{100.0 * share:.0f} % of the photos' pixels look through the regions"
+    figures = {"share": share}
+    reason = ""
+    if share == 0.0:
+        reason = "No photo shows the regions."
+    elif share > MOST_SHOWN:
+        reason = f"{through} (at most {100.0 * MOST_SHOWN:.0f} %): they show little else."
+    elif refines:
+        reason = "The splat brings its own number of Gaussians."
+    elif is_masked():
+        reason = "The photos are masked: little is left of their surroundings."
+    if reason:
+        return Favour(decision=Decision("region_weight", "auto", OFF, reason, figures))
+    budget = share + SURROUNDINGS_BUDGET
+    evidence = (
+        f"{through}: {100.0 * (1.0 - SURROUNDINGS_SHARE):.0f} % of the iterations are for them, "
+        f"with at most {100.0 * budget:.0f} % of `max_gaussians`."
+    )
+    figures["budget_share"] = budget
+    return Favour(focus, budget, Decision("region_weight", "auto", ON, evidence, figures))
+
+
+def _shown(region: Region, camera: Camera) -> np.ndarray:
+    """Return which pixels of a photo look through a region, (h, w) bool."""
+    rays = camera.rays() @ camera.rotation  # (h, w, 3) scene frame, of depth 1
+    begin, end = np.full(rays.shape[:2], limits.NEAR_Z), np.full(rays.shape[:2], np.inf)
+    for normal, offset in zip(*region.half_spaces, strict=True):
+        room, rise = offset - normal @ (camera.center - region.center), rays @ normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = room / rise
+        end = np.where(rise > 0.0, np.minimum(end, depth), end)
+        begin = np.where(rise < 0.0, np.maximum(begin, depth), begin)
+        end[(rise == 0.0) & (room < 0.0)] = -np.inf
+    return begin < end
 
 
 def _small(camera: Camera) -> Camera:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ from .backend import Backend, Shown, Window, windows
 from .background import draw_background
 from .camera_poses import pose_rate_px
 from .exposure import exposure_rate
-from .focus import SURROUNDINGS_SHARE, Focus
+from .focus import SURROUNDINGS_SHARE
 from .multi_view import MultiViewOptions
 from .schedule import Schedule
 from .state import TrainingState
@@ -65,18 +65,19 @@ class Stepper:
         For each training view, the views that the multi-view terms compare it with.
     backend : Backend
         Computes; the samples drawn do not depend on it.
-    focus : Focus, optional
-        What most iterations are for; without it they are drawn evenly over all pixels.
+    rectangles : callable, optional
+        Returns those that most iterations are for, by photo and divisor
+        (:meth:`~.focus.Focus.rectangles`); without it windows are drawn evenly over all pixels.
     """
 
     def __init__(
         self, photos: PhotoSource, schedule: Schedule, views: Sequence[int],
         neighbours: dict[int, np.ndarray], backend: Backend, threads: int,
-        focus: Focus | None = None,
+        rectangles: Callable[[int, int], list[Window]] | None = None,
     ) -> None:  # fmt: skip
         self.photos, self.schedule, self.views = photos, schedule, list(views)
         self.settings, self.threads = schedule.settings, threads
-        self.neighbours, self.backend, self.focus = neighbours, backend, focus
+        self.neighbours, self.backend, self.rectangles = neighbours, backend, rectangles
         self.priors: dict[int, DepthPrior] = {}
         """Confirmed depths of views that training started on."""
         self.multi_view = MultiViewOptions.of_settings(schedule.settings)
@@ -177,43 +178,40 @@ class Stepper:
     def _draw_sample(self, state: TrainingState) -> _Sample:
         view = state.next_view(self.views)
         divisor = self.schedule.divisor(state.iteration)
-        parts, surroundings = self._parts(state, view, divisor)
-        if surroundings:
+        boxes = self._boxes(state, view, divisor)
+        if boxes == []:
             divisor = self.schedule.coarser(divisor)
         whole, mask = self.photos.camera(view, divisor), self.photos.mask(view, divisor)
-        choices = parts or windows(whole.width, whole.height, self.settings.pixels_per_iteration)
+        choices = [
+            dataclasses.replace(part, left=part.left + box.left, top=part.top + box.top)
+            for box in boxes or [Window(0, 0, whole.width, whole.height)]
+            for part in windows(box.width, box.height, self.settings.pixels_per_iteration)
+        ]
         numbers = np.arange(len(choices))
         if mask is not None and self.settings.mask_mode == "ignore":
             shown = np.array([bool(window.of(mask).any()) for window in choices])
             numbers = np.flatnonzero(shown) if shown.any() else numbers
         number = int(numbers[int(state.random.integers(len(numbers)))])
         window = choices[number]
-        part = None if len(choices) == 1 and not parts else window
-        number += _FIRST_OF_FOCUS if parts else 0
+        part = None if len(choices) == 1 and not boxes else window
+        number += _FIRST_OF_FOCUS if boxes else 0
         seen = self.backend.shown(self.photos, view, divisor, part)
         return _Sample(
-            view, divisor, whole, window, number, window.camera(whole), seen, surroundings
+            view, divisor, whole, window, number, window.camera(whole), seen, boxes == []
         )
 
-    def _parts(self, state: TrainingState, view: int, divisor: int) -> tuple[list[Window], bool]:
-        """Return the windows of the regions in a photo, none where it is trained on whole.
+    def _boxes(self, state: TrainingState, view: int, divisor: int) -> list[Window] | None:
+        """Return the rectangles of the regions in a photo to train on this time.
 
-        The second value tells whether that is for the surroundings alone.
+        ``None``: there is nothing to prefer in it; empty: it is for the surroundings, coarser.
         """
-        if self.focus is None:
-            return [], False
+        if self.rectangles is None:
+            return None
+        boxes = self.rectangles(view, divisor)
         whole = self.photos.camera(view, divisor)
-        boxes = self.focus.rectangles(whole)
         if boxes == [Window(0, 0, whole.width, whole.height)]:
-            return [], False
-        if not boxes or state.random.random() < SURROUNDINGS_SHARE:
-            return [], True
-        limit = self.settings.pixels_per_iteration
-        return [
-            dataclasses.replace(part, left=part.left + box.left, top=part.top + box.top)
-            for box in boxes
-            for part in windows(box.width, box.height, limit)
-        ], False
+            return None
+        return boxes if boxes and state.random.random() >= SURROUNDINGS_SHARE else []
 
     def _is_empty(self, sample: _Sample) -> bool:
         """Return whether the mask leaves no pixel to compare."""

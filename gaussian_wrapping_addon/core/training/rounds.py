@@ -20,6 +20,7 @@ from .density import (
     prune_contributors,
     reset_opacity,
 )
+from .focus import Focus
 from .iteration import Stepper
 from .model_selection import select_poses
 from .schedule import Schedule
@@ -42,6 +43,8 @@ class Rounds:
         Checked for cancellation before every view of a round.
     filter_views : sequence of int, optional
         Views whose pixels the 3D filter follows; by default the training views.
+    focus : Focus, optional
+        Gaussians in its regions count ``region_weight`` times.
     """
 
     def __init__(
@@ -49,8 +52,9 @@ class Rounds:
         stepper: Stepper,
         progress: Progress,
         filter_views: Sequence[int] | None = None,
+        focus: Focus | None = None,
     ) -> None:
-        self.stepper = stepper
+        self.stepper, self.focus = stepper, focus
         self.filter_views = stepper.views if filter_views is None else list(filter_views)
         self.photos: PhotoSource = stepper.photos
         self.schedule: Schedule = stepper.schedule
@@ -176,14 +180,14 @@ class Rounds:
     def _wrap(self, state: TrainingState) -> bool:
         """Clone Gaussians with the opposite orientation; return whether there are new ones."""
         errors = self._normal_errors(state)
-        limit = self.schedule.max_gaussians
+        limit = self.schedule.most_gaussians
         return wrap(state.adam, errors, self.settings.wrap_share, limit) > 0
 
     def _region_weights(self, state: TrainingState) -> np.ndarray | None:
         """Return (n,) weights of the Gaussians, or ``None`` if all weigh the same."""
-        if self.stepper.focus is None:
+        if self.focus is None:
             return None
-        within = self.stepper.focus.contains(state.adam.array("means").astype(np.float64))
+        within = self.focus.contains(state.adam.array("means").astype(np.float64))
         return np.where(within, self.settings.region_weight, 1.0)
 
     def _views(self, divisor: int) -> Iterator[WrapView]:

@@ -93,8 +93,8 @@ class Schedule:
     budget_share: float = 1.0
 
     @property
-    def max_gaussians(self) -> int:
-        """Largest number of Gaussians."""
+    def most_gaussians(self) -> int:
+        """Largest number of Gaussians of this training."""
         return max(1, round(self.budget_share * self.settings.max_gaussians))
 
     @property
@@ -207,10 +207,10 @@ class Schedule:
     def growth_limit(self) -> int:
         """Return the final limit of density control on the number of Gaussians.
 
-        A part of ``max_gaussians`` is reserved for the wrapping rounds.
+        A part of :attr:`most_gaussians` is reserved for the wrapping rounds.
         """
         growth = (1.0 + self.settings.wrap_share) ** self.settings.wrap_rounds
-        return max(1, math.floor(self.max_gaussians / growth))
+        return max(1, math.floor(self.most_gaussians / growth))
 
     def budget(self, iteration: int) -> int:
         """Return the limit on the number of Gaussians after this iteration.

@@ -39,7 +39,7 @@ from .camera_poses import PosedPhotos
 from .cpu_backend import CpuBackend
 from .exposure import Exposure
 from .exposure_selection import first_decisions
-from .focus import MOST_SHOWN, SURROUNDINGS_BUDGET, Focus
+from .focus import Focus, favour
 from .growth_selection import photo_detail, select_image_size
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import LiveView, divisor_for, held_out_metrics, measure_held_out
@@ -170,22 +170,17 @@ class _Trainer:
         numbers = np.array(self.views)
         self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
         self.image_decision, finest = self._image_size(side_px)
-        share = 1.0 if focus is None else focus.share_of(sizes)
-        # Masks leave no surroundings, and a splat brings its own number of Gaussians.
-        masked = any(photos.mask(view, 1) is not None for view in self.views)
-        favoured = focus if 0.0 < share <= MOST_SHOWN and not masked else None
-        if start_splat is not None:
-            favoured = None
-        if focus is not None:
-            _logger.info(
-                "%.0f %% of the photos look through the regions: the training is for %s",
-                100.0 * share, "all" if favoured is None else "them",
-            )  # fmt: skip
-        budget = 1.0 if favoured is None else share + SURROUNDINGS_BUDGET
-        self.schedule = Schedule(settings, side_px, finest, start_splat is not None, budget)
+        self.favour = favour(
+            focus, sizes, lambda: any(photos.mask(view, 1) is not None for view in self.views),
+            refines=start_splat is not None,
+        )  # fmt: skip
+        self.schedule = Schedule(
+            settings, side_px, finest, start_splat is not None, self.favour.budget_share
+        )
         self.stepper = Stepper(
             self.posed, self.schedule, self.views, self.neighbours,
-            backend or CpuBackend(threads), threads, favoured,
+            backend or CpuBackend(threads), threads,
+            None if self.favour.focus is None else self.favour.focus.rectangles_in(photos),
         )  # fmt: skip
         self.live_figures: dict[str, float] = {}
         self.live = LiveView(
@@ -221,7 +216,7 @@ class _Trainer:
         self.progress.update(0.0, "preparing the Gaussians")
         rounds = Rounds(
             self.stepper, self.progress,
-            None if handover is None else handover.filter_views,
+            None if handover is None else handover.filter_views, self.favour.focus,
         )  # fmt: skip
         state = load_checkpoint(self.folder, key)
         if state is None:
@@ -316,10 +311,10 @@ class _Trainer:
             count = len(self.scene.views)
             text = f"Few photos ({count}): {len(self.held_out)} held out for measuring."
             warnings.append(ReportWarning("few-photos", text, "Take more photos, from all around."))
-        decision = None
+        dense_start = None
         if self.start_splat is None:
             found = self._point_start().gaussians(key, self.progress)
-            gaussians, decision, self.stepper.priors = found
+            gaussians, dense_start, self.stepper.priors = found
         else:
             gaussians, of_splat = start_from_splat(
                 self.start_splat, self.scene, self.photos, self.views, self.settings,
@@ -335,8 +330,9 @@ class _Trainer:
             self.scene, self.photos, self.views, self.neighbours, self.settings,
             self.image_decision,
         )  # fmt: skip
-        if decision is not None:
-            state.model_selection = state.model_selection.with_decision(decision)
+        for decision in (dense_start, self.favour.decision):
+            if decision is not None:
+                state.model_selection = state.model_selection.with_decision(decision)
         state.poses, state.model_selection = start_poses(
             self.settings.refine_poses, self.scene, self.views, state.model_selection
         )
@@ -373,7 +369,7 @@ class _Trainer:
         return PointStart(
             self.scene, self.photos, self.views, self.settings, self.folder,
             self.schedule.divisor(0), self.schedule.growth_limit(), self.seed, self.threads,
-            self.stepper.focus,
+            self.favour.focus,
         )  # fmt: skip
 
     def _saved_priors(self, state: TrainingState, key: str) -> dict[int, DepthPrior]:

@@ -15,6 +15,7 @@ from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, UsageEr
 from gaussian_wrapping_addon.core.gaussians.files import write_splat_ply
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians, gaussians_at
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.render.projection import RawArrays
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
@@ -22,6 +23,7 @@ from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.scene.camera import Camera
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import cpu_backend, iteration, live_view, rounds, trainer
+from gaussian_wrapping_addon.core.training.focus import Focus
 from gaussian_wrapping_addon.core.training.start import LEAST_REACH
 from gaussian_wrapping_addon.core.training.state import TrainingResult, cancellable
 from gaussian_wrapping_addon.core.training.trainer import train, with_backdrop
@@ -121,26 +123,42 @@ def test_held_out_photos_get_a_likeness_or_the_reason_why_not(
     assert values.get("held_out_lpips") == value
 
 
-def test_killed_and_resumed_is_bit_for_bit_the_same(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("focus", "changed"),
+    [
+        (None, {}),
+        (
+            Focus([Region.box("box", np.full(3, -0.05), np.full(3, 0.1))]),
+            {"refine_poses": "on", "coarse_to_fine": "off"},
+        ),
+    ],
+)
+def test_killed_and_resumed_is_bit_for_bit_the_same(
+    focus: Focus | None, changed: dict[str, str], tmp_path: Path
+) -> None:
     scene, photos = sphere_scene(views=9, size_px=24)
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    whole = train(scene, photos, SETTINGS, tmp_path / "a", Progress(), seed=3, threads=1)
+    settings = dataclasses.replace(SETTINGS, **changed)  # type: ignore[arg-type]
+
+    def trained(folder: str, progress: Progress, threads: int, seed: int = 3) -> TrainingResult:
+        (tmp_path / folder).mkdir(exist_ok=True)
+        return train(
+            scene, photos, settings, tmp_path / folder, progress, seed=seed, threads=threads,
+            focus=focus,
+        )  # fmt: skip
+
+    whole = trained("a", Progress(), 1)
+    assert whole.model_selection.chose("region_weight") == (focus is not None)
     for stop in (10, 20, 30):
         with pytest.raises(Cancelled):
-            train(
-                scene, photos, SETTINGS, tmp_path / "b", StopAt(stop).progress(),
-                seed=3, threads=2,
-            )  # fmt: skip
+            trained("b", StopAt(stop).progress(), 2)
     assert len(list((tmp_path / "b").glob("checkpoint-*.json"))) == 2
     # The newest is broken: the one before it leads to the same end.
     newest = sorted((tmp_path / "b").glob("checkpoint-*.npz"))[-1]
     newest.write_bytes(newest.read_bytes()[:-100])
-    resumed = train(scene, photos, SETTINGS, tmp_path / "b", Progress(), seed=3, threads=2)
+    resumed = trained("b", Progress(), 2)
     assert_same(whole.gaussians, resumed.gaussians)
     assert whole.held_out == resumed.held_out
-    (tmp_path / "c").mkdir()
-    other = train(scene, photos, SETTINGS, tmp_path / "c", Progress(), seed=4, threads=1)
+    other = trained("c", Progress(), 1, seed=4)
     assert not torch.equal(other.gaussians.means[:50], whole.gaussians.means[:50])
 
 

@@ -42,6 +42,7 @@ _TITLES = {
     "full_size": "Size of the training images",
     "dense_start": "Start on surfaces found by matching photos",
     "refine_poses": "Camera poses refined",
+    "region_weight": "Trained for the regions",
 }
 """Title of each choice, in an artist's words."""
 
@@ -51,6 +52,7 @@ _EFFECTS = {
     "full_size": '"on" trains at full size up to `max_image_px`; "off" at half of it',
     "refine_poses": '"on" refines them in any case; "off" takes them as given',
     "dense_start": '"on" starts on whatever is found; "off" starts from the sparse points',
+    "region_weight": "1 trains for all that the photos show",
     "growth": '"on" lets the number grow up to `max_gaussians`; "off" adds none',
 }
 

@@ -25,7 +25,7 @@ from ...files import finite_json, read_json, real_path, write_json
 from ...limits import SHORTEST_EDGE
 from ...masks.mask_folder import check_model_file
 from ...names import AUTO, AUTOMATIC_REGIONS, RESULT_FORMATS, file_stem, region_name, region_names
-from ...regions.files import parse_region_file, read_region_body
+from ...regions.files import SHAPE_ENTRIES, parse_region_file, read_region_body
 from ...scene.camera import Similarity
 from ...scene.frames import FileFrame
 from ...settings import (
@@ -244,10 +244,15 @@ def make_job(
 
 
 def _focus_of(training: TrainingSettings, names: Sequence[str], bodies: Mapping[str, Any]) -> str:
-    """Return the setting that tells what the training is for; empty where that is everything."""
+    """Return the setting that tells what the training is for; empty where that is everything.
+
+    Names and the order of regions are left out: they are no reason to train again.
+    """
     if training.region_weight == 1.0 or "all" in names:
         return ""
-    return json.dumps([*bodies.values(), *([AUTO] if AUTO in names else [])], sort_keys=True)
+    shapes = [{name: body[name] for name in SHAPE_ENTRIES} for body in bodies.values()]
+    shapes.sort(key=json.dumps)
+    return json.dumps([*shapes, *([AUTO] if AUTO in names else [])], sort_keys=True)
 
 
 def _makes_masks_of_regions(settings: JobSettings, source: Path, bodies: Mapping[str, Any]) -> bool:

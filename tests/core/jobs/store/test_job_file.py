@@ -159,16 +159,24 @@ def test_regions_that_a_training_favours_stay_its_own(tmp_path: Path) -> None:
     everything = replace(settings, regions=(*settings.regions, "all"))
     assert make_job("wrap", tmp_path, everything).settings.training.focus == ""
     both = make_job("wrap", tmp_path, replace(settings, regions=("auto", *settings.regions)))
-    assert json.loads(both.settings.training.focus) == [body_of("head"), "auto"]
+    shape = {name: body_of("head")[name] for name in ("class_name", "version", "vertices")}
+    assert json.loads(both.settings.training.focus) == [shape, "auto"]
     assert JobFile.from_json(both.to_json()) == both
     trained = make_job("wrap", tmp_path, settings)
-    assert json.loads(trained.settings.training.focus) == [body_of("head")]
+    assert json.loads(trained.settings.training.focus) == [shape]
     other = replace(trained.settings, regions=(foot,))
     meshed = make_job("mesh", tmp_path, other)
     assert meshed.settings.training == trained.settings.training
     assert training_keys("cameras", meshed) == training_keys("cameras", trained)
     again = make_job("wrap", tmp_path, other)
     assert training_keys("cameras", again) != training_keys("cameras", trained)
+    # Names and order are no reason to train again.
+    renamed = region_file(tmp_path / "nose.json", "nose")
+    pairs = [
+        make_job("wrap", tmp_path, replace(settings, regions=regions))
+        for regions in ((head, foot), (foot, renamed))
+    ]
+    assert len({tuple(training_keys("cameras", job)) for job in pairs}) == 1
 
 
 @pytest.mark.parametrize(
