@@ -34,8 +34,7 @@ from gaussian_wrapping_addon.core.settings.job import write_saved_settings
 
 BATCH = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon" / "batch.py"
 
-PARTS_OF_PAPER = ("harmonics", "wrapping")
-DECIDED = tuple(name for name in MODEL_SELECTION if name not in PARTS_OF_PAPER)
+DECIDED = tuple(name for name in MODEL_SELECTION if name not in ("harmonics", "wrapping"))
 
 
 def settings_of(*arguments: str) -> JobSettings:
@@ -60,7 +59,8 @@ def test_without_options_the_preset_stands(name: str) -> None:
         ("--set", "preview_every=2.5", "preview_every_s", 2.5),
         ("--set", "mask_mode=background", "mask_mode", "background"),
         *(("--set", f"{n}=off", n, "off") for n in DECIDED),
-        *(("--set", f"{n}=on", n, "on") for n in MODEL_SELECTION),
+        *(("--set", f"{n}=on", n, "on") for n in MODEL_SELECTION if n != "harmonics"),
+        ("--set", "harmonics=off", "harmonics", "off"),
     ],
 )
 def test_an_option_changes_its_setting_alone(
@@ -413,11 +413,11 @@ def test_export_asks_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", PARTS_OF_PAPER)
-def test_parts_that_gain_nothing_are_the_papers_and_off_elsewhere(name: str) -> None:
+@pytest.mark.parametrize(("name", "elsewhere"), [("harmonics", "on"), ("wrapping", "off")])
+def test_parts_that_photos_do_not_decide_on(name: str, elsewhere: str) -> None:
     for word in PRESETS:
         given = getattr(settings_of("--preset", word, "--needs", "auto").training, name)
-        assert given == ("on" if word == "paper" else "off")
+        assert given == ("on" if word == "paper" else elsewhere)
     asked = settings_of("--preset", "paper", "--set", f"{name}=off").training
     assert getattr(asked, name) == "off"
     with pytest.raises(UsageError, match="invalid choice: 'auto'"):

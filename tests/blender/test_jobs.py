@@ -47,7 +47,7 @@ def test_wrap_scene_runs_and_imports(photos: Path, worker: object) -> None:
     assert (job.command, job.source) == ("wrap", str(photos))
     assert (job.settings.preset, job.settings.texture.size_px) == ("draft", 2048)
     assert job.settings.texture.source == "gaussians"
-    assert job.settings.training.iterations == 800
+    assert job.settings.training.iterations == 1500
     wait_for("DONE")
     kinds = sorted(addon.kind_of(o) for o in bpy.context.scene.objects)
     assert kinds == ["camera"] * 4 + ["frame", "mesh", "region"]

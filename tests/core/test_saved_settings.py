@@ -47,7 +47,7 @@ def test_paths_regions_and_the_machine_are_no_part_of_it() -> None:
 def test_a_word_of_an_earlier_version_becomes_the_default(tmp_path: Path) -> None:
     path = written(tmp_path / "a.json", settings={"training.harmonics": "auto"})
     saved = read_saved_settings(path)
-    assert (saved.values, saved.notes) == ({"training.harmonics": "off"}, ())
+    assert (saved.values, saved.notes) == ({"training.harmonics": "on"}, ())
 
 
 @pytest.mark.parametrize(

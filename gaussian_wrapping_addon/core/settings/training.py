@@ -70,7 +70,7 @@ class MethodSettings:
         _SHARE, unit="squared pixels", paper=0.2, since="0.2.0",
     )
     short_run_power: float = _constant(
-        0.4,
+        0.5,
         "Learning rates of n iterations grow with (30000 / n) to this power; 0 leaves them as "
         "published.",
         _SHARE, since="0.2.0",
@@ -235,14 +235,14 @@ def _model_selection(
     )  # fmt: skip
 
 
-def _part_of_paper(*, label: str, tooltip: str, name: str, **more: Any) -> Any:
-    """Declare a part that only Paper has unless asked for, as meshes hardly gain by it or lose.
+def _switch(default: str, *, label: str, tooltip: str, name: str, **more: Any) -> Any:
+    """Declare a part of the model that no photo decides on; the preset Paper has all of them.
 
     Version 0.1.0 decided on it from the photos: job files of then say ``"auto"``. The property in
     the panel has a ``name`` that is not the setting's, which .blend files hold as an enum.
     """
     return setting(
-        "off", check=Choices(SWITCH, earlier=("auto",)), presets={"paper": "on"},
+        default, check=Choices(SWITCH, earlier=("auto",)), presets={"paper": "on"},
         model_selection=True, panel=PanelProperty(label, tooltip, name=name), **more,
     )  # fmt: skip
 
@@ -254,7 +254,7 @@ class TrainingSettings(MethodSettings):
 
     iterations: int = setting(
         3000, help="Training iterations.", check=_COUNT, unit="iterations",
-        presets={"draft": 800, "fine": 4000, "paper": 30_000, "large": 7000},
+        presets={"draft": 1500, "fine": 4000, "paper": 30_000, "large": 7000},
         option=Option("--iterations", "N", "training iterations instead of the preset's", own=True),
         panel=PanelProperty(
             "Iterations", "Steps of the training; 0 takes the preset's number", preset_if_zero=True,
@@ -302,13 +302,14 @@ class TrainingSettings(MethodSettings):
             "--holdout", "N", "hold out each n-th photo for measuring; 0 holds out none", own=True,
         ),
     )
-    harmonics: str = _part_of_paper(
+    harmonics: str = _switch(
+        "on",
         help="View-dependent colour. on: up to degree `sh_degree`; off: degree 0, but a splat that "
         "training starts from keeps what it has.",
         option=Option("--harmonics", help="colour that depends on the direction"),
         label="Reflections",
-        tooltip="Learn colours that change with the viewing direction: for images of the "
-        "Gaussians, meshes hardly gain. The preset Paper always does",
+        tooltip="Learn colours that change with the viewing direction: without them, gloss becomes "
+        "false surfaces",
         name="reflections",
     )
     exposure: str = _model_selection(
@@ -328,7 +329,8 @@ class TrainingSettings(MethodSettings):
         on="Always compare; slower, gives smoother and more accurate surfaces",
         off="Never compare; faster",
     )
-    wrapping: str = _part_of_paper(
+    wrapping: str = _switch(
+        "off",
         help="Orientation of the Gaussians, its loss, and clones of opposite orientation.",
         option=Option("--wrapping", help="orientation, and clones of opposite orientation"),
         label="Orientations",
