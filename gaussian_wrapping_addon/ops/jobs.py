@@ -462,7 +462,7 @@ class GWRAP_OT_train_for_regions(OnRegions, bpy.types.Operator):
     bl_label = "Train for Regions"
     bl_description = (
         "Train again, most of all for what stands in the checked regions, and mesh these; cameras "
-        "are kept"
+        "are kept, masks made of a region are not used"
     )
 
     @classmethod
@@ -476,7 +476,13 @@ class GWRAP_OT_train_for_regions(OnRegions, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         regions = self.regions(context)
-        start_wrap_for(context.scene, regions, worker_choice(context), {})
+        earlier = finished_job(JobFolder(job_folder_of(common_frame(regions))))
+        if earlier.source.lower().endswith(".ply") or earlier.settings.start_splat:
+            raise UsageError(
+                "This result was made of a splat: there is no training that could be for regions.",
+                "Mesh the region instead.",
+            )
+        start_wrap_for(context.scene, regions, worker_choice(context), {"make_masks": "off"})
         self.report({"INFO"}, f"Training for {', '.join(r.name for r in regions)}")
 
 

@@ -10,6 +10,7 @@ from ..limits import MAX_BLOCKS
 from .declaration import (
     CORRELATIONS,
     MASK_MODES,
+    PRESETS,
     SELECTION_MODES,
     SWITCH,
     Check,
@@ -36,13 +37,16 @@ _OF_ITERATIONS = "share of iterations"
 
 
 def _constant(
-    default: Any, help: str, check: Check, *, paper: Any = None, large: Any = None, **more: Any
-) -> Any:
+    default: Any, help: str, check: Check, *, paper: Any = None, large: Any = None,
+    others: Any = None, **more: Any,
+) -> Any:  # fmt: skip
     """Declare a constant of the method.
 
-    ``paper`` and ``large`` are the published value and that of the preset for GPUs, if others.
+    ``paper`` and ``large`` are the published value and that of the preset for GPUs, if others;
+    ``others`` that of all presets but Paper, where jobs of 0.1.0 had the default.
     """
-    values = {"paper": paper, "large": large}
+    values = {name: others for name in PRESETS if name != "paper"}
+    values |= {"paper": paper, "large": others if large is None else large}
     presets = {name: value for name, value in values.items() if value is not None}
     option = Option(metavar="" if isinstance(check, Choices) else "X")
     return setting(default, help=help, check=check, presets=presets, option=option, **more)
@@ -70,10 +74,10 @@ class MethodSettings:
         _SHARE, unit="squared pixels", paper=0.2, since="0.2.0",
     )
     short_run_power: float = _constant(
-        0.5,
+        0.4,
         "Learning rates of n iterations grow with (30000 / n) to this power; 0 leaves them as "
         "published.",
-        _SHARE, since="0.2.0",
+        _SHARE, since="0.2.0", others=0.5,
     )
     lambda_dssim: float = _constant(0.2, "Weight of the D-SSIM term of the colour loss.", _SHARE)
     lambda_depth_normal: float = _constant(0.05, "Weight of the depth-normal loss.", _WEIGHT)
@@ -238,12 +242,14 @@ def _model_selection(
 def _switch(default: str, *, label: str, tooltip: str, name: str, **more: Any) -> Any:
     """Declare a part of the model that no photo decides on; the preset Paper has all of them.
 
-    Version 0.1.0 decided on it from the photos: job files of then say ``"auto"``. The property in
-    the panel has a ``name`` that is not the setting's, which .blend files hold as an enum.
+    Version 0.1.0 decided on it from the photos: its job files say ``"auto"``, which trains without
+    it; saved settings that do take the default. The property in the panel has a ``name`` that is
+    not the setting's, which .blend files hold as an enum.
     """
     return setting(
-        default, check=Choices(SWITCH, earlier=("auto",)), presets={"paper": "on"},
-        model_selection=True, panel=PanelProperty(label, tooltip, name=name), **more,
+        default, check=Choices(SWITCH, earlier=("auto",)),
+        presets={} if default == "on" else {"paper": "on"}, model_selection=True,
+        panel=PanelProperty(label, tooltip, name=name), **more,
     )  # fmt: skip
 
 

@@ -220,8 +220,10 @@ class BlockPlan:
 
         ``part`` names it among those of the plan; ``further`` are the other fields.
         """
-        # Growth ended, or did not, at the size of the coarse photos: each block decides that anew.
-        lasting = tuple(d for d in self.coarse.model_selection if d.name != "growth")
+        # Growth ended, or did not, at the size of the coarse photos: each block decides that anew,
+        # and by its own photos whether it is for the regions.
+        anew = ("growth", "region_weight")
+        lasting = tuple(d for d in self.coarse.model_selection if d.name not in anew)
         return Handover(
             degree=self.coarse.gaussians.sh_degree,
             model_selection=ModelSelection(lasting),

@@ -130,7 +130,7 @@ def favour(
     if focus is None:
         return Favour()
     share = focus.share_of(cameras)
-    through = f"{100.0 * share:.0f} % of the photos' pixels look through the regions"
+    through = f"{100.0 * share:.1f} % of the photos' pixels look through the regions"
     figures = {"share": share}
     reason = ""
     if share == 0.0:

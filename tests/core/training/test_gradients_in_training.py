@@ -46,7 +46,7 @@ SETTINGS = TrainingSettings(
     wrap_rounds=2, multi_view="on", multi_view_pixels=150, multi_view_until=1.0, depth_from=0.1,
     orient_from=0.3, wrap_from=0.5, wrap_until=0.7, degree_every=0.2,
     harmonics="on", wrapping="on", growth="on", exposure="off", refine_poses="off",
-    dense_start="off", short_run_power=0.4,  # at the rates of so few iterations chance decides
+    dense_start="off",
 )  # fmt: skip
 
 GRADIENTS, LOSS = 1e-4, 1e-5

@@ -52,7 +52,7 @@ _EFFECTS = {
     "full_size": '"on" trains at full size up to `max_image_px`; "off" at half of it',
     "refine_poses": '"on" refines them in any case; "off" takes them as given',
     "dense_start": '"on" starts on whatever is found; "off" starts from the sparse points',
-    "region_weight": "1 trains for all that the photos show",
+    "region_weight": "1 trains for all that the photos show, more for regions in them",
     "growth": '"on" lets the number grow up to `max_gaussians`; "off" adds none',
 }
 

@@ -231,8 +231,9 @@ def make_job(
         raise DatasetError(f"The control points {control} do not exist.", "Check the path.")
     training, mask_regions = settings.training, settings.mask_regions
     if command == "wrap":
-        listed = json.dumps(list(bodies.values()), sort_keys=True)
-        training = replace(training, focus=_focus_of(training, names, bodies))
+        shapes = _shapes_of(bodies)
+        training = replace(training, focus=_focus_of(training, names, shapes))
+        listed = json.dumps(shapes, sort_keys=True)
         mask_regions = listed if _makes_masks_of_regions(settings, source, bodies) else ""
     settings = replace(
         settings, training=training, mask_regions=mask_regions,
@@ -243,15 +244,18 @@ def make_job(
     return JobFile(command, str(real_path(source)), settings, bodies, lengths)
 
 
-def _focus_of(training: TrainingSettings, names: Sequence[str], bodies: Mapping[str, Any]) -> str:
-    """Return the setting that tells what the training is for; empty where that is everything.
+def _shapes_of(bodies: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return where regions are, sorted: names and order are no reason to train again."""
+    shapes = [{name: body[name] for name in SHAPE_ENTRIES} for body in bodies.values()]
+    return [json.loads(text) for text in sorted({json.dumps(shape) for shape in shapes})]
 
-    Names and the order of regions are left out: they are no reason to train again.
-    """
+
+def _focus_of(
+    training: TrainingSettings, names: Sequence[str], shapes: Sequence[dict[str, Any]]
+) -> str:
+    """Return the setting that tells what the training is for; empty where that is everything."""
     if training.region_weight == 1.0 or "all" in names:
         return ""
-    shapes = [{name: body[name] for name in SHAPE_ENTRIES} for body in bodies.values()]
-    shapes.sort(key=json.dumps)
     return json.dumps([*shapes, *([AUTO] if AUTO in names else [])], sort_keys=True)
 
 
