@@ -201,22 +201,21 @@ class DenseStart:
 
 
 def dense_start(
-    scene: Scene, photos: PhotoSource, views: Sequence[int], setting: str, progress: Progress, *,
-    side_px: int, max_gaussians: int, sh_degree: int, seed: int, threads: int,
-    focus: Focus | None = None,
+    scene: Scene, photos: PhotoSource, views: Sequence[int], settings: TrainingSettings,
+    progress: Progress, *, max_gaussians: int, seed: int, threads: int, focus: Focus | None = None,
 ) -> DenseStart:  # fmt: skip
     """Match the photos of the training views and return flat Gaussians on the surfaces found.
 
-    The setting ``"auto"`` needs :data:`LEAST_CONFIRMED` of the pixels; ``"on"`` takes what there
-    is. Photos are matched at a longest side of ``side_px``; the start leaves room below
-    ``max_gaussians``, the limit of the growth.
+    The setting ``dense_start`` ``"auto"`` needs :data:`LEAST_CONFIRMED` of the pixels; ``"on"``
+    takes what there is. The start leaves room below ``max_gaussians``, the limit of the growth.
     """
+    sh_degree = settings.sh_degree
     points, colors = _usable(scene)
     maps = estimate_depth_maps(
-        photos, views, points, progress, side_px=side_px, seed=seed, threads=threads
+        photos, views, points, progress, side_px=settings.match_px, seed=seed, threads=threads
     )  # none where there is too little to match
     confirmed = _confirmed_share(maps)
-    decision = _decision(setting, confirmed, len(maps))
+    decision = _decision(settings.dense_start, confirmed, len(maps))
     if decision.chosen != "on":
         return DenseStart(None, {}, decision)
     maps = fill_plain_parts(maps, points, progress, seed=seed)
@@ -345,9 +344,8 @@ class PointStart:
         decision = Decision.by_settings("dense_start", "off")
         if settings.dense_start != "off":
             start = dense_start(
-                scene, self.photos, self.views, settings.dense_start, progress.span(0.0, 0.0),
-                side_px=settings.match_px, max_gaussians=self.max_gaussians,
-                sh_degree=settings.sh_degree, seed=self.seed, threads=self.threads,
+                scene, self.photos, self.views, settings, progress.span(0.0, 0.0),
+                max_gaussians=self.max_gaussians, seed=self.seed, threads=self.threads,
                 focus=self.focus,
             )  # fmt: skip
             if start.gaussians is not None:

@@ -58,10 +58,10 @@ def start(
     focus: Focus | None = None,
 ) -> DenseStart:
     own_scene, own_photos = ball_scene()
+    settings = TrainingSettings(dense_start=setting, match_px=SIDE_PX, sh_degree=1)
     return dense_start(
-        scene or own_scene, photos or own_photos, FEW, setting, Progress(),
-        side_px=SIDE_PX, max_gaussians=max_gaussians, sh_degree=1, seed=seed, threads=1,
-        focus=focus,
+        scene or own_scene, photos or own_photos, FEW, settings, Progress(),
+        max_gaussians=max_gaussians, seed=seed, threads=1, focus=focus,
     )  # fmt: skip
 
 
