@@ -147,6 +147,7 @@ def kept_of(report: Mapping[str, Any]) -> dict[str, Any]:
         "gaussians": training["gaussians"],
         "decisions": {d["name"]: d["chosen"] for d in training["decisions"]},
         "mesh_psnr": rendered.get("psnr"),
+        "mesh_exposed_psnr": rendered.get("exposed_psnr"),
         "mesh_ssim": rendered.get("ssim"),
         "covered": rendered.get("covered"),
         "faces": statistics["faces"],
@@ -181,6 +182,7 @@ def _row(record: Mapping[str, Any]) -> Row:
         "held out dB": shown(record["held_out_psnr"], 2),
         "SSIM": shown(record["held_out_ssim"], 3),
         "textured mesh dB": shown(record["mesh_psnr"], 2),
+        "in their exposures": shown(record.get("mesh_exposed_psnr"), 2),
         "SSIM, mesh": shown(record["mesh_ssim"], 3),
         "of the photo, %": shown(100.0 * (record["covered"] or 0.0), 0),
         "texels seen, %": shown(100.0 * record["coverage"], 0),
@@ -204,7 +206,8 @@ def write_document(folder: Path, root: Path = RECORDS) -> Path | None:
         f"{'; '.join(sorted({r['versions'] for r in records}))}. Load average before a run: "
         f"{min(loads, default=0.0):.1f} to {max(loads, default=0.0):.1f}. Automatic region and "
         "settings, seed 0. Held out: every eighth photo, whole, rendered from the Gaussians. "
-        "Textured mesh: what of these photos it covers, baked without them."
+        "Textured mesh: what of these photos it covers, baked without them; where exposures are "
+        "modelled, in that of each photo as well, as the Gaussians are measured."
     )
     table = table_of("Photo sets", [_row(record) for record in records])
     lines = [origin, "", *reading("photo-sets"), table.markdown()]

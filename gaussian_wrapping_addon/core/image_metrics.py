@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""PSNR, SSIM and LPIPS of images."""
+"""PSNR, SSIM and LPIPS of images, and a render brought to the exposure of a photo."""
 
 from __future__ import annotations
 
@@ -426,6 +426,91 @@ def compare(
         windows,
         gradient.reshape(image.shape) if weights else None,
     )
+
+
+# -- Exposure of a photo that nobody trained, fitted so that a render can be compared with it ------
+
+
+MAX_LOG_GAIN = 1.5
+"""Bound of the log gains; larger ones stem from photos without content, not from exposure."""
+FIT_ROUNDS = 8
+FIT_PRIOR_SQ = 0.02**2
+"""Weight of the prior on a fitted gain of 1, as a variance of display values: a photo of uniform
+colour does not separate gain and offset."""
+FIT_SCALE = 0.05
+"""Errors beyond this display value have decreasing weight."""
+FIT_DARKEST, FIT_BRIGHTEST = 2.5 / 255, 252.5 / 255
+"""Values of the photo outside this range may be clipped and are ignored."""
+MIN_FIT_PIXELS = 64
+
+
+def fit_exposure(
+    render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return gain and offset (3,) float64 that fit a render to a photo.
+
+    ``photo ~ gain render + offset`` for each channel, by least squares in closed form, reweighted
+    with ``1 / max(|error|, 0.05)`` (Huber), with a weak prior :data:`FIT_PRIOR_SQ` on a gain of 1;
+    1 and 0 for a channel with fewer than :data:`MIN_FIT_PIXELS` usable pixels. For photos whose
+    exposure was not trained. Metrics on the fitted pixels are too optimistic; report those of
+    :func:`corrected_for_measuring`.
+
+    Parameters
+    ----------
+    render : (h, w, 3) floats
+    photo : (h, w, 3) uint8, or floats in [0, 1]
+    mask : (h, w) bool, optional
+        Pixels to use.
+    """
+    x, y = np.asarray(render, np.float64), np.asarray(photo)
+    y = y / 255.0 if y.dtype == np.uint8 else y.astype(np.float64)
+    gain, offset = np.ones(3), np.zeros(3)
+    for channel in range(3):
+        value = y[..., channel]
+        usable = (value >= FIT_DARKEST) & (value <= FIT_BRIGHTEST) & np.isfinite(x[..., channel])
+        if mask is not None:
+            usable &= np.asarray(mask, np.bool_)
+        if np.count_nonzero(usable) >= MIN_FIT_PIXELS:
+            gain[channel], offset[channel] = _fit(x[..., channel][usable], value[usable])
+    return gain, offset
+
+
+def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    weight = np.ones(len(x))
+    gain = offset = 0.0
+    for _ in range(FIT_ROUNDS):
+        total = weight.sum()
+        mean_x, mean_y = float(weight @ x / total), float(weight @ y / total)
+        variance = float(weight @ (x - mean_x) ** 2 / total)
+        covariance = float(weight @ ((x - mean_x) * (y - mean_y)) / total)
+        gain = (covariance + FIT_PRIOR_SQ) / (variance + FIT_PRIOR_SQ)
+        gain = min(max(gain, math.exp(-MAX_LOG_GAIN)), math.exp(MAX_LOG_GAIN))
+        offset = mean_y - gain * mean_x
+        weight = 1.0 / np.maximum(np.abs(gain * x + offset - y), FIT_SCALE)
+    return gain, offset
+
+
+def corrected_for_measuring(
+    render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the render in the photo's exposure, each half corrected by a fit to the other half.
+
+    The exposure of a held-out photo was never trained. As each half of the image (left, right) is
+    corrected by the fit to the other, metrics of the whole image measure how well the scene is
+    reconstructed and not how well six numbers fit. They must be named as such: "PSNR after an
+    exposure fitted crosswise on the image's halves".
+
+    Images are as for :func:`fit_exposure`, the result is (h, w, 3) float32 in [0, 1]. A half whose
+    other half has too few pixels is not corrected.
+    """
+    middle = np.shape(render)[1] // 2
+    halves = (slice(None, middle), slice(middle, None))
+    result = np.array(render, np.float64)
+    for half, other in (halves, halves[::-1]):
+        part = None if mask is None else mask[:, other]
+        gain, offset = fit_exposure(render[:, other], photo[:, other], part)
+        result[:, half] = gain * result[:, half] + offset
+    return np.clip(result, 0.0, 1.0).astype(np.float32)
 
 
 # -- LPIPS, a learned perceptual distance between images, if its package is installed -------------

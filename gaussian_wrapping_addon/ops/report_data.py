@@ -95,7 +95,8 @@ def figures_of_report(report: Any) -> dict[str, Any]:
     ``memory_bytes``, ``device``, ``device_reason``, ``stages`` (pairs of name and seconds),
     ``decisions`` (name, choice and setting), ``warnings`` (texts), and ``regions``: for each name
     ``faces``, ``vertices``, ``closed``, ``coverage``, ``mesh_psnr`` (dB, where the mesh covers the
-    photos), ``uncovered`` (share of the photos) and ``whole_psnr`` (dB, uncovered pixels black).
+    photos), ``exposed_psnr`` (dB, the same in each photo's exposure), ``uncovered`` (share of the
+    photos) and ``whole_psnr`` (dB, uncovered pixels black).
     """
     if not isinstance(report, dict) or not report:
         return {}
@@ -139,6 +140,7 @@ def _rows_of_region(region: Any) -> dict[str, Any]:
         vertices=statistics.get("vertices"),
         coverage=part(region, "texture").get("coverage"),
         mesh_psnr=part(region, "mesh_rendering").get("psnr"),
+        exposed_psnr=part(region, "mesh_rendering").get("exposed_psnr"),
         uncovered=part(region, "mesh_rendering").get("uncovered"),
         whole_psnr=part(region, "mesh_rendering").get("whole_psnr"),
     )
@@ -212,12 +214,15 @@ def _decision(name: str, chosen: str, setting: str) -> Row:
 def _region_rows(region: dict[str, Any]) -> tuple[Row, ...]:
     closed = region.get("closed")
     no = "Open by request" if region.get("open_by_request") else "No"
-    rows = (
+    rows: tuple[Row, ...] = (
         ("Faces", number(region.get("faces"))),
         ("Closed", ("Yes" if closed else no) if isinstance(closed, bool) else NOT_MEASURED),
         ("Texture Coverage", percent(region.get("coverage"))),
         ("Textured Mesh PSNR", number(region.get("mesh_psnr"), "dB", digits=1)),
     )
+    exposed = measured(region.get("exposed_psnr"))
+    if exposed is not None:
+        rows = (*rows, ("In Each Photo's Exposure", number(exposed, "dB", digits=1)))
     uncovered = measured(region.get("uncovered"))
     if uncovered is None:  # version 0.1.0 did not measure it
         return rows

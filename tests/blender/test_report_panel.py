@@ -52,7 +52,9 @@ def test_without_a_report(tmp_path: Path) -> None:
 
 
 def test_full_report(tmp_path: Path) -> None:
-    layout = show(tmp_path / "job", full_report())
+    report = full_report()
+    report["regions"][REGION]["mesh_rendering"]["exposed_psnr"] = 26.5
+    layout = show(tmp_path / "job", report)
     found = rows(layout)
     for name, value in (
         ("Time of Last Job", "3 min 22 s"),
@@ -68,6 +70,7 @@ def test_full_report(tmp_path: Path) -> None:
         ("Closed", "No"),
         ("Texture Coverage", "25.0 %"),
         ("Textured Mesh PSNR", "20.0 dB"),
+        ("In Each Photo's Exposure", "26.5 dB"),
         ("Photo Not Covered", "25.0 %"),
         ("PSNR, That as Black", "8.0 dB"),
     ):

@@ -16,6 +16,7 @@ from ..image_metrics import (
     PSNR_CAP_DB,
     Lpips,
     ViewScores,
+    corrected_for_measuring,
     has_windows,
     lpips_ready,
     psnr,
@@ -188,12 +189,17 @@ class MeshView:
     covers wholly."""
     uncovered: float  # share of the candidate pixels in which no ray meets a face
     whole_psnr: float  # PSNR over all candidate pixels, black where no face covers them, dB
+    exposed_psnr: float | None = None
+    """PSNR, dB, of the rendering brought to the photo's exposure
+    (:func:`~.image_metrics.corrected_for_measuring`), as held-out photos are measured where
+    exposures are modelled; ``None`` where it was not asked for."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values; ``lpips`` only if measured."""
+        """Return plain JSON values; ``lpips`` and ``exposed_psnr`` only if measured."""
+        exposed = {} if self.exposed_psnr is None else {"exposed_psnr": self.exposed_psnr}
         return {
             "name": self.name, **self.scores.to_json(), "covered": self.covered,
-            "uncovered": self.uncovered, "whole_psnr": self.whole_psnr,
+            "uncovered": self.uncovered, "whole_psnr": self.whole_psnr, **exposed,
         }  # fmt: skip
 
 
@@ -215,7 +221,7 @@ class MeshRenderingScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; unmeasured values are absent, and no value is infinite."""
-        names = ("psnr", "ssim", "lpips", "covered", "uncovered", "whole_psnr")
+        names = ("psnr", "ssim", "lpips", "covered", "uncovered", "whole_psnr", "exposed_psnr")
         means = {name: self.mean(name) for name in names}
         values: dict[str, Any] = {
             "views": [view.to_json() for view in self.views],
@@ -232,6 +238,7 @@ def render_views(
     textured: TexturedMesh, cameras: Sequence[Camera], images: Sequence[np.ndarray], *,
     masks: Sequence[np.ndarray] | None = None, counted: Sequence[np.ndarray | None] | None = None,
     lpips: Lpips | None = None, threads: int = 0, on_view: OnView | None = None,
+    exposed: bool = False,
 ) -> MeshRenderingScore:  # fmt: skip
     """Render the mesh from each camera and compare with its photo.
 
@@ -256,6 +263,8 @@ def render_views(
         0 uses every core; the result does not depend on it, except for the last digits of LPIPS.
     on_view : callable, optional
         Called with name, photo and rendering of each view compared.
+    exposed : bool
+        Measure PSNR in the photos' exposures as well, whose own the texture does not have.
 
     Raises
     ------
@@ -288,7 +297,11 @@ def render_views(
         covered = np.count_nonzero(view.covered & candidates) / count
         uncovered = np.count_nonzero((view.coverage == 0.0) & candidates) / count
         whole = min(psnr(view.on_black(), photo, candidates), PSNR_CAP_DB)
-        views.append(MeshView(camera.name, scores, covered, uncovered, whole))
+        of_photo = None
+        if exposed:
+            corrected = corrected_for_measuring(view.image / np.float32(255), photo, judged)
+            of_photo = min(psnr(corrected, photo, judged), PSNR_CAP_DB)
+        views.append(MeshView(camera.name, scores, covered, uncovered, whole, of_photo))
         if on_view is not None:
             on_view(camera.name, photo, view.image)
     pixels = "covered" if masks is None else "mask"

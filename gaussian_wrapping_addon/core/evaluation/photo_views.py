@@ -171,7 +171,8 @@ NOTE_GAUSSIANS = (
 
 def compare_with_photos(
     textured: TexturedMesh, scene: Scene, photos: PhotoSource, held_out: Collection[str],
-    folder: Path, progress: Progress, *, from_gaussians: bool = False, threads: int = 0,
+    folder: Path, progress: Progress, *, from_gaussians: bool = False, exposed: bool = False,
+    threads: int = 0,
 ) -> dict[str, Any]:  # fmt: skip
     """Evaluate mesh-based rendering over covered pixels, and write some of the comparisons.
 
@@ -187,6 +188,8 @@ def compare_with_photos(
         Where ``comparison-1.jpg`` and so on are written: photo left, rendering right.
     from_gaussians : bool
         The texture has no colours of photos, so no photo has to be left out.
+    exposed : bool
+        The photos differ in exposure: measure in that of each photo as well.
     threads : int
         0 uses every core.
 
@@ -234,7 +237,7 @@ def compare_with_photos(
     shown: list[tuple[np.ndarray, np.ndarray]] = []
     lpips, reason = lpips_if_ready()
     score = render_views(
-        textured, cameras, images, counted=counted, lpips=lpips, threads=threads,
+        textured, cameras, images, counted=counted, lpips=lpips, threads=threads, exposed=exposed,
         on_view=lambda name, photo, image: shown.append((photo, image)),
     )  # fmt: skip
     values = score.to_json()

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..image_metrics import FIT_BRIGHTEST, FIT_DARKEST
 from ..scene.scene import PhotoSource, Scene
 from ..settings import TrainingSettings
 from .background import pixels_of
-from .exposure import FIT_BRIGHTEST, FIT_DARKEST, SRGB_PEDESTAL, Exposure
+from .exposure import SRGB_PEDESTAL, Exposure
 from .model_selection import Decision, ModelSelection, decide, select_multi_view
 
 # -- Detect, before training, whether the photos differ in exposure -------------------------------

@@ -18,14 +18,13 @@ import numpy as np
 from ..files import write_bytes
 from ..gaussians.model import OrientedGaussians
 from ..gaussians.preview_points import POINTS_FILE, points_file, preview_points
-from ..image_metrics import lpips_if_ready, psnr, score_images
+from ..image_metrics import corrected_for_measuring, lpips_if_ready, psnr, score_images
 from ..progress import Progress
 from ..render.projection import RawArrays
 from ..render.types import Renderer, RenderOptions
 from ..render.view_renderer import ViewRenderer
 from ..scene.scene import PhotoSource, evenly_spaced
 from ..settings import TrainingSettings
-from .exposure import corrected_for_measuring
 from .focus import Focus
 from .state import HeldOutMetrics
 
@@ -73,7 +72,7 @@ def measure_held_out(
         Renderer to reuse; not one whose last view still awaits its backward pass.
     exposed : bool
         Whether exposures are modelled: renders are brought to those of the photos before they are
-        measured (:func:`~.exposure.corrected_for_measuring`).
+        measured (:func:`~.image_metrics.corrected_for_measuring`).
     """
     renderer = renderer or ViewRenderer()
     raw = RawArrays.from_gaussians(gaussians)

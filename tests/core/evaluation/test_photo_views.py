@@ -65,6 +65,17 @@ def test_photos_are_chosen_evenly_and_held_out_ones_first(tmp_path: Path) -> Non
     assert json.loads(json.dumps(values, allow_nan=False)) == values
 
 
+def test_a_photo_of_another_exposure_is_also_compared_in_its_own(tmp_path: Path) -> None:
+    photos = wall_photos(5)
+    plain = compared(photos, {"2.jpg"}, tmp_path, exposed=True)
+    photos.images[2] = np.clip(0.7 * photos.images[2] + 12.0, 0, 255).astype(np.uint8)
+    dark = compared(photos, {"2.jpg"}, tmp_path, exposed=True)
+    assert dark["psnr"] < 25.0 < 35.0 < dark["exposed_psnr"]
+    assert dark["exposed_psnr"] == dark["views"][0]["exposed_psnr"]
+    assert plain["exposed_psnr"] == pytest.approx(plain["psnr"], abs=1.0)
+    assert "exposed_psnr" not in compared(photos, {"2.jpg"}, tmp_path)
+
+
 def test_a_held_out_photo_is_judged_by_a_texture_without_it(tmp_path: Path) -> None:
     """The texture of the file is kept out of it, and so is every photo that was held out."""
     photos = wall_photos(5)

@@ -7,20 +7,22 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.image_metrics import psnr
+from gaussian_wrapping_addon.core.image_metrics import (
+    MAX_LOG_GAIN,
+    corrected_for_measuring,
+    fit_exposure,
+    psnr,
+)
 from gaussian_wrapping_addon.core.resampling import as_unit_floats as as_floats
 from gaussian_wrapping_addon.core.training.exposure import (
     BETAS,
     LARGEST_RATE,
     LAST_SHARE,
-    MAX_LOG_GAIN,
     REFERENCE_RATE,
     SRGB_PEDESTAL,
     Exposure,
     PhotoAdam,
-    corrected_for_measuring,
     exposure_rate,
-    fit_exposure,
     photo_rate,
 )
 

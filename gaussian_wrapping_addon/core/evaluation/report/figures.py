@@ -145,7 +145,10 @@ _SHOWN_ELSEWHERE = {
 }  # fmt: skip
 
 _NAMES = {
-    "dB": ("psnr", "held_out_psnr", "held_out_region_psnr", "region_psnr", "whole_psnr"),
+    "dB": (
+        "psnr", "held_out_psnr", "held_out_region_psnr", "region_psnr", "whole_psnr",
+        "exposed_psnr",
+    ),
     "1 is identical": ("ssim", "held_out_ssim"),
     "0 is identical": ("lpips", "held_out_lpips"),
     "s": ("seconds_training", "wall_seconds", "mesh_seconds", "seconds_low", "seconds_high"),

@@ -268,23 +268,31 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
         return [unknown, *note_lines(rendering)]
     perceptual = any(measured(view.get("lpips")) is not None for view in views)
     counted = any(measured(view.get("uncovered")) is not None for view in (*views, rendering))
+    exposed = any(measured(view.get("exposed_psnr")) is not None for view in views)
     where = {
         "mask": "Only pixels inside the photos' masks are compared.",
         "covered": "PSNR and SSIM are over the pixels that the mesh covers wholly.",
     }.get(str(rendering.get("pixels")), "")
-    rows = [_view_row(escaped_or(view.get("name")), view, counted, perceptual) for view in views]
-    rows.append(_view_row("**mean**", rendering, counted, perceptual))
+    shown = counted, exposed, perceptual
+    rows = [_view_row(escaped_or(view.get("name")), view, *shown) for view in views]
+    rows.append(_view_row("**mean**", rendering, *shown))
     header = ["photo", "PSNR", "SSIM (1 is identical)", "covered share of the photo"]
     header += ["share that no face covers", "PSNR, uncovered pixels black"] * counted
+    header += ["PSNR in the photo's exposure"] * exposed
     trained = {
         "True": "The Gaussians were not trained on these photos.",
         "False": "The Gaussians were trained on these photos.",
     }.get(str(rendering.get("held_out")), "")
     if counted:
         where += " The last PSNR counts every pixel, black where no face covers it."
+    if exposed:
+        where += (
+            " The texture has one exposure, each photo its own: in the photo's, each half of the "
+            "rendering is corrected by a fit to the other half, as for the Gaussians."
+        )
     intro = ("The textured mesh, unlit, rendered from the cameras of the photos.", where, trained)
     header += ["LPIPS (0 is identical)"] * perceptual
-    align = "lrrr" + "rr" * counted + "r" * perceptual
+    align = "lrrr" + "rr" * counted + "r" * exposed + "r" * perceptual
     lines = [" ".join(filter(None, intro)), "", *table(header, rows, align)]
     left_out = measured(rendering.get("left_out"))
     if left_out:
@@ -292,12 +300,16 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
     return lines + note_lines(rendering)
 
 
-def _view_row(name: str, view: dict[str, Any], counted: bool, perceptual: bool) -> list[str]:
+def _view_row(
+    name: str, view: dict[str, Any], counted: bool, exposed: bool, perceptual: bool
+) -> list[str]:
     covered = "" if "views" in view and "covered" not in view else percent(view.get("covered"))
     psnr, ssim = number(view.get("psnr"), "dB", digits=2), number(view.get("ssim"), digits=4)
     row = [name, psnr, ssim, covered]
     if counted:
         row += [percent(view.get("uncovered")), number(view.get("whole_psnr"), "dB", digits=2)]
+    if exposed:
+        row += [number(view.get("exposed_psnr"), "dB", digits=2)]
     return [*row, number(view.get("lpips"), digits=4)] if perceptual else row
 
 

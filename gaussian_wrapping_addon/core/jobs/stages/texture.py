@@ -94,6 +94,7 @@ def run_texture(
         rendering = compare_with_photos(
             textured, scene, photos, held_out, stage_folder, progress.span(0.92, 0.97),
             from_gaussians=texture.source == "gaussians", threads=threads,
+            exposed=bool(trained.done.get("held_out_exposure_fitted")),
         )  # fmt: skip
         progress.update(0.97, "rendering the preview")
         write_preview(textured, scene, photos, stage_folder / "preview.png", threads=threads)

@@ -186,6 +186,17 @@ def test_uncovered_pixels_are_told_where_they_were_measured(tmp_path: Path) -> N
         assert made_up not in text
 
 
+def test_the_mesh_in_the_exposure_of_each_photo_is_told(tmp_path: Path) -> None:
+    region = full_region()
+    for figures in (region["mesh_rendering"], *region["mesh_rendering"]["views"]):
+        figures["exposed_psnr"] = 26.5
+    report, text = write(tmp_path, full_summary(), {REGION: region})
+    told = "PSNR 20.00 dB, 26.50 dB in the exposure of each photo, where it covers the photos"
+    assert any(told in line for line in headline(report))
+    assert "26.5 dB in the exposure of each photo" in text
+    assert "| 62.5 % | 25.0 % | 8.00 dB | 26.50 dB |" in text
+
+
 @pytest.mark.parametrize("perceptual", [False, True])
 def test_tables_are_well_formed_with_perceptual_figures_or_without(
     tmp_path: Path, perceptual: bool
