@@ -18,7 +18,13 @@ import numpy as np
 from ..files import write_bytes
 from ..gaussians.model import OrientedGaussians
 from ..gaussians.preview_points import POINTS_FILE, points_file, preview_points
-from ..image_metrics import corrected_for_measuring, lpips_if_ready, psnr, score_images
+from ..image_metrics import (
+    corrected_for_measuring,
+    fit_exposure,
+    lpips_if_ready,
+    psnr,
+    score_images,
+)
 from ..progress import Progress
 from ..render.projection import RawArrays
 from ..render.types import Renderer, RenderOptions
@@ -159,10 +165,12 @@ class LiveView:
     def _write(self, gaussians: OrientedGaussians, exposed: bool) -> None:
         divisor = divisor_for(self._photos, self._shown_view, (PREVIEW_PX - GAP_PX) // 2)
         raw = RawArrays.from_gaussians(gaussians)
-        image = _rendered(
-            self.renderer, raw, self._photos, self._shown_view, divisor, self._threads, exposed
-        )
-        picture = side_by_side(self._photos.photo(self._shown_view, divisor), image)
+        view, photo = self._shown_view, self._photos.photo(self._shown_view, divisor)
+        image = _rendered(self.renderer, raw, self._photos, view, divisor, self._threads, False)
+        if exposed:  # one for the whole photo: the halves' own, for measuring, would leave a seam
+            gain, offset = fit_exposure(image, photo, self._photos.mask(view, divisor))
+            image = gain * image + offset
+        picture = side_by_side(photo, image)
         try:
             write_bytes(self._folder / PREVIEW_FILE, png(picture))
             write_bytes(self._folder / PIXELS_FILE, npy(picture))

@@ -114,6 +114,28 @@ def test_a_correction_is_applied_before_measuring(monkeypatch: pytest.MonkeyPatc
     assert found == 100.0
 
 
+def test_a_preview_has_one_exposure_and_no_seam(tmp_path: Path) -> None:
+    """Halves that differ are each measured in the other's exposure, but not shown so."""
+    scene, photos = sphere_scene()
+    changed = [photo.copy() for photo in photos.photos]
+    width = changed[0].shape[1]
+    changed[0][:, : width // 2] //= 3
+    gaussians = sphere_gaussians(200)
+    live = LiveView(
+        PhotosInMemory(scene, changed), [0], tmp_path, SETTINGS, 1,
+        clock=iter([0.0, 10.0, 11.0]).__next__,
+    )  # fmt: skip
+    live.update(gaussians, 1, exposed=True)
+    shown = np.load(tmp_path / PIXELS_FILE, allow_pickle=False)[:, -width:] / 255.0
+    options = RenderOptions(depth=False)
+    image = render_reference(gaussians, photos.camera(0), options).color.numpy()
+    inside = (shown > 0.01) & (shown < 0.99)
+    for channel in range(3):
+        part = inside[..., channel]
+        line = np.polynomial.Polynomial.fit(image[part, channel], shown[part, channel], 1)
+        assert np.abs(line(image[part, channel]) - shown[part, channel]).max() < 0.01
+
+
 def test_looking_changes_no_gaussian(tmp_path: Path) -> None:
     _, photos = sphere_scene()
     gaussians = sphere_gaussians(60)

@@ -80,7 +80,7 @@ def test_every_barrier_of_the_tiles_is_needed(tmp_path: Path, kernel: str) -> No
     text = cuda_source()
     begin = text.index(kernel)
     stop = text.index("\n}\n", begin)
-    barriers = [begin + m.start() for m in re.finditer("__syncthreads", text[begin:stop])]
+    barriers = [begin + m.start() for m in re.finditer(r"__syncthreads\(\);", text[begin:stop])]
     assert len(barriers) == (2 if kernel.startswith("forward") else 3)
     for number, place in enumerate(barriers):
         broken = text[:place] + text[place + len("__syncthreads();") :]
