@@ -107,6 +107,23 @@ def test_no_colour_of_another_chart_comes_in(level: int) -> None:
     np.testing.assert_array_equal(found, palette[face // 2])
 
 
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_a_ramp_is_the_same_ramp_in_each_level(level: int) -> None:
+    side = 64
+    mesh, uvs, image, _ = patches(side)
+    row, column = np.indices((side, side))
+    image = np.repeat((2 * column + row).astype(np.uint8)[..., None], 3, axis=2)
+    pyramid = chart_pyramid(TexturedMesh(mesh, uvs, image), 2, THREADS)
+    face = np.arange(len(mesh.faces)).repeat(50)
+    middle = uvs.reshape(-1, 6, 2).mean(axis=1)[face // 2]
+    corner = np.random.default_rng(6).integers(0, 3, len(face))
+    shares = np.random.default_rng(7).uniform(0.0, 0.5, (len(face), 1))
+    uv = middle + shares * (uvs[face, corner] - middle)  # its four texels are of its chart
+    found = pyramid.sample_level(uv, face, level)[:, 0]
+    wanted = 2 * (uv[:, 0] * side - 0.5) + (1 - uv[:, 1]) * side - 0.5
+    assert np.abs(found - wanted).max() <= 0.5 + 1e-3
+
+
 def test_a_level_is_averaged_within_its_chart() -> None:
     side = 64
     mesh, uvs, image, _ = patches(side)
