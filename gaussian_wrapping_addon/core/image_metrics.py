@@ -495,7 +495,7 @@ def corrected_for_measuring(
 ) -> np.ndarray:
     """Return the render in the photo's exposure, each half corrected by a fit to the other half.
 
-    The exposure of a held-out photo was never trained. As each half of the image (left, right) is
+    The exposure of a held-out photo was never trained. As each half of the pixels (left, right) is
     corrected by the fit to the other, metrics of the whole image measure how well the scene is
     reconstructed and not how well six numbers fit. They must be named as such: "PSNR after an
     exposure fitted crosswise on the image's halves".
@@ -504,6 +504,8 @@ def corrected_for_measuring(
     other half has too few pixels is not corrected.
     """
     middle = np.shape(render)[1] // 2
+    if mask is not None and mask.any():  # what is compared may lie in one half of the image
+        middle = int(np.median(np.nonzero(mask)[1])) + 1
     halves = (slice(None, middle), slice(middle, None))
     result = np.array(render, np.float64)
     for half, other in (halves, halves[::-1]):

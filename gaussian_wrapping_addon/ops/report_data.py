@@ -222,7 +222,7 @@ def _region_rows(region: dict[str, Any]) -> tuple[Row, ...]:
     )
     exposed = measured(region.get("exposed_psnr"))
     if exposed is not None:
-        rows = (*rows, ("In Each Photo's Exposure", number(exposed, "dB", digits=1)))
+        rows = (*rows, ("PSNR, Photo's Exposure", number(exposed, "dB", digits=1)))
     uncovered = measured(region.get("uncovered"))
     if uncovered is None:  # version 0.1.0 did not measure it
         return rows

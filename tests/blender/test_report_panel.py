@@ -70,7 +70,7 @@ def test_full_report(tmp_path: Path) -> None:
         ("Closed", "No"),
         ("Texture Coverage", "25.0 %"),
         ("Textured Mesh PSNR", "20.0 dB"),
-        ("In Each Photo's Exposure", "26.5 dB"),
+        ("PSNR, Photo's Exposure", "26.5 dB"),
         ("Photo Not Covered", "25.0 %"),
         ("PSNR, That as Black", "8.0 dB"),
     ):

@@ -151,7 +151,7 @@ PRIOR_CELL_PX = 4
 RELIABLE_COST, RELIABLE_SOURCES = 0.3, 2
 """The best pixel of each cell that is reliable by these is a corner of the prior's triangles."""
 
-LEAST_SOURCES = 2  # of two photos alone, each has one
+LEAST_SOURCES = 2
 LEAST_CORRELATION = 0.5
 CERTAIN_SOURCES = 4
 """Sources and correlation that confidence needs, and sources from which it no longer rises."""
@@ -208,7 +208,7 @@ def estimate_depth_maps(
     threads = threads or default_threads()
     views = list(views)
     full = [photos.camera(view, 1) for view in views]
-    if len(views) < 2 or len(points) < FEW_POINTS:
+    if len(views) <= LEAST_SOURCES or len(points) < FEW_POINTS:
         return []
     fine = matching_divisor(full, side_px)
     if min(min(camera.width, camera.height) for camera in full) < 2 * fine:
@@ -228,11 +228,6 @@ def estimate_depth_maps(
     return found
 
 
-def _needed_sources(count: int) -> int:
-    """Return how many sources confirm a depth where so many photos are matched."""
-    return min(LEAST_SOURCES, count - 1)
-
-
 class _Matcher:
     """The levels of one matching."""
 
@@ -243,7 +238,6 @@ class _Matcher:
         self.photos, self.views, self.points = photos, views, points
         self.sources, self.ranges, self.seed = sources, ranges, seed
         self.threads, self.progress = threads, progress
-        self.needed = _needed_sources(len(views))
         full = [photos.camera(view, 1) for view in views]
         self.guiding: list[np.ndarray] = []  # of each photo, the sources that tell its depth
         self.guided: list[bool] = []
@@ -255,7 +249,7 @@ class _Matcher:
             lonely = [
                 view
                 for view, near in enumerate(self.guiding)
-                if self.guided[view] and sum(self.guided[k] for k in near) < self.needed
+                if self.guided[view] and sum(self.guided[k] for k in near) < LEAST_SOURCES
             ]
             if not lonely:
                 break
@@ -298,7 +292,7 @@ class _Matcher:
         level.confirm_all()
         guides = []
         for view, shape in enumerate(shapes):
-            known = (_BITS[level.confirmed[view]] >= self.needed)[..., None]
+            known = (_BITS[level.confirmed[view]] >= LEAST_SOURCES)[..., None]
             guide = np.where(known, level.planes_of(view), np.float32(0))
             if halved:
                 guide = finer_planes(guide, shape)
@@ -449,7 +443,7 @@ def _depth_map(
     count = _BITS[level.confirmed[view]]
     floor = 1.0 + TEXTURE_VARIANCE / np.maximum(level.variances[view], 1e-3)
     correlation = np.clip((1.0 - level.costs[view]) * floor, 0.0, 1.0)
-    good = (count >= _needed_sources(len(level.cameras))) & (correlation > LEAST_CORRELATION)
+    good = (count >= LEAST_SOURCES) & (correlation > LEAST_CORRELATION)
     good |= _from_aside(level, view, means) & (level.costs[view] < SINGLE_COST)
     good &= means > 0
     if mask is not None:

@@ -119,14 +119,6 @@ def test_one_source_confirms_from_aside_alone(
         assert (m.confidence[part] <= 0.25).all()
 
 
-def test_two_photos_alone_confirm_each_other() -> None:
-    found = few_maps(ball_scene()[1], views=range(6, 8))
-    assert len(found) == 2
-    assert min((m.confidence > 0).mean() for m in found) > 0.2
-    assert np.median(errors(found)) < 0.005
-    assert (errors(found) < 0.01).mean() > 0.9
-
-
 def test_the_number_of_threads_does_not_matter_and_the_seed_does() -> None:
     photos = ball_scene()[1]
     one, two, other = few_maps(photos), few_maps(photos, threads=2), few_maps(photos, seed=1)
@@ -150,7 +142,7 @@ def test_a_mask_excludes_pixels() -> None:
 
 def test_few_points_few_views_and_tiny_photos_give_nothing() -> None:
     scene, photos = ball_scene()
-    assert few_maps(photos, views=range(1)) == []
+    assert few_maps(photos, views=range(2)) == []
     assert match(photos, FEW, scene.points[:19], Progress(), threads=1) == []
     assert match(photos, FEW, np.zeros((0, 3)), Progress(), threads=1) == []
     views = tuple(dataclasses.replace(v, camera=v.camera.resized(128, 1)) for v in scene.views[:4])

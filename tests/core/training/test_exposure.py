@@ -273,6 +273,11 @@ def test_measuring_fits_one_half_and_corrects_the_other() -> None:
     again = corrected_for_measuring(render, other)
     assert np.array_equal(again[:, :30], corrected[:, :30])
     assert not np.array_equal(again[:, 30:], corrected[:, 30:])
+    # Pixels that lie in one half of the image are parted in their own middle.
+    mask = np.zeros((40, 60), bool)
+    mask[5:35, 35:55] = True
+    corrected = corrected_for_measuring(render, photo, mask)
+    assert psnr(corrected, photo, mask) > psnr(render, photo, mask) + 10
 
 
 def test_exposures_that_are_given_stay() -> None:

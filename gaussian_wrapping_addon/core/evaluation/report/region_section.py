@@ -284,7 +284,7 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
         "False": "The Gaussians were trained on these photos.",
     }.get(str(rendering.get("held_out")), "")
     if counted:
-        where += " The last PSNR counts every pixel, black where no face covers it."
+        where += " The PSNR with uncovered pixels black counts every pixel."
     if exposed:
         where += (
             " The texture has one exposure, each photo its own: in the photo's, each half of the "

@@ -313,14 +313,14 @@ def _mesh_accuracy_sentence(report: dict[str, Any]) -> str:
                 # The Gaussians are measured over whole photos: the two values are not comparable.
                 covered = percent(rendering.get("covered"))
                 views += f", over the pixels the mesh covers: {covered} of the photo"
+            exposed = measured(rendering.get("exposed_psnr"))
+            if exposed is not None:
+                views += f", and {exposed:.1f} dB over them in the exposure of each photo"
             views += _left_out(
                 rendering,
                 "; no face covers {share} of the photo, and with these pixels counted as black it "
                 "is {whole:.1f} dB",
             )
-            exposed = measured(rendering.get("exposed_psnr"))
-            if exposed is not None:
-                views += f"; {exposed:.1f} dB in the exposure of each photo"
             note = rendering.get("note")
             if isinstance(note, str) and note.strip():
                 views += f"; {escaped(note.strip().rstrip('.'))}"
@@ -581,7 +581,7 @@ def headline(report: dict[str, Any]) -> list[str]:
             line += f", textured mesh PSNR {rendered:.2f} dB"
             exposed = measured(rendering.get("exposed_psnr"))
             if exposed is not None:
-                line += f", {exposed:.2f} dB in the exposure of each photo,"
+                line += f" ({exposed:.2f} dB in the exposure of each photo)"
             where = " where it covers the photos" if rendering.get("pixels") == "covered" else ""
             line += _left_out(
                 rendering, where + " ({share} of them uncovered; {whole:.2f} dB with these black)"

@@ -191,9 +191,10 @@ def test_the_mesh_in_the_exposure_of_each_photo_is_told(tmp_path: Path) -> None:
     for figures in (region["mesh_rendering"], *region["mesh_rendering"]["views"]):
         figures["exposed_psnr"] = 26.5
     report, text = write(tmp_path, full_summary(), {REGION: region})
-    told = "PSNR 20.00 dB, 26.50 dB in the exposure of each photo, where it covers the photos"
+    told = "PSNR 20.00 dB (26.50 dB in the exposure of each photo) where it covers the photos"
     assert any(told in line for line in headline(report))
-    assert "26.5 dB in the exposure of each photo" in text
+    assert "62.5 % of the photo, and 26.5 dB over them in the exposure of each photo" in text
+    assert "The PSNR with uncovered pixels black counts every pixel" in text
     assert "| 62.5 % | 25.0 % | 8.00 dB | 26.50 dB |" in text
 
 
