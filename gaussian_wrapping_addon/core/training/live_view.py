@@ -85,23 +85,21 @@ def measure_held_out(
     figures = []
     for view in evenly_spaced(held_out, MEASURED_VIEWS):
         divisor = divisor_for(photos, view, MEASURED_PX)
-        mask = photos.mask(view, divisor)
+        photo, mask = photos.photo(view, divisor), photos.mask(view, divisor)
         if mask is not None and not mask.any():
             continue
-        image = _rendered(renderer, raw, photos, view, divisor, threads, exposed)
-        figures.append(min(psnr(image, photos.photo(view, divisor), mask), BEST_PSNR))
+        image = _rendered(renderer, raw, photos, view, divisor, threads)
+        if exposed:
+            image = corrected_for_measuring(image, photo, mask)
+        figures.append(min(psnr(image, photo, mask), BEST_PSNR))
     return float(np.mean(figures)) if figures else float("nan")
 
 
 def _rendered(
-    renderer: Renderer, raw: RawArrays, photos: PhotoSource, view: int, divisor: int, threads: int,
-    exposed: bool,
-) -> np.ndarray:  # fmt: skip
+    renderer: Renderer, raw: RawArrays, photos: PhotoSource, view: int, divisor: int, threads: int
+) -> np.ndarray:
     options = RenderOptions(depth=False, threads=threads)
-    image = renderer.render(raw, photos.camera(view, divisor), options).color
-    if not exposed:
-        return image
-    return corrected_for_measuring(image, photos.photo(view, divisor), photos.mask(view, divisor))
+    return renderer.render(raw, photos.camera(view, divisor), options).color
 
 
 class LiveView:
@@ -166,7 +164,7 @@ class LiveView:
         divisor = divisor_for(self._photos, self._shown_view, (PREVIEW_PX - GAP_PX) // 2)
         raw = RawArrays.from_gaussians(gaussians)
         view, photo = self._shown_view, self._photos.photo(self._shown_view, divisor)
-        image = _rendered(self.renderer, raw, self._photos, view, divisor, self._threads, False)
+        image = _rendered(self.renderer, raw, self._photos, view, divisor, self._threads)
         if exposed:  # one for the whole photo: the halves' own, for measuring, would leave a seam
             gain, offset = fit_exposure(image, photo, self._photos.mask(view, divisor))
             image = gain * image + offset
@@ -220,11 +218,12 @@ def held_out_metrics(
     raw, renderer = RawArrays.from_gaussians(gaussians), renderer or ViewRenderer()
     for view, name in names.items():
         progress.update(1.0, f"measuring {name}")
-        mask = photos.mask(view, 1)
+        photo, mask = photos.photo(view, 1), photos.mask(view, 1)
         if mask is not None and not mask.any():
             continue
-        image = _rendered(renderer, raw, photos, view, 1, threads, exposed)
-        photo = photos.photo(view, 1)
+        image = _rendered(renderer, raw, photos, view, 1, threads)
+        if exposed:
+            image = corrected_for_measuring(image, photo, mask)
         scores = score_images(image, photo, mask, lpips=lpips, threads=threads)
         of_regions = None
         if focus is not None:

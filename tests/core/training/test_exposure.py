@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.image_metrics import (
-    MAX_LOG_GAIN,
-    corrected_for_measuring,
-    fit_exposure,
-    psnr,
-)
+from gaussian_wrapping_addon.core.image_metrics import MAX_LOG_GAIN
 from gaussian_wrapping_addon.core.resampling import as_unit_floats as as_floats
 from gaussian_wrapping_addon.core.training.exposure import (
     BETAS,
@@ -233,51 +228,6 @@ def test_rates_grow_for_short_runs_and_fall() -> None:
     assert REFERENCE_RATE < middle < LARGEST_RATE
     assert exposure_rate(3000, 3000, 30) == pytest.approx(LAST_SHARE * middle)
     assert exposure_rate(9000, 3000, 30) == pytest.approx(LAST_SHARE * middle)
-
-
-def test_fit_finds_gain_and_offset_beside_outliers_and_masks() -> None:
-    render = textured(2, 40, 60)
-    gain, offset = np.array([0.8, 1.1, 1.3]), np.array([0.05, -0.02, 0.0])
-    photo = gain * render + offset
-    mask = np.ones(render.shape[:2], bool)
-    mask[:10] = False
-    photo[:10] = 0.3  # masked out
-    photo[12:15, 5:30] = 0.9  # something else stands there: 6 % of the pixels
-    found_gain, found_offset = fit_exposure(render, photo, mask)
-    np.testing.assert_allclose(found_gain, gain, atol=0.04)
-    np.testing.assert_allclose(found_offset, offset, atol=0.025)
-    plain_gain, plain_offset = fit_exposure(render[15:], photo[15:])
-    np.testing.assert_allclose(plain_gain, gain, atol=0.03)  # drawn to 1 a little
-    np.testing.assert_allclose(plain_gain * 0.4 + plain_offset, gain * 0.4 + offset, atol=2e-3)
-
-
-def test_fit_of_what_says_nothing_is_neutral() -> None:
-    render = textured(1)
-    for photo in (np.zeros((24, 31, 3), np.uint8), np.full((24, 31, 3), 255, np.uint8)):
-        gain, offset = fit_exposure(render, photo)
-        assert gain.tolist() == [1, 1, 1]
-        assert offset.tolist() == [0, 0, 0]
-    gain, offset = fit_exposure(np.full((24, 31, 3), 0.5), np.full((24, 31, 3), 0.6))
-    np.testing.assert_allclose(gain, 1)
-    np.testing.assert_allclose(offset, 0.1)
-
-
-def test_measuring_fits_one_half_and_corrects_the_other() -> None:
-    render = textured(4, 40, 60)
-    photo = altered(render, np.array([0.8, 1.0, 1.25]))
-    corrected = corrected_for_measuring(render, photo)
-    assert psnr(corrected, photo) > psnr(render, photo) + 10
-    # What a half shows does not change how that half is corrected.
-    other = photo.copy()
-    other[:, :30] = textured(9, 40, 30)
-    again = corrected_for_measuring(render, other)
-    assert np.array_equal(again[:, :30], corrected[:, :30])
-    assert not np.array_equal(again[:, 30:], corrected[:, 30:])
-    # Pixels that lie in one half of the image are parted in their own middle.
-    mask = np.zeros((40, 60), bool)
-    mask[5:35, 35:55] = True
-    corrected = corrected_for_measuring(render, photo, mask)
-    assert psnr(corrected, photo, mask) > psnr(render, photo, mask) + 10
 
 
 def test_exposures_that_are_given_stay() -> None:

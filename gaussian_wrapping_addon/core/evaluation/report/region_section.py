@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -266,51 +266,69 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
     if measured(rendering.get("psnr")) is None and not views:
         unknown = f"How well the textured mesh reproduces photos was {NOT_MEASURED}."
         return [unknown, *note_lines(rendering)]
-    perceptual = any(measured(view.get("lpips")) is not None for view in views)
-    counted = any(measured(view.get("uncovered")) is not None for view in (*views, rendering))
-    exposed = any(measured(view.get("exposed_psnr")) is not None for view in views)
-    where = {
+    columns = [
+        column for column in _COLUMNS
+        if column.if_measured is None
+        or any(measured(view.get(column.if_measured)) is not None for view in (*views, rendering))
+    ]  # fmt: skip
+    named = [*((escaped_or(view.get("name")), view) for view in views), ("**mean**", rendering)]
+    rows = [[name, *(column.value(view) for column in columns)] for name, view in named]
+    pixels = {
         "mask": "Only pixels inside the photos' masks are compared.",
         "covered": "PSNR and SSIM are over the pixels that the mesh covers wholly.",
     }.get(str(rendering.get("pixels")), "")
-    shown = counted, exposed, perceptual
-    rows = [_view_row(escaped_or(view.get("name")), view, *shown) for view in views]
-    rows.append(_view_row("**mean**", rendering, *shown))
-    header = ["photo", "PSNR", "SSIM (1 is identical)", "covered share of the photo"]
-    header += ["share that no face covers", "PSNR, uncovered pixels black"] * counted
-    header += ["PSNR in the photo's exposure"] * exposed
     trained = {
         "True": "The Gaussians were not trained on these photos.",
         "False": "The Gaussians were trained on these photos.",
     }.get(str(rendering.get("held_out")), "")
-    if counted:
-        where += " The PSNR with uncovered pixels black counts every pixel."
-    if exposed:
-        where += (
-            " The texture has one exposure, each photo its own: in the photo's, each half of the "
-            "rendering is corrected by a fit to the other half, as for the Gaussians."
-        )
-    intro = ("The textured mesh, unlit, rendered from the cameras of the photos.", where, trained)
-    header += ["LPIPS (0 is identical)"] * perceptual
-    align = "lrrr" + "rr" * counted + "r" * exposed + "r" * perceptual
-    lines = [" ".join(filter(None, intro)), "", *table(header, rows, align)]
+    intro = ["The textured mesh, unlit, rendered from the cameras of the photos.", pixels]
+    intro += [*(column.explained for column in columns), trained]
+    header = ["photo", *(column.title for column in columns)]
+    lines = [" ".join(filter(None, intro)), "", *table(header, rows, "l" + "r" * len(columns))]
     left_out = measured(rendering.get("left_out"))
     if left_out:
         lines += ["", f"{plural(int(left_out), 'photo')} could not be compared: no valid pixel."]
     return lines + note_lines(rendering)
 
 
-def _view_row(
-    name: str, view: dict[str, Any], counted: bool, exposed: bool, perceptual: bool
-) -> list[str]:
-    covered = "" if "views" in view and "covered" not in view else percent(view.get("covered"))
-    psnr, ssim = number(view.get("psnr"), "dB", digits=2), number(view.get("ssim"), digits=4)
-    row = [name, psnr, ssim, covered]
-    if counted:
-        row += [percent(view.get("uncovered")), number(view.get("whole_psnr"), "dB", digits=2)]
-    if exposed:
-        row += [number(view.get("exposed_psnr"), "dB", digits=2)]
-    return [*row, number(view.get("lpips"), digits=4)] if perceptual else row
+class _Column(NamedTuple):
+    """A column of the comparisons with photos."""
+
+    title: str
+    value: Callable[[dict[str, Any]], str]
+    if_measured: str | None = None
+    """Shown only if some view has this figure."""
+    explained: str = ""
+
+
+def _psnr(key: str) -> Callable[[dict[str, Any]], str]:
+    return lambda view: number(view.get(key), "dB", digits=2)
+
+
+def _covered(view: dict[str, Any]) -> str:
+    return "" if "views" in view and "covered" not in view else percent(view.get("covered"))
+
+
+_COLUMNS = (
+    _Column("PSNR", _psnr("psnr")),
+    _Column("SSIM (1 is identical)", lambda view: number(view.get("ssim"), digits=4)),
+    _Column("covered share of the photo", _covered),
+    _Column(
+        "share that no face covers", lambda view: percent(view.get("uncovered")), "uncovered"
+    ),
+    _Column(
+        "PSNR, uncovered pixels black", _psnr("whole_psnr"), "uncovered",
+        "The PSNR with uncovered pixels black counts every pixel.",
+    ),
+    _Column(
+        "PSNR in the photo's exposure", _psnr("exposed_psnr"), "exposed_psnr",
+        "The texture has one exposure, each photo its own: in the photo's, each half of the "
+        "rendering is corrected by a fit to the other half, as for the Gaussians.",
+    ),
+    _Column(
+        "LPIPS (0 is identical)", lambda view: number(view.get("lpips"), digits=4), "lpips"
+    ),
+)  # fmt: skip
 
 
 def note_lines(figures: dict[str, Any]) -> list[str]:

@@ -183,6 +183,7 @@ def run_bake(
         rendering = compare_with_photos(
             textured, scene, photos, (), files, progress.span(0.93, 1.0),
             from_gaussians=request.texture.source == "gaussians", threads=threads,
+            exposed=bool(trained.done.get("held_out_exposure_fitted")),
         )  # fmt: skip
         figures = {
             "version": BAKE_VERSION, "name": request.name, "vertices": len(textured.mesh.vertices),
