@@ -49,6 +49,7 @@ def steps() -> Iterator[float]:
     yield 1.0
     screenshot("2-running")
     bpy.context.scene.gwrap.show_points = False
+    driving.module("ops.addon").redraw()  # a click does that; an assignment does not
     yield from until(lambda: points._drawing.batch is None, "the points are switched off")
     bpy.context.scene.gwrap.show_points = True
     press(bpy.ops.gwrap.cancel_job)
