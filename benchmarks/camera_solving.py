@@ -440,17 +440,19 @@ PAGE = "camera-solving.md"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make missing runs and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", help="cases; none: write the page alone")
+    parser.add_argument("--only", nargs="*", help="these cases alone")
     parser.add_argument("--data", type=Path, help="folder of the real photo sets")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--again", action="store_true", help="make runs that have a record, too")
+    parser.add_argument("--document", action="store_true", help="make no run, write the page")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     code = code_of_tree()
 
     def wanted(name: str) -> bool:
         is_new = options.again or not (RECORDS / f"{name}.json").is_file()
-        return is_new and (options.only is None or name in options.only)
+        listed = options.only is None or name in options.only
+        return is_new and listed and not options.document
 
     def keep(name: str, figures: dict[str, Any]) -> None:
         write_figures(RECORDS / f"{name}.json", figures, options.threads, code)

@@ -528,7 +528,7 @@ def page(outcomes: list[Outcome], count: int) -> list[str]:
     ]
     lines = [
         f"`{COMMAND} --n {count}`, {' and '.join(dates)}. Machine: {machines}.",
-        f"Code: {', '.join(codes)}.",
+        f"Content of the core (git's tree): {', '.join(codes)}.",
         "",
         f"A small job ({PHOTOS} photos of {WIDTH_PX} x {HEIGHT_PX} pixels with cameras, 1 thread)",
         "goes through all stages by the command line. It is interrupted at a moment drawn from a",

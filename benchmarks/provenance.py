@@ -137,10 +137,9 @@ def age(commits: Iterable[str | None], root: Path = ROOT) -> str:
     """
     named = list(dict.fromkeys(commits))
     nameless = [c for c in named if c in (None, "", UNKNOWN)]
-    last = git("log", "-1", "--format=%h %cs", "--abbrev=10", "HEAD", "--", PACKAGE, root=root)
-    if not last:
+    changed = git("log", "-1", "--format=%h", "HEAD", "--", PACKAGE, root=root)
+    if not changed:
         return f"> {_NAMELESS}" if nameless else ""
-    changed, day = last.split()
     old = [
         c
         for c in named
@@ -150,8 +149,8 @@ def age(commits: Iterable[str | None], root: Path = ROOT) -> str:
     words = []
     if old:
         words.append(
-            f"**Older than the code**: measured at {', '.join(map(str, old))}; the core was last "
-            f"changed at {changed} ({day})."
+            f"**Older than the code**: measured at {', '.join(map(str, old))}; the core was "
+            "changed since."
         )
     if nameless:
         words.append(_NAMELESS)

@@ -261,6 +261,7 @@ def test_set_takes_every_setting_without_an_option() -> None:
     ("words", "message", "hint"),
     [
         ("--set wraping=on", "unknown setting 'wraping', the nearest is wrapping", "--help"),
+        ("--set foo=1", "unknown setting 'foo'; the command settings lists them", "--help"),
         ("--set wrapping", "no value in 'wrapping'; give wrapping=VALUE", "--help"),
         ("--set wrapping=yes", "wrapping: invalid choice: 'yes' .choose from off, on", "--help"),
         ("--set sh_degree=x", "sh_degree: invalid int value: 'x'", "--help"),
@@ -275,6 +276,19 @@ def test_a_wrong_setting_is_refused_with_the_right_one(words: str, message: str,
     assert hint in refused.value.hint
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["wrap", "x", "--out", ""], "--out: an empty path"),
+        (["wrap", "", "--out", "o"], "input: an empty path"),
+        (["mesh", "--out", "o", "--set", "exposure=on"], "exposure is no setting of this command"),
+    ],
+)
+def test_what_a_command_cannot_take_is_refused(words: list[str], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        build_parser().parse_args(words)
+
+
 def test_settings_lists_what_set_takes(caplog: pytest.LogCaptureFixture) -> None:
     parser = build_parser()
     with caplog.at_level("INFO"):
@@ -282,6 +296,10 @@ def test_settings_lists_what_set_takes(caplog: pytest.LogCaptureFixture) -> None
         assert options.run(options) == 0
     words = [message.partition("=")[0] for message in caplog.messages]
     assert words == ["patch_contrast", "patch_rise"]
+    with caplog.at_level("INFO"):
+        options = parser.parse_args(["settings", "edge_length"])
+        assert options.run(options) == 0
+    assert any("see the option --edge-length" in message for message in caplog.messages)
     options = parser.parse_args(["settings", "no such words"])
     with pytest.raises(UsageError, match="No setting has no such words"):
         options.run(options)

@@ -12,14 +12,14 @@ from ..core.errors import EXIT_BAD_DATA, EXIT_DONE, UsageError
 from ..core.jobs.commands.doctor import find_and_diagnose
 from ..core.settings import JobSettings
 from .job_commands import has_bpy, run_in_worker
-from .options import Commands, add_threads
+from .options import Commands, add_threads, given_path
 
 _logger = logging.getLogger("gaussian_wrapping")
 
 
 def add_check(commands: Commands) -> None:
     parser = commands.add_parser("check", help="findings about an input, without starting anything")
-    parser.add_argument("input", type=Path)
+    parser.add_argument("input", type=given_path)
     parser.add_argument(
         "--quick", action="store_true", help="do not decode the photos: no blur, no duplicates"
     )
@@ -84,7 +84,10 @@ def add_evaluate(commands: Commands) -> None:
         "evaluate", help="score a mesh or a job against a ground truth or photos"
     )
     parser.add_argument(
-        "mesh", type=Path, metavar="MESH_OR_JOB", help="PLY, OBJ, GLB, STL or OFF; or a job folder"
+        "mesh",
+        type=given_path,
+        metavar="MESH_OR_JOB",
+        help="PLY, OBJ, GLB, STL or OFF; or a job folder",
     )
     parser.add_argument(
         "--metric", choices=("surface", "mbr"), default="surface",
@@ -92,10 +95,10 @@ def add_evaluate(commands: Commands) -> None:
         "trained on the mesh and compared with photos that were held out",
     )  # fmt: skip
     parser.add_argument(
-        "--truth", type=Path, metavar="PATH", help="mesh, cloud, scene or data set (surface)"
+        "--truth", type=given_path, metavar="PATH", help="mesh, cloud, scene or data set (surface)"
     )
     parser.add_argument(
-        "--test", type=Path, metavar="PATH",
+        "--test", type=given_path, metavar="PATH",
         help="test photos with cameras: COLMAP, transforms, or a folder with cameras.json and "
         "images (mbr; default: the photos that the job held out)",
     )  # fmt: skip
@@ -109,7 +112,9 @@ def add_evaluate(commands: Commands) -> None:
     parser.add_argument("--scan", type=int, help="number of the DTU scan")
     parser.add_argument("--region", help="region of the job, if it has several")
     parser.add_argument(
-        "--cameras", type=Path, help="cameras, and photos, of a mesh file: COLMAP, transforms, job"
+        "--cameras",
+        type=given_path,
+        help="cameras, and photos, of a mesh file: COLMAP, transforms, job",
     )
     parser.add_argument(
         "--thresholds", type=_floats, help="shares of the truth's diagonal, comma separated"
@@ -127,7 +132,7 @@ def add_evaluate(commands: Commands) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of these points")
     add_threads(parser)
     parser.add_argument(
-        "--out", type=Path, metavar="FILE.json", help="write all figures to this file"
+        "--out", type=given_path, metavar="FILE.json", help="write all figures to this file"
     )
     parser.set_defaults(run=_evaluate)
 

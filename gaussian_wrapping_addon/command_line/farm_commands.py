@@ -33,7 +33,7 @@ from ..core.files import real_path
 from ..core.names import SHARED_VARIABLE
 from ..core.settings.declaration import MAX_PROCESSES
 from .job_commands import run_in_worker
-from .options import Commands
+from .options import Commands, given_path
 
 _BATCH = Path(__file__).resolve().parents[1] / "batch.py"
 
@@ -64,7 +64,7 @@ def add_ssh(commands: Any) -> None:
     _add_here(parser)
     parser.add_argument("hosts", nargs="*", metavar="COMPUTER", help="as ssh takes it")
     parser.add_argument(
-        "--hosts", dest="hosts_file", type=Path, metavar="FILE",
+        "--hosts", dest="hosts_file", type=given_path, metavar="FILE",
         help="more of them, one a line: COMPUTER [shared=DIR] [certificates=DIR] [python=PATH] "
         "[batch=PATH] [slots=N]",
     )  # fmt: skip
@@ -174,7 +174,7 @@ def _add_make_certificates(commands: Any) -> None:
     parser = commands.add_parser(
         "make-certificates", help="make the certificates by which computers know each other"
     )
-    parser.add_argument("folder", type=Path, metavar="DIR", help="new folder for them")
+    parser.add_argument("folder", type=given_path, metavar="DIR", help="new folder for them")
     parser.set_defaults(run=_make_certificates)
 
 

@@ -16,7 +16,7 @@ from ..core.files import read_json, real_path
 from ..core.jobs.store.job_folder import NAME, JobFolder, back_up_stale_blend, result_state
 from ..core.names import BLENDER_FORMATS
 from ..core.settings import JobSettings
-from .options import Commands, add_device, add_threads
+from .options import Commands, add_device, add_threads, given_path
 
 if TYPE_CHECKING:
     from ..core.jobs.client import JobClient
@@ -169,7 +169,7 @@ def add_cancel(commands: Commands) -> None:
 
 
 def _add_folder(parser: ArgumentParser) -> None:
-    parser.add_argument("out", type=Path, metavar="DIR", help="job folder of that job")
+    parser.add_argument("out", type=given_path, metavar="DIR", help="job folder of that job")
 
 
 def _status(options: Namespace) -> int:

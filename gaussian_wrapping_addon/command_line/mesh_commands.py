@@ -40,6 +40,7 @@ from .options import (
     add_out,
     add_threads,
     declared_options,
+    given_path,
     given_settings,
     method_settings,
     region_settings,
@@ -119,7 +120,7 @@ def add_bake(commands: Commands) -> None:
     )
     add_out(parser)
     parser.add_argument(
-        "--mesh", type=Path, required=True, metavar="FILE", help="OBJ, PLY, GLB, STL or OFF"
+        "--mesh", type=given_path, required=True, metavar="FILE", help="OBJ, PLY, GLB, STL or OFF"
     )
     parser.add_argument(
         "--name", default="", metavar="NAME", help="folder below DIR/baked (default: as the file)"
@@ -133,10 +134,10 @@ def add_bake(commands: Commands) -> None:
         help="decimate to N faces first; the detail removed becomes a normal map",
     )  # fmt: skip
     parser.add_argument(
-        "--dense", type=Path, metavar="FILE", help="mesh whose detail becomes a normal map"
+        "--dense", type=given_path, metavar="FILE", help="mesh whose detail becomes a normal map"
     )
     parser.add_argument(
-        "--sidecar", type=Path, metavar="FILE.json",
+        "--sidecar", type=given_path, metavar="FILE.json",
         help="sidecar of the exported file that the mesh was made from (default: beside it)",
     )  # fmt: skip
     parser.add_argument(
@@ -202,13 +203,15 @@ def add_export(commands: Commands) -> None:
     parser = commands.add_parser(
         "export", help="export meshes of a finished job for other programs"
     )
-    parser.add_argument("job", type=Path, metavar="JOB", help="job folder, or its result folder")
+    parser.add_argument(
+        "job", type=given_path, metavar="JOB", help="job folder, or its result folder"
+    )
     parser.add_argument(
         "--format", default="glb",
         help=f"comma separated, of {','.join(EXPORT_FORMATS)}; "
         f"{' and '.join(BLENDER_FORMATS)} need bpy or Blender",
     )  # fmt: skip
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("--out", type=given_path, required=True, metavar="FOLDER")
     parser.add_argument(
         "--placed", action="store_true",
         help="coordinates as placed in Blender, instead of the input's world",
@@ -270,8 +273,8 @@ def add_convert_region(commands: Commands) -> None:
     parser = commands.add_parser(
         "convert-region", help="convert a region file: JSON, or .rsbox of RealityScan"
     )
-    parser.add_argument("input", type=Path, metavar="FILE")
-    parser.add_argument("output", type=Path, metavar="OUT", help="ends with .json or .rsbox")
+    parser.add_argument("input", type=given_path, metavar="FILE")
+    parser.add_argument("output", type=given_path, metavar="OUT", help="ends with .json or .rsbox")
     parser.set_defaults(run=_convert_region)
 
 

@@ -59,6 +59,13 @@ def with_option_name(error: SettingError) -> SettingError:
     return SettingError(error.setting, error.wanted, called=option_of(error.setting))
 
 
+def given_path(text: str) -> Path:
+    """Return the path that an option names; an empty one, as of an unset variable, is none."""
+    if not text.strip():
+        raise ArgumentTypeError("an empty path; name the file or folder")
+    return Path(text)
+
+
 def add_options(parser: ArgumentParser, entries: Iterable[Declaration]) -> None:
     """Add options of settings, and ``--set`` for those without their own. Once for a parser.
 
@@ -123,7 +130,11 @@ class SetAction(Action):
         if word in self.known:
             return f"{word} has an option of its own: {self.known[word]}"
         near = difflib.get_close_matches(word, self.settings, n=1)
-        return f"unknown setting {word!r}" + (f", the nearest is {near[0]}" if near else "")
+        if near:
+            return f"unknown setting {word!r}, the nearest is {near[0]}"
+        if any(word == e.option.word for e in declarations(JobSettings) if e.option is not None):
+            return f"{word} is no setting of this command: it belongs to the training"
+        return f"unknown setting {word!r}; the command settings lists them"
 
 
 def add_option(parser: Any, entry: Declaration, **changes: Any) -> None:
@@ -190,7 +201,7 @@ _USER_PRESET = "--user-preset"
 def add_training_options(parser: ArgumentParser) -> None:
     """Add what sets many settings of the training at once: a user's preset, model selection."""
     parser.add_argument(
-        _USER_PRESET, type=Path, metavar="FILE.json",
+        _USER_PRESET, type=given_path, metavar="FILE.json",
         help="settings of training and texture of a preset saved in the panel (My Presets); other "
         "options override it",
     )  # fmt: skip
@@ -325,7 +336,7 @@ class Commands(Protocol):
 
 def add_out(parser: ArgumentParser) -> None:
     """Add ``--out``, the job folder."""
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=given_path, required=True, metavar="DIR")
 
 
 def add_threads(parser: ArgumentParser) -> None:

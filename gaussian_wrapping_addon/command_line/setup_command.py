@@ -32,7 +32,7 @@ from ..core.worker.environment import (
     read_requirements,
     requirements_file,
 )
-from .options import Commands
+from .options import Commands, given_path
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -49,7 +49,7 @@ def add_set_up_worker(commands: Commands) -> None:
         "--python", default="", metavar="P", help="Python 3.11 or newer (default: searched for)"
     )
     parser.add_argument(
-        "--to", type=Path, metavar="DIR", help="folder (default: the add-on's own folder)"
+        "--to", type=given_path, metavar="DIR", help="folder (default: the add-on's own folder)"
     )
     parser.add_argument(
         "--find-links", default="", metavar="DIR", help="install wheels only from this folder"
@@ -60,7 +60,7 @@ def add_set_up_worker(commands: Commands) -> None:
         "index: the default of pip's index",
     )  # fmt: skip
     parser.add_argument(
-        "--requirements", type=Path, metavar="FILE", help="another list of packages"
+        "--requirements", type=given_path, metavar="FILE", help="another list of packages"
     )
     parser.add_argument(
         "--extras", default="", metavar="NAMES",

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 from argparse import Namespace
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +25,7 @@ from .options import (
     add_out,
     add_training_options,
     declared_options,
+    given_path,
     option_of,
     region_settings,
     training_settings,
@@ -42,7 +44,7 @@ def add_wrap(commands: Commands) -> None:
     parser = commands.add_parser(
         "wrap", help="make a textured mesh of photos, with or without cameras, or of a video"
     )
-    parser.add_argument("input", type=Path)
+    parser.add_argument("input", type=given_path)
     add_training_options(parser)
     add_out(parser)
     add_options(parser, declared_options("training", "method", "region"))
@@ -86,6 +88,12 @@ def checked_job(photos: Path, options: Namespace) -> JobFile:
         raise UsageError(
             "--set blocks saves no time in one process.", "Give --computers as well, or omit it."
         )
+    for path in ("certificates", "processes"):
+        if getattr(options, path) is not None and not job.settings.computers:
+            raise UsageError(
+                f"{option_of(path)} has no effect on this computer alone.",
+                "Give --computers as well, or omit it.",
+            )
     require_device(job.settings.device)
     _reject_frames_of_photos(job)
     panoramas = job.settings.equirectangular
@@ -138,7 +146,7 @@ def _on_device(job: JobFile, options: Namespace) -> JobFile:
 
 def add_resume(commands: Commands) -> None:
     parser = commands.add_parser("resume", help="resume a job that was stopped")
-    parser.add_argument("out", type=Path, metavar="DIR")
+    parser.add_argument("out", type=given_path, metavar="DIR")
     entry = declared("training.max_gaussians")
     add_option(parser, entry, dest="max_gaussians", help="train anew with this maximum")
     add_device(parser, kept=True)
@@ -169,7 +177,7 @@ def _resume(options: Namespace) -> int:
 
 def add_estimate(commands: Commands) -> None:
     parser = commands.add_parser("estimate", help="estimate time, memory and disk of a training")
-    parser.add_argument("input", type=Path)
+    parser.add_argument("input", type=given_path)
     add_training_options(parser)
     add_options(parser, declared_options("training"))
     parser.set_defaults(run=_estimate)
@@ -197,28 +205,39 @@ def _settings(options: Namespace) -> int:
     lines = []
     for entry in declared_options("training", "method", "region"):
         option = entry.option
-        if option is None or option.own:
+        if option is None:
+            continue
+        if option.own:  # listed where it is asked for: --set does not take it
+            owned = f"{option.word}: see the option {option.name}: {option.help or entry.help}"
+            if options.words and _has(owned, options.words):
+                lines.append(owned)
             continue
         default = entry.default if entry.default != "" else "empty"
         valid = f" ({entry.check.wanted})" if entry.check is not None else ""
         text = f"{option.word}={default}{valid}: {option.help or entry.help}"
-        if all(word.lower().replace("-", "_") in text.lower() for word in options.words):
+        if _has(text, options.words):
             lines.append(text)
     if not lines:
         raise UsageError(
             f"No setting has {' '.join(options.words)} in its name or description.",
-            "The command settings without words lists all.",
+            "The command settings without words lists all that --set takes.",
         )
     for line in lines:
         _logger.info("%s", line)
     return EXIT_DONE
 
 
+def _has(text: str, words: Sequence[str]) -> bool:
+    return all(word.lower().replace("-", "_") in text.lower() for word in words)
+
+
 def add_queue(commands: Commands) -> None:
     parser = commands.add_parser(
         "queue", help="wrap each folder of photos in a folder, and list the results"
     )
-    parser.add_argument("input", type=Path, metavar="FOLDER", help="folder of folders of photos")
+    parser.add_argument(
+        "input", type=given_path, metavar="FOLDER", help="folder of folders of photos"
+    )
     add_training_options(parser)
     add_out(parser)
     add_options(parser, declared_options("training", "method", "region"))

@@ -56,7 +56,7 @@ def test_figures_are_old_once_the_core_has_changed(repository: Repository) -> No
     changed = repository.commit(f"{PACKAGE}/a.py", "two")
     said = age([first, later, first, changed], repository.root)
     assert f"measured at {first}, {later};" in said
-    assert f"last changed at {changed}" in said
+    assert said.endswith("the core was changed since.")
     assert age([changed], repository.root) == ""
     assert "0123456789" in age([changed, "0123456789"], repository.root)  # not in this repository
 

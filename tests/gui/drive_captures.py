@@ -42,8 +42,8 @@ def choose(source: str) -> Iterator[float]:
     scene = bpy.context.scene
     scene.gwrap.source = f"//{source}"
     press(bpy.ops.gwrap.check_photos)
-    photo_check, look = (driving.module(f"ops.dataset.photo_{n}") for n in ("check", "look"))
-    busy = lambda: photo_check.is_busy() or look.is_busy()  # noqa: E731
+    data = driving.module("ops.dataset")
+    busy = lambda: data.is_checking() or data.is_busy()  # noqa: E731
     yield 1.0
     yield from until(lambda: not busy() and len(scene.gwrap.findings) > 0, f"{source} is checked")
 

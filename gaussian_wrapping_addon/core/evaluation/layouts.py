@@ -421,7 +421,7 @@ def align_to_log(cameras: Sequence[Camera], scene: TanksScene, *, seed: int) -> 
     centers = np.array([cameras[i].center for i in known])
     found = umeyama_ransac(
         centers, scene.log_centers[rows[known]], threshold=RANSAC_DISTANCE,
-        iterations=RANSAC_ITERATIONS, seed=seed, with_scale=True,
+        iterations=RANSAC_ITERATIONS, seed=seed,
     )  # fmt: skip
     if found.inliers.mean() < MIN_AGREEING_SHARE:
         raise DatasetError(

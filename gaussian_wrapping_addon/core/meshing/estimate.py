@@ -359,7 +359,7 @@ def _span(seconds: float) -> str:
 
 def estimate_pivot_mesh(
     arrays: GaussianArrays, region: Region, pivots: int, depth_samples: int, *,
-    box: str = "normal", alone: bool = False, evaluation_s: float = 0.0, seed: int = 0,
+    box: str = "normal", alone: bool = False, evaluation_s: float = 0.0,
 ) -> PivotEstimate:  # fmt: skip
     """Estimate the cost of :func:`~.pivot_meshing.mesh_by_pivots`.
 
@@ -388,7 +388,7 @@ def estimate_pivot_mesh(
         own, depth_samples = pivots_alone(arrays, region, rule), 0
         tetrahedra_high, faces_high = TETRAHEDRA_ALONE_HIGH, FACES_ALONE_HIGH
     else:
-        own = pivots_and_probes(arrays, region, seed, rule)
+        own = pivots_and_probes(arrays, region, 0, rule)
         tetrahedra_high, faces_high = TETRAHEDRA_HIGH, FACES_HIGH
     pairs_low = PAIRED_LOW * min(depth_samples, MAX_DEPTH_SAMPLES)
     pairs_high = min(PAIRED_HIGH * depth_samples, 2.0 * MAX_DEPTH_SAMPLES)

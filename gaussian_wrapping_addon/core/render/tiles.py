@@ -131,14 +131,14 @@ def order_by_keys(
     return order
 
 
-def radix_order(depths: np.ndarray, visible: np.ndarray, threads: int = 1) -> np.ndarray:
+def radix_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
     """Return the indices of the visible rows by increasing distance >= 0, ties by index (int32)."""
     ids = np.nonzero(visible)[0].astype(np.int32)
     # Positive floats are ordered like their bit patterns.
     keys = depths[ids].view(np.uint32)
     extent = (int(keys.min()), int(keys.max())) if len(keys) else (0, 0)
     bounds = np.array([[0, len(keys)]], np.int64)
-    return ids[order_by_keys(keys, bounds, extent, threads, ArrayStore())]
+    return ids[order_by_keys(keys, bounds, extent, 1, ArrayStore())]
 
 
 # -- Tile lists: the Gaussians that reach each tile of 16 x 16 pixels, in blending order ----------

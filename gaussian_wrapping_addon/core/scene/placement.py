@@ -104,7 +104,6 @@ def umeyama_ransac(
     threshold: float,
     iterations: int,
     seed: int,
-    with_scale: bool,
 ) -> RansacResult:
     """Fit a similarity to pairs with outliers by RANSAC.
 
@@ -136,7 +135,7 @@ def umeyama_ransac(
         drawn += batch
         # The three smallest of n random keys are a triple without repetition.
         triples = np.argpartition(rng.random((batch, len(a))), 2, axis=1)[:, :3]
-        within, cost = _score_triples(a, b, triples, threshold, with_scale)
+        within, cost = _score_triples(a, b, triples, threshold)
         counts = within.sum(1)
         order = np.lexsort((cost, -counts))
         if (counts[order[0]], -cost[order[0]]) > (best_count, -best_cost):
@@ -153,7 +152,7 @@ def umeyama_ransac(
         raise DatasetError(text, hint)
     for _ in range(RANSAC_POLISH):
         require_plane(a[best], "agreeing source")
-        fit = fit_similarity(a[best], b[best], with_scale)
+        fit = fit_similarity(a[best], b[best], with_scale=True)
         distances = np.linalg.norm(fit.points(a) - b, axis=1)
         within = distances <= threshold
         if within.sum() < 3 or (within == best).all():
@@ -167,7 +166,7 @@ def umeyama_ransac(
 
 
 def _score_triples(
-    a: np.ndarray, b: np.ndarray, triples: np.ndarray, threshold: float, with_scale: bool
+    a: np.ndarray, b: np.ndarray, triples: np.ndarray, threshold: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the inliers of each triple, (k, n) bool, and the sum of their squares, (k,)."""
     p, q = a[triples], b[triples]  # (k, 3, 3)
@@ -178,7 +177,7 @@ def _score_triples(
     signs[:, 2] = np.where(np.linalg.det(u) * np.linalg.det(vt) < 0, -1.0, 1.0)
     rotation = np.einsum("kij,kj,kjl->kil", u, signs, vt)
     spread = (p * p).sum((1, 2))
-    scale = (d * signs).sum(1) / np.maximum(spread, 1e-300) if with_scale else np.ones(len(d))
+    scale = (d * signs).sum(1) / np.maximum(spread, 1e-300)
     shift = q_mean - scale[:, None] * np.einsum("kij,kj->ki", rotation, p_mean)
     moved = scale[:, None, None] * np.einsum("nj,kij->kni", a, rotation) + shift[:, None]
     squared = ((moved - b) ** 2).sum(2)  # (k, n)

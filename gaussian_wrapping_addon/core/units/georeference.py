@@ -263,7 +263,7 @@ def robust_similarity(
     while threshold >= noise:
         try:
             found = umeyama_ransac(
-                source, target, threshold=threshold, iterations=ITERATIONS, seed=0, with_scale=True
+                source, target, threshold=threshold, iterations=ITERATIONS, seed=0
             )
         except DatasetError:
             if best is None:

@@ -355,7 +355,7 @@ def test_degenerate_pairs_are_refused(points: np.ndarray, words: str) -> None:
     with pytest.raises(DatasetError, match=words):
         umeyama(points, points, with_scale=True)
     with pytest.raises(DatasetError, match=words):
-        umeyama_ransac(points, points, threshold=1.0, iterations=10, seed=0, with_scale=True)
+        umeyama_ransac(points, points, threshold=1.0, iterations=10, seed=0)
 
 
 def test_ransac_survives_forty_percent_of_outliers() -> None:
@@ -365,8 +365,7 @@ def test_ransac_survives_forty_percent_of_outliers() -> None:
     wrong = rng.permutation(100)[:40]
     target[wrong] += rng.normal(size=(40, 3)) * 5 + 3
     found, again = (
-        umeyama_ransac(points, target, threshold=0.05, iterations=100_000, seed=0, with_scale=True)
-        for _ in range(2)
+        umeyama_ransac(points, target, threshold=0.05, iterations=100_000, seed=0) for _ in range(2)
     )
     assert set(np.flatnonzero(~found.inliers)) == set(wrong)
     assert np.abs(found.transform.points(points) - TRUE.points(points)).max() < 1e-8
@@ -378,7 +377,7 @@ def test_pairs_that_do_not_belong_together_are_refused() -> None:
     with pytest.raises(DatasetError, match="do not correspond"):
         umeyama_ransac(
             rng.normal(size=(20, 3)), rng.normal(size=(20, 3)) * 9,
-            threshold=1e-6, iterations=500, seed=0, with_scale=True,
+            threshold=1e-6, iterations=500, seed=0,
         )  # fmt: skip
 
 

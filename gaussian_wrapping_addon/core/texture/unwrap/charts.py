@@ -291,17 +291,18 @@ NORMAL_COST = 1.5
 """Cost of deviating normals relative to the cost of one chunk radius of distance."""
 
 
-def split_into_chunks(graph: FaceGraph, max_faces: int = MAX_CHUNK_FACES) -> np.ndarray:
+def split_into_chunks(graph: FaceGraph) -> np.ndarray:
     """Label faces by chunk.
 
     Chunks grow from a seed over shared edges, by distance and deviation of normals; small chunks
     are merged with the neighbour with which they share most edges; isolated small pieces are
-    bundled. Returns labels from 0, (f,) int32; a chunk has at most ``1.3 * max_faces`` faces.
+    bundled. Returns labels from 0, (f,) int32; a chunk has at most 1.3 times
+    :data:`MAX_CHUNK_FACES`.
     """
-    radius = float(np.sqrt(max(graph.areas.mean(), 1e-300) * max_faces / np.pi))
+    radius = float(np.sqrt(max(graph.areas.mean(), 1e-300) * MAX_CHUNK_FACES / np.pi))
     neighbours = (graph.opposite // 3).astype(np.int32)  # -1 without one
-    labels = _grow(neighbours, graph.centroids, graph.normals, radius, max_faces)
-    return _merge_small(labels, neighbours, max_faces)
+    labels = _grow(neighbours, graph.centroids, graph.normals, radius, MAX_CHUNK_FACES)
+    return _merge_small(labels, neighbours, MAX_CHUNK_FACES)
 
 
 @kernel(fast=False)
