@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.errors import ResourceError, UsageError
+from gaussian_wrapping_addon.core.errors import DeviceError, ResourceError, UsageError
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.stereo.depth_maps import least_divisor
 from gaussian_wrapping_addon.core.training.block_plan import coarse_settings
@@ -23,6 +23,7 @@ from gaussian_wrapping_addon.core.training.estimate import (
     estimate,
     estimate_training,
     gaussian_counts,
+    speeds,
     this_machine,
 )
 from gaussian_wrapping_addon.core.training.schedule import Schedule
@@ -210,3 +211,20 @@ def test_more_blocks_than_photos_are_refused_before_anything_is_trained() -> Non
     assert estimate_training(few, replace(LARGE, blocks=7), MACHINE).seconds_high > 0.0
     with pytest.raises(UsageError, match="8 blocks: 7 photos"):
         estimate_training(few, replace(LARGE, blocks=8), MACHINE)
+
+
+def test_a_gpu_that_fails_while_it_is_timed_does_not_end_the_estimate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fails(error: Exception) -> None:
+        def timed(device: int) -> float:
+            assert device == 1
+            raise error
+
+        monkeypatch.setattr("gaussian_wrapping_addon.core.training.estimate.gpu_speed", timed)
+
+    fails(DeviceError("The driver does not answer.", "Restart it."))
+    assert speeds(4, "cuda:1") == (4 * speeds(1, "cuda:1")[0], 1.0)
+    fails(RuntimeError("a fault of this program"))
+    with pytest.raises(RuntimeError, match="a fault of this program"):
+        speeds(4, "cuda:1")
