@@ -48,8 +48,9 @@ def _arguments(given: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--label", help="folder of the records (default: the preset)")
     parser.add_argument(
-        "--taken", action="store_true",
-        help=f"photos as a camera takes them; the label gets {TAKEN} at its end",
+        "--clean", action="store_true",
+        help="photos as they are rendered; without it they are as a camera takes them, and the "
+        f"label gets {TAKEN} at its end",
     )  # fmt: skip
     parser.add_argument("--runs", type=int, default=0, help="make at most so many; 0: no limit")
     parser.add_argument("--again", action="store_true", help="make runs that have a record, too")
@@ -94,7 +95,7 @@ def main(given: Sequence[str] | None = None) -> int:
             return _make_runs(names, options, further)
         for name in names:
             begun_s = time.monotonic()
-            ensure = ensure_taken_scene if options.taken else ensure_zoo_scene
+            ensure = ensure_zoo_scene if options.clean else ensure_taken_scene
             folder = ensure(name, options.threads)
             _logger.info("%s: %.0f s, %s", name, time.monotonic() - begun_s, folder.name)
     except WrapError as error:
@@ -106,8 +107,8 @@ def main(given: Sequence[str] | None = None) -> int:
 def _make_runs(names: Sequence[str], options: argparse.Namespace, further: Sequence[str]) -> int:
     """Make the alpha shapes and runs that are missing; return 1 where one failed, else 0."""
     if options.label and options.label.endswith(TAKEN):
-        raise UsageError(f"Labels do not end with {TAKEN}.", "Say --taken, which adds it.")
-    label = (options.label or options.preset) + (TAKEN if options.taken else "")
+        raise UsageError(f"Labels do not end with {TAKEN}.", "Omit it: it is added.")
+    label = (options.label or options.preset) + ("" if options.clean else TAKEN)
     if label == BASELINES or (further and not options.label):
         raise UsageError(
             f"Runs of {label!r} need a label of their own.",

@@ -295,9 +295,9 @@ def write_document(out: Path, root: Path = RECORDS) -> Path | None:
     for label, records in found.items():
         given = next(iter(records.values())).case
         more = f" -- {' '.join(given.arguments)}" if given.arguments else ""
-        taken = " --taken" if label.endswith(TAKEN) else ""
+        clean = "" if label.endswith(TAKEN) else " --clean"
         own = label.removesuffix(TAKEN)
-        name = taken if own == given.preset else f" --label {own}{taken}"
+        name = clean if own == given.preset else f" --label {own}{clean}"
         command = f"{COMMAND} --preset {given.preset}{name}{more}"
         judged = {r.case.scene for r in records.values()}
         others = [dataclasses.replace(given, scene=name) for name in SCENES if name not in judged]

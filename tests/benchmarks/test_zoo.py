@@ -247,7 +247,7 @@ def test_a_page_is_written_from_records_alone(tmp_path: Path) -> None:
     path = write_document(tmp_path, tmp_path)
     assert path is not None
     text = path.read_text()
-    assert "python -m benchmarks.zoo --preset draft --label more -- --iterations 9" in text
+    assert "python -m benchmarks.zoo --preset draft --label more --clean -- --iterations 9" in text
     (row,) = [
         line
         for line in text.split("## more")[0].splitlines()
