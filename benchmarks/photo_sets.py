@@ -209,10 +209,7 @@ def write_document(folder: Path, root: Path = RECORDS) -> Path | None:
         "Textured mesh: what of these photos it covers, baked without them; where exposures are "
         "modelled, in that of each photo as well, as the Gaussians are measured."
     )
-    rows = [_row(record) for record in records]
-    if not any(row["in their exposures"] for row in rows):  # records of before it was measured
-        rows = [{k: v for k, v in row.items() if k != "in their exposures"} for row in rows]
-    table = table_of("Photo sets", rows)
+    table = table_of("Photo sets", [_row(record) for record in records])
     lines = [origin, "", *reading("photo-sets"), table.markdown()]
     commits = [record["commit"] for record in records]
     return write_page(folder / PAGE, "Photos that people took", commits, lines)

@@ -84,9 +84,9 @@ Row = dict[str, Cell]
 
 
 def table_of(title: str, rows: Sequence[Row], *notes: str) -> Table:
-    """Return a table whose columns are the keys of its rows."""
-    header = tuple(rows[0]) if rows else ()
-    return Table(title, header, [tuple(row[name] for name in header) for row in rows], notes)
+    """Return a table whose columns are the keys of its rows that have a value in any of them."""
+    header = [name for name in (rows[0] if rows else ()) if any(r[name] is not None for r in rows)]
+    return Table(title, tuple(header), [tuple(row[name] for name in header) for row in rows], notes)
 
 
 def thin_recall(surface: dict[str, Any]) -> float | None:

@@ -2,7 +2,7 @@
 """A small scene with exact ground truth: a patterned ball on a floor under a dome, ray traced.
 
 The photos, cameras (COLMAP text model) and sparse points come from closed forms, so a test can
-compare a mesh with the true sphere.
+compare a mesh with the true sphere. Beside it an image of waves, for what needs no scene.
 """
 
 from __future__ import annotations
@@ -156,3 +156,12 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
     return np.array([w, x, y, z])
+
+
+def textured(seed: int, height: int = 24, width: int = 31) -> np.ndarray:
+    """Return an image with values in about [0.1, 0.7]."""
+    random = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width] / 5.0
+    phase = random.uniform(0, 6, 3)
+    waves = np.sin(x[..., None] + phase) * np.cos(y[..., None] - phase)
+    return 0.4 + 0.25 * waves + random.uniform(-0.05, 0.05, (height, width, 3))

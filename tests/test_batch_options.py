@@ -356,6 +356,8 @@ def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
         (["farm", "worker", "tcp://127.0.0.1:1", "--slots", "0"], 2, "--slots is out of range. "),
         (["wrap", "photos", "--out", "o", "--processes", "0", "--no-blend"], 2, "--processes is"),
         (["wrap", "photos", "--out", "o", "--computers", "here", "--no-blend"], 2, "--computers"),
+        (["wrap", "photos", "--out", "o", "--processes", "3", "--no-blend"], 2, "--processes has"),
+        (["wrap", "photos", "--out", "o", "--certificates", "c"], 2, "--certificates has no"),
         (["evaluate", "m.ply", "--truth", "photos", "--threads", "-1"], 2, "--threads is"),
         (["wrap", "photos", "--out", "o", "--set", "lods=9", "--no-blend"], 2, "--set lods is"),
         (["wrap", "photos", "--out", "o", "--set", "pivots=4", "--no-blend"], 2, "--set: pivots"),

@@ -133,7 +133,7 @@ class SetAction(Action):
         if near:
             return f"unknown setting {word!r}, the nearest is {near[0]}"
         if any(word == e.option.word for e in declarations(JobSettings) if e.option is not None):
-            return f"{word} is no setting of this command: it belongs to the training"
+            return f"{word} is no setting of this command"
         return f"unknown setting {word!r}; the command settings lists them"
 
 

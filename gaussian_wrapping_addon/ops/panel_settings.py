@@ -157,8 +157,9 @@ def job_settings(scene: bpy.types.Scene, threads: int, device: str = "auto") -> 
 def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
     """Return the settings, by path, that say where the parts of a job run.
 
-    Raises UsageError: the address of the Dask scheduler is none, or not encrypted; the folder of
-    the certificates is on another computer.
+    What was chosen for other places than the present one is left out. Raises UsageError: the
+    address of the Dask scheduler is none, or not encrypted; the folder of the certificates is on
+    another computer.
     """
     properties = properties_of(scene)
     choices, processes = properties.computers, properties.processes
@@ -167,7 +168,7 @@ def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
         where = str(scheduler_address(choices.dask_address))
     elif choices.kind == "THIS" and processes > 1:
         where = LOCAL
-    certificates = certificates_of(scene)
+    certificates = certificates_of(scene) if where else ""
     if where != LOCAL:
         processes = JobSettings().processes
     return {"computers": where, "processes": processes, "certificates": certificates}

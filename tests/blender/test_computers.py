@@ -75,19 +75,21 @@ def test_the_choice_decides_what_is_asked_for() -> None:
 @pytest.mark.parametrize(
     ("kind", "address", "processes", "wanted"),
     [
-        ("THIS", "tcp://x:1", 1, ("", 2)),  # the default, which says nothing then
-        ("THIS", "tcp://x:1", 3, ("local", 3)),
-        ("DASK", " tls://computer:8786 ", 3, ("tls://computer:8786", 2)),
+        ("THIS", "tcp://x:1", 1, ("", 2, "")),  # the defaults, which say nothing then
+        ("THIS", "tcp://x:1", 3, ("local", 3, "{stored}")),
+        ("DASK", " tls://computer:8786 ", 3, ("tls://computer:8786", 2, "{stored}")),
     ],
 )
 def test_the_choice_becomes_settings_of_the_job(
-    kind: str, address: str, processes: int, wanted: tuple[str, int]
+    kind: str, address: str, processes: int, wanted: tuple[str, int, str], tmp_path: Path
 ) -> None:
     properties = bpy.context.scene.gwrap
+    properties.computers.certificates = str(tmp_path)
     properties.computers.kind, properties.computers.dask_address = kind, address
     properties.processes = processes
     settings = job_settings(bpy.context.scene, threads=0).validated()
-    assert (settings.computers, settings.processes) == wanted
+    assert (settings.computers, settings.processes) == wanted[:2]
+    assert settings.certificates == wanted[2].format(stored=tmp_path)
 
 
 def choose_dask(address: str) -> None:

@@ -29,6 +29,8 @@ from gaussian_wrapping_addon.core.image_metrics import (
     ssim,
 )
 from gaussian_wrapping_addon.core.resampling import LUMA, grey_of
+from gaussian_wrapping_addon.core.training.exposure import SRGB_PEDESTAL
+from tests.synthetic import textured
 
 
 def images(height: int = 19, width: int = 23, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -296,15 +298,6 @@ def test_a_package_that_fails_is_a_reason_too(
 # -- A render brought to the exposure of a photo --------------------------------------------------
 
 
-def textured(seed: int, height: int = 24, width: int = 31) -> np.ndarray:
-    """Return an image with values in about [0.1, 0.7]."""
-    random = np.random.default_rng(seed)
-    y, x = np.mgrid[:height, :width] / 5.0
-    phase = random.uniform(0, 6, 3)
-    waves = np.sin(x[..., None] + phase) * np.cos(y[..., None] - phase)
-    return 0.4 + 0.25 * waves + random.uniform(-0.05, 0.05, (height, width, 3))
-
-
 def test_fit_finds_gain_and_offset_beside_outliers_and_masks() -> None:
     render = textured(2, 40, 60)
     gain, offset = np.array([0.8, 1.1, 1.3]), np.array([0.05, -0.02, 0.0])
@@ -334,7 +327,8 @@ def test_fit_of_what_says_nothing_is_neutral() -> None:
 
 def test_measuring_fits_one_half_and_corrects_the_other() -> None:
     render = textured(4, 40, 60)
-    photo = np.array([0.8, 1.0, 1.25]) * render
+    light = np.array([0.8, 1.0, 1.25])
+    photo = (render + SRGB_PEDESTAL) * light ** (1 / 2.4) - SRGB_PEDESTAL
     corrected = corrected_for_measuring(render, photo)
     assert psnr(corrected, photo) > psnr(render, photo) + 10
     # What a half shows does not change how that half is corrected.

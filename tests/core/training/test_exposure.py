@@ -20,17 +20,9 @@ from gaussian_wrapping_addon.core.training.exposure import (
     exposure_rate,
     photo_rate,
 )
+from tests.synthetic import textured
 
 # -- Trained exposure: gradients, recovery of known gains, pinned mean, bitwise resume, fits ------
-
-
-def textured(seed: int, height: int = 24, width: int = 31) -> np.ndarray:
-    """Return an image with values in about [0.1, 0.7]."""
-    random = np.random.default_rng(seed)
-    y, x = np.mgrid[:height, :width] / 5.0
-    phase = random.uniform(0, 6, 3)
-    waves = np.sin(x[..., None] + phase) * np.cos(y[..., None] - phase)
-    return 0.4 + 0.25 * waves + random.uniform(-0.05, 0.05, (height, width, 3))
 
 
 def some_exposure(seed: int = 3) -> Exposure:

@@ -94,7 +94,7 @@ def run_texture(
         rendering = compare_with_photos(
             textured, scene, photos, held_out, stage_folder, progress.span(0.92, 0.97),
             from_gaussians=texture.source == "gaussians", threads=threads,
-            exposed=bool(trained.done.get("held_out_exposure_fitted")),
+            exposed=_exposures_fitted(trained),
         )  # fmt: skip
         progress.update(0.97, "rendering the preview")
         write_preview(textured, scene, photos, stage_folder / "preview.png", threads=threads)
@@ -124,6 +124,11 @@ def photo_source(
 BAKE_FILE = "bake.json"
 """Figures of a bake, beside its files."""
 BAKE_VERSION = 1
+
+
+def _exposures_fitted(trained: Stage) -> bool:
+    """Tell whether held-out photos were measured in an exposure of their own."""
+    return bool(trained.done.get("held_out_exposure_fitted"))
 
 
 def require_training(folder: JobFolder, job: JobFile, cameras: Stage) -> None:
@@ -183,7 +188,7 @@ def run_bake(
         rendering = compare_with_photos(
             textured, scene, photos, (), files, progress.span(0.93, 1.0),
             from_gaussians=request.texture.source == "gaussians", threads=threads,
-            exposed=bool(trained.done.get("held_out_exposure_fitted")),
+            exposed=_exposures_fitted(trained),
         )  # fmt: skip
         figures = {
             "version": BAKE_VERSION, "name": request.name, "vertices": len(textured.mesh.vertices),
