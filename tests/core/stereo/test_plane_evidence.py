@@ -218,6 +218,32 @@ def test_noise_makes_no_false_plane_true(noise: float) -> None:
     assert aligner.aligned(false, wall_parts(aligner.plain)) is None
 
 
+def blotched_maps(level: float) -> list[DepthMap]:
+    """Return the maps with noise in blotches, as denoising leaves it: little in single pixels."""
+    random, found = np.random.default_rng(12), []
+    for clean in depth_maps():
+        noise = ndimage.gaussian_filter(random.normal(size=clean.depth.shape), 2.0)
+        color = clean.color + (level / noise.std() * noise)[..., None]
+        color = np.clip(np.rint(color), 0, 255).astype(np.uint8)
+        found.append(dataclasses.replace(clean, color=color))
+    return found
+
+
+@pytest.mark.parametrize("level", [1.8, 2.2])
+def test_a_plane_that_matches_better_than_its_surroundings_stays(level: float) -> None:
+    aligner = aligner_of(blotched_maps(level))
+    parts = wall_parts(aligner.plain)
+    found = aligner.aligned(wall_plane(), parts)
+    assert found is not None
+    corners = np.array([[-1.5, WALL_Y, 0.3], [1.5, WALL_Y, 0.3], [1.5, WALL_Y, 2.0]])
+    assert np.abs(corners @ found.normal - found.offset).max() < 0.02 * WALL_Y
+    assert sum(aligner.contradicts(wall_plane(), part) for part in parts) <= len(parts) // 2
+    false = wall_plane().moved(np.array([0.0, 1.0, 0.0]), 0.6 * WALL_Y)
+    assert aligner.aligned(false, parts) is None
+    assert sum(aligner.contradicts(false, part) for part in parts) >= len(parts) - 1
+    assert aligner.aligned(wall_plane(), parts[:2]) is None, "two photos may agree by chance"
+
+
 def test_parts_on_a_false_plane_are_contradicted() -> None:
     aligner, false = aligner_of(depth_maps()), wall_plane(0.6 * WALL_Y)
     parts = wall_parts()
