@@ -15,7 +15,6 @@ from .depth_maps import DepthMap
 from .matching_cost import WORST_COST
 from .plane_evidence import AGREEING, ALIKE, NEARER, THROUGH, Aligner, PackedPhotos, Part, packed
 from .plane_fitting import (
-    BORDER_PX,
     FULL_SPREAD,
     LEAST_INVERSE_DEPTH,
     LEAST_SPREAD,
@@ -438,14 +437,15 @@ def _fitted(
 def _tilted_alike(
     plane: Plane, segment: Segment, depth_map: DepthMap
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return confirmed points in and around a segment that lie on a plane and have its normal."""
+    """Return confirmed points of a segment that lie on a plane and have its normal.
+
+    Of the segment alone: what hangs on a wall is textured, parallel to it, and before it.
+    """
     camera = depth_map.camera
-    top, left = max(segment.rows.min() - BORDER_PX, 0), max(segment.columns.min() - BORDER_PX, 0)
-    low, right = segment.rows.max() + BORDER_PX + 1, segment.columns.max() + BORDER_PX + 1
-    row, column = np.nonzero(depth_map.confidence[top:low, left:right] > 0)
-    row, column = row + top, column + left
+    confirmed = depth_map.confidence[segment.rows, segment.columns] > 0
+    row, column = segment.rows[confirmed], segment.columns[confirmed]
     depth = depth_map.depth[row, column].astype(np.float64)
-    points = lifted_pixels(camera, np.stack([column, row], 1).astype(np.float64), 1.0 / depth)
+    points = lifted_pixels(camera, segment.pixels[confirmed], 1.0 / depth)
     away = np.sign(plane.offset - plane.normal @ camera.center)
     cosine = -away * (depth_map.normal[row, column] @ plane.normal)
     distance = np.abs(points @ plane.normal - plane.offset)

@@ -176,6 +176,15 @@ def test_borrowed_depths_on_the_wall_are_replaced() -> None:
     assert_wall_is_filled(fill_plain_parts(maps, sparse_points(), Progress()))
 
 
+def test_pictures_that_hang_before_the_wall_do_not_draw_it_to_them() -> None:
+    maps = []
+    for camera, found in zip(cameras(), depth_maps(), strict=True):
+        near_wall = np.where(traced(camera)[1] == PICTURE, 0.99, 1.0)  # about 4 cm before it
+        depth = (near_wall * found.depth).astype(np.float32)
+        maps.append(dataclasses.replace(found, depth=depth))
+    assert_wall_is_filled(fill_plain_parts(maps, sparse_points(), Progress()))
+
+
 def test_photos_of_different_exposure_agree() -> None:
     gains = np.linspace(0.8, 1.1, len(cameras()))
     maps = [depth_map(camera, gain) for camera, gain in zip(cameras(), gains, strict=True)]
