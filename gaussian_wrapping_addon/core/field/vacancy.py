@@ -333,6 +333,9 @@ class VacancyField:
     unseen : {"empty", "occupied", "invalid"}
         Vacancy 1, 0 or NaN of points that no camera sees (docs/method.md, section 5.3). Invalid
         points count as empty in :meth:`is_empty`, and ``unseen_evaluations`` counts them.
+    level : float
+        Vacancy, by the definition above, at which the surface is; all results are raised to the
+        power that makes it 0.5 (docs/method.md, section 5.3).
     masks : sequence of (h, w) bool, PackedMask or None, optional
         One per camera, true where its photo counts, of any resolution.
     mask_mode : {"ignore", "background"}
@@ -359,6 +362,7 @@ class VacancyField:
         *,
         threads: int = 0,
         unseen: Unseen = "empty",
+        level: float = limits.ISO_LEVEL,
         region_bounds: np.ndarray | None = None,
         near_z: float = limits.NEAR_Z,
         cache_bytes: int | None = None,
@@ -373,6 +377,8 @@ class VacancyField:
         self.cameras = tuple(cameras)
         self.threads = threads or default_threads()
         self.unseen: Unseen = unseen
+        self.power = math.log(limits.ISO_LEVEL) / math.log(level)
+        """Vacancy is raised to it, so that the surface is at 0.5 whatever the level."""
         self.near_z = near_z
         self.device = "cpu"
         """Device of the evaluation, in torch's notation."""
@@ -419,7 +425,7 @@ class VacancyField:
             seen = winner >= 0
             self.wins += np.bincount(winner[seen], minlength=len(self.cameras))
             self.unseen_evaluations += int((~seen).sum())
-            vacancy[begin:end] = np.where(seen, best, self._unseen_value)
+            vacancy[begin:end] = np.where(seen, self._raised(best), self._unseen_value)
             camera[begin:end] = winner
         return VacancyResult(vacancy, camera)
 
@@ -437,7 +443,8 @@ class VacancyField:
         soon as the point cannot be empty for it.
         """
         points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
-        level32 = np.float32(level)
+        unseen_is_empty = not self._unseen_value <= level
+        level32 = np.float32(level if self.power == 1.0 else level ** (1.0 / self.power))
         out = np.empty(len(points), bool)
         progress = progress or Progress()
         for begin, end, part in self._passes(len(points), progress):
@@ -448,7 +455,7 @@ class VacancyField:
             won = winner[best > level32]
             self.wins += np.bincount(won, minlength=len(self.cameras))
             self.unseen_evaluations += int((~seen).sum())
-            out[begin:end] = np.where(seen, best > level32, not self._unseen_value <= level)
+            out[begin:end] = np.where(seen, best > level32, unseen_is_empty)
         return out
 
     def transmittance(self, points: np.ndarray, camera_index: int) -> np.ndarray:
@@ -475,6 +482,9 @@ class VacancyField:
         return np.lexsort((spread, -self.wins))
 
     # -- inside -----------------------------------------------------------------------------------
+
+    def _raised(self, best: np.ndarray) -> np.ndarray:
+        return best if self.power == 1.0 else best ** np.float32(self.power)
 
     @property
     def _unseen_value(self) -> float:

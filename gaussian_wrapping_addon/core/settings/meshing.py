@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..limits import MAX_TILES, SHORTEST_EDGE
+from ..limits import ISO_LEVEL, MAX_TILES, SHORTEST_EDGE
 from .declaration import (
     BOUNDARIES,
     FIELD_CAMERAS,
@@ -213,6 +213,13 @@ class MeshingSettings:
                 Item("occupied", "Occupied", "It is solid: closes the backs of objects"),
             ),
         ),
+    )
+    level: float = setting(
+        ISO_LEVEL,
+        help="Vacancy at which the surface is. Above 0.5 thin parts hold together that the photos "
+        "show as 1 or 2 pixels, and everything is a little fatter.",
+        check=Range(0.3, 0.9), since="0.2.0",
+        option=Option("--level", help="vacancy at which the surface is (default: 0.5)"),
     )
     cameras: str = setting(
         "training",

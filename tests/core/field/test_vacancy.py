@@ -178,6 +178,19 @@ def test_is_empty_is_the_sign_of_vacancy(make_field: FieldMaker) -> None:
         assert field.evaluations == len(points)
 
 
+@pytest.mark.parametrize("level", [0.3, 0.7])
+def test_the_surface_is_at_half_whatever_the_level(make_field: FieldMaker, level: float) -> None:
+    arrays, cameras = random_arrays(400), cameras_around(7)
+    points = query_points(arrays, 400)
+    vacancy = make_field(arrays, cameras).vacancy(points).vacancy
+    field = make_field(arrays, cameras, level=level)
+    raised = field.vacancy(points).vacancy
+    np.testing.assert_array_equal(raised > 0.5, vacancy > level)
+    np.testing.assert_array_equal(field.is_empty(points), vacancy > level)
+    np.testing.assert_allclose(raised, vacancy ** (np.log(0.5) / np.log(level)), atol=1e-6)
+    assert 0 < (vacancy > level).sum() < len(points)
+
+
 def test_vacancy_is_the_largest_transmittance(make_field: FieldMaker) -> None:
     arrays = random_arrays(300, seed=4)
     field = make_field(arrays, cameras_around(5))

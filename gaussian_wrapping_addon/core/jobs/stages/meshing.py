@@ -194,6 +194,7 @@ def region_field(
     options: dict[str, Any] = {
         "threads": threads,
         "unseen": meshing.unseen,
+        "level": meshing.level,
         "region_bounds": halo_bounds(region),
         "masks": [PackedMask.of(photos.mask(index)) for index in views],
         "mask_mode": scene.mask_mode(training.mask_mode),

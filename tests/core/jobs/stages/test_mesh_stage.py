@@ -349,6 +349,18 @@ def test_a_ball_that_only_held_out_cameras_look_into_is_meshed_solid(
     assert mesh.provenance["components"] == walls
 
 
+def test_the_mesh_lies_at_the_level() -> None:
+    scene, arrays = scene_looked_into(), shell_arrays(0.95, sigma_n=0.05)
+    region = cube(1.5)
+    plain = region_field(scene, arrays, region, TrainingSettings(), MeshingSettings(), threads=1)
+    for level in (0.5, 0.7):
+        settings = MeshingSettings(method="pivots", level=level)
+        field = region_field(scene, arrays, region, TrainingSettings(), settings, threads=1)
+        mesh = mesh_by_pivots(field, arrays, field.cameras, region, settings, Progress(), seed=0)
+        at = plain.vacancy(mesh.vertices).vacancy
+        assert abs(float(np.median(at)) - level) < 0.02
+
+
 def test_the_method_asks_the_cameras_that_were_trained_on(tmp_path: Path) -> None:
     assert MeshingSettings().cameras == "training"
     scene = scene_with_masks(tmp_path, slice(None))
