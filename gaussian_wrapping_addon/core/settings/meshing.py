@@ -218,7 +218,7 @@ class MeshingSettings:
         ISO_LEVEL,
         help="Vacancy at which the surface is. Above 0.5 thin parts hold together that the photos "
         "show as 1 or 2 pixels, and everything is a little fatter.",
-        check=Range(0.3, 0.9), since="0.2.0",
+        check=Range(0.3, 0.9), since="0.2.0", unit="vacancy",
         option=Option("--level", help="vacancy at which the surface is (default: 0.5)"),
     )
     cameras: str = setting(
