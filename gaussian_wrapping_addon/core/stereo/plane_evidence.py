@@ -344,7 +344,7 @@ many grey levels (root mean square) besides noise, taken so many times as large 
 fine scale alone refuses planes that are off by a pixel, and walls whose finest texture is that of
 rounding to whole levels."""
 
-ELSEWHERE, LEAST_CONTRAST = (0.05, 0.08, 0.12), 0.05
+ELSEWHERE, LEAST_CONTRAST = (0.05, 0.08, 0.12), 0.1
 """Shares of the depth by which a plane is moved either way, and how much more than at any of these
 places the coarse texture must correlate for a plane to stand out. JPEG and what cameras do against
 noise leave more of it in large squares than single pixels tell: a true ground's texture correlated
