@@ -84,7 +84,7 @@ Row = dict[str, Cell]
 
 
 def table_of(title: str, rows: Sequence[Row], *notes: str) -> Table:
-    """Return a table whose columns are the keys of its rows that have a value in any of them."""
+    """Return a table whose columns are the keys of its rows, without those of no value at all."""
     header = [name for name in (rows[0] if rows else ()) if any(r[name] is not None for r in rows)]
     return Table(title, tuple(header), [tuple(row[name] for name in header) for row in rows], notes)
 

@@ -168,7 +168,7 @@ def computers_choices(scene: bpy.types.Scene) -> dict[str, Any]:
         where = str(scheduler_address(choices.dask_address))
     elif choices.kind == "THIS" and processes > 1:
         where = LOCAL
-    certificates = certificates_of(scene) if where else ""
+    certificates = certificates_of(scene) if choices.kind == "DASK" else ""
     if where != LOCAL:
         processes = JobSettings().processes
     return {"computers": where, "processes": processes, "certificates": certificates}

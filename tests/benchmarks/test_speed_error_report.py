@@ -144,12 +144,13 @@ def test_meshers_of_a_training_stand_together() -> None:
 
 
 def test_thin_parts_and_open_meshes_are_shown_as_they_are() -> None:
-    case = preset_case("spot", "draft")
+    case, other = preset_case("spot", "draft"), preset_case("spot", "standard")
     made = invented(case)
     made.scores["surface"]["uniform"]["thin_count"] = 5
     made.mesh["closed"] = False
-    row = rows(preset_table({case.identity: made}))[0]
-    assert (row.get("thin recall 0.5 %"), row["closed"]) == (None, "NO")
+    row, full = rows(preset_table({case.identity: made, other.identity: invented(other)}))
+    assert (row["thin recall 0.5 %"], row["closed"]) == (None, "NO")
+    assert full["thin recall 0.5 %"] is not None
 
 
 def test_a_further_mesh_costs_its_training_too() -> None:

@@ -76,7 +76,7 @@ def test_the_choice_decides_what_is_asked_for() -> None:
     ("kind", "address", "processes", "wanted"),
     [
         ("THIS", "tcp://x:1", 1, ("", 2, "")),  # the defaults, which say nothing then
-        ("THIS", "tcp://x:1", 3, ("local", 3, "{stored}")),
+        ("THIS", "tcp://x:1", 3, ("local", 3, "")),
         ("DASK", " tls://computer:8786 ", 3, ("tls://computer:8786", 2, "{stored}")),
     ],
 )

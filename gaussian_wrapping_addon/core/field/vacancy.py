@@ -300,8 +300,9 @@ class VacancyResult:
     """Vacancy of points and their arg-max cameras."""
 
     vacancy: np.ndarray
-    """(n,) float32 in [0, 1]; 1 is empty, the surface is at 0.5. Values above 0.999 are lower
-    bounds, values below 1e-4 are 0. NaN where no camera sees the point, if unseen is invalid."""
+    """(n,) float32 in [0, 1]; 1 is empty, the surface is at 0.5. Before it is raised (``level``),
+    values above 0.999 are lower bounds, values below 1e-4 are 0. NaN where no camera sees the
+    point, if unseen is invalid."""
     camera: np.ndarray
     """(n,) int32: the camera that sees the point best, or -1 where none sees it."""
 
@@ -334,8 +335,9 @@ class VacancyField:
         Vacancy 1, 0 or NaN of points that no camera sees (docs/method.md, section 5.3). Invalid
         points count as empty in :meth:`is_empty`, and ``unseen_evaluations`` counts them.
     level : float
-        Vacancy, by the definition above, at which the surface is; all results are raised to the
-        power that makes it 0.5 (docs/method.md, section 5.3).
+        Vacancy, by the definition above, at which the surface is. What :meth:`vacancy` returns and
+        :meth:`is_empty` compares is raised to the power that makes it 0.5 (docs/method.md, section
+        5.3).
     masks : sequence of (h, w) bool, PackedMask or None, optional
         One per camera, true where its photo counts, of any resolution.
     mask_mode : {"ignore", "background"}
@@ -438,9 +440,9 @@ class VacancyField:
     ) -> np.ndarray:
         """Tell whether vacancy exceeds ``level`` at (n, 3) points, without finding its value.
 
-        Equal to ``vacancy(points).vacancy > level`` for levels from 1e-4 to 0.999, but a point is
-        finished at the first camera that finds it empty, and the evaluation from a camera stops as
-        soon as the point cannot be empty for it.
+        Equal to ``vacancy(points).vacancy > level`` for levels that are, before vacancy is raised,
+        from 1e-4 to 0.999, but a point is finished at the first camera that finds it empty, and the
+        evaluation from a camera stops as soon as the point cannot be empty for it.
         """
         points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
         unseen_is_empty = not self._unseen_value <= level
@@ -484,7 +486,9 @@ class VacancyField:
     # -- inside -----------------------------------------------------------------------------------
 
     def _raised(self, best: np.ndarray) -> np.ndarray:
-        return best if self.power == 1.0 else best ** np.float32(self.power)
+        if self.power == 1.0:
+            return best
+        return np.maximum(best, np.float32(0)) ** np.float32(self.power)  # -1 where unseen
 
     @property
     def _unseen_value(self) -> float:

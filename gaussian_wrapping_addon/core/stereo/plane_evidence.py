@@ -339,18 +339,20 @@ LEAST_GAIN, LEAST_CORRELATION, LEAST_TEXTURE_SHARE = 0.01, 0.6, 0.2
 texture has such a share of the power besides noise."""
 
 FALSE_CORRELATION, LEAST_TEXTURE, NOISE_MARGIN = 0.4, 0.12, 1.25
-"""A plane whose texture correlates less at both scales is no surface, if there is texture of so
-many grey levels (root mean square) besides noise, taken so many times as large as measured. The
-fine scale alone refuses planes that are off by a pixel, and walls whose finest texture is that of
-rounding to whole levels."""
+"""A plane whose texture correlates less at both scales is no surface, unless it stands out (below),
+if there is texture of so many grey levels (root mean square) besides noise, taken so many times as
+large as measured. The fine scale alone refuses planes that are off by a pixel, and walls whose
+finest texture is that of rounding to whole levels."""
 
-ELSEWHERE, LEAST_CONTRAST = (0.05, 0.08, 0.12), 0.1
-"""Shares of the depth by which a plane is moved either way, and how much more than at any of these
-places the coarse texture must correlate for a plane to stand out. JPEG and what cameras do against
-noise leave more of it in large squares than single pixels tell: a true ground's texture correlated
-by .23 where .84 were expected, and by at most .04 elsewhere."""
+ELSEWHERE, LEAST_CONTRAST, LEAST_LEFT = (0.05, 0.08, 0.12), 0.1, 0.5
+"""Shares of the depth by which a plane is moved before and behind, how much more than at any of
+these places the coarse texture must correlate for a plane to stand out, and share of the samples
+that must be left there. JPEG and what cameras do against noise leave more of it in large squares
+than those of one and two pixels tell: the texture of a true ground (thin-d3 of the zoo, as a camera
+takes it) correlated by .23 where .84 were expected, and by at most .04 elsewhere."""
 
-MANY_VIEWS = 6  # photos of a plane that stays because it stands out; curved things have fewer
+MANY_VIEWS = 6
+"""Photos that must show a plane which stays because it stands out: few may be alike by chance."""
 
 
 @dataclass(frozen=True)
@@ -505,6 +507,11 @@ class _Search:
 
     def correlation(self, place: np.ndarray, level: int) -> float:
         """Return the mean correlation; samples that get lost count as 0."""
+        total, count = self._correlated(place, level)
+        return total / max(count, self.counts.setdefault(level, count), 1)
+
+    def _correlated(self, place: np.ndarray, level: int) -> tuple[float, int]:
+        """Return the sum of the correlations and the number of samples that were compared."""
         normal, offset = self.plane(place)
         photos, textures = self.aligner.photos, self.aligner.textures[level]
         total, count = 0.0, 0
@@ -516,8 +523,7 @@ class _Search:
                 part.others, photos.projections, photos.sizes, textures, CLIPPED_LEVELS,
             )  # fmt: skip
             total, count = total + found[0], count + found[1]
-        least = self.counts.setdefault(level, count)
-        return total / max(count, least, 1)
+        return total, count
 
     def climbed(
         self, place: np.ndarray, level: int, steps: Sequence[float]
@@ -551,10 +557,23 @@ class _Search:
         return spoken
 
     def stands_out(self, place: np.ndarray) -> bool:
-        """Tell whether the coarse texture matches clearly better here than before and behind."""
-        own = self.correlation(place, 0)
-        moves = (np.array([sign * step, 0.0, 0.0]) for step in ELSEWHERE for sign in (-1, 1))
-        return all(own >= self.correlation(place + move, 0) + LEAST_CONTRAST for move in moves)
+        """Tell whether the coarse texture matches clearly better here than before and behind.
+
+        The depths of all pixels change by the same shares, however slanting the plane is seen.
+        Never true where too few samples are left to compare with.
+        """
+        normal, offset = self.plane(place)
+        depth = float(np.median([abs(offset - normal @ center) for center in self.centers]))
+        total, count = self._correlated(place, 0)
+        for step in ELSEWHERE:
+            for sign in (-1.0, 1.0):
+                move = np.array([sign * step * depth / self.scale, 0.0, 0.0])
+                other, left = self._correlated(place + move, 0)
+                if left < max(LEAST_LEFT * count, 1):
+                    return False
+                if total / count < other / left + LEAST_CONTRAST:
+                    return False
+        return True
 
     def texture_share(self, level: int, margin: float) -> float:
         """Return the share of a texture's power that is not noise, taken ``margin`` times.

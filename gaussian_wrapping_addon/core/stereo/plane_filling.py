@@ -413,19 +413,14 @@ def _fitted(
                 continue
             views.add(segment.view)
             support += float(segment.weights[near].sum())
-            tilted = _tilted_alike(plane, segment, depth_maps[segment.view])
-            if len(tilted[0]):
-                exact.append(tilted)
-            else:
-                inverse = segment.inverse_depths[near]
-                at = lifted_pixels(camera, segment.places[near], inverse)
-                known.append((at, segment.weights[near] * inverse**2))
+            exact.append(_tilted_alike(plane, segment, depth_maps[segment.view]))
+            inverse = segment.inverse_depths[near]
+            at = lifted_pixels(camera, segment.places[near], inverse)
+            known.append((at, segment.weights[near] * inverse**2))
         if len(views) < LEAST_VIEWS:
             continue
         if sum(len(part[0]) for part in exact) < LEAST_FITTED:
             exact = known + exact
-        if not exact:
-            continue
         points, weights = (np.concatenate(parts) for parts in zip(*exact, strict=True))
         evidence = replace(
             plane, points=points, weights=weights, support=support, views=frozenset(views)

@@ -188,6 +188,12 @@ def test_the_surface_is_at_half_whatever_the_level(make_field: FieldMaker, level
     np.testing.assert_array_equal(raised > 0.5, vacancy > level)
     np.testing.assert_array_equal(field.is_empty(points), vacancy > level)
     np.testing.assert_allclose(raised, vacancy ** (np.log(0.5) / np.log(level)), atol=1e-6)
+    for unseen, value in (("empty", 1.0), ("occupied", 0.0), ("invalid", np.nan)):
+        field = make_field(arrays, cameras, level=level, unseen=unseen)
+        behind = np.array([[0.0, 0.0, 1e4]])
+        with np.errstate(all="raise"):
+            np.testing.assert_array_equal(field.vacancy(behind).vacancy, [value])
+        assert field.is_empty(behind) == (value != 0.0)
     assert 0 < (vacancy > level).sum() < len(points)
 
 

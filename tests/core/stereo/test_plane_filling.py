@@ -185,6 +185,20 @@ def test_pictures_that_hang_before_the_wall_do_not_draw_it_to_them() -> None:
     assert_wall_is_filled(fill_plain_parts(maps, sparse_points(), Progress()))
 
 
+def test_single_pixels_of_a_wall_do_not_outweigh_what_is_known_around_it() -> None:
+    maps, random = [], np.random.default_rng(4)
+    for camera, found in zip(cameras(), depth_maps(), strict=True):
+        wall = traced(camera)[1] == WALL
+        lone = np.zeros(wall.shape, bool)
+        row, column = np.argwhere(wall & ~near(~wall, 6))[random.integers(300)]
+        lone[row, column] = True
+        depth = np.where(lone, random.uniform(0.99, 1.01) * traced(camera)[0], found.depth)
+        known = np.where(wall, 0.5 * lone, found.confidence)
+        changed = {"depth": depth.astype(np.float32), "confidence": known.astype(np.float32)}
+        maps.append(dataclasses.replace(found, **changed))
+    assert_wall_is_filled(fill_plain_parts(maps, sparse_points(), Progress()))
+
+
 def test_photos_of_different_exposure_agree() -> None:
     gains = np.linspace(0.8, 1.1, len(cameras()))
     maps = [depth_map(camera, gain) for camera, gain in zip(cameras(), gains, strict=True)]

@@ -171,6 +171,7 @@ _NAMES = {
     "weight": ("region_weight", "overlap_price"),
     "times the reference machine": ("speed",),
     "1/s": ("video_fps",),
+    "of vacancy": ("level",),
 }  # fmt: skip
 """Names of figures by their unit."""
 _UNITS = {name: unit for unit, names in _NAMES.items() for name in names}
@@ -216,7 +217,7 @@ _COUNTS = frozenset((
     "vertices_on_surface", "video_frames", "video_frames_blurred", "video_frames_damaged",
     "video_frames_kept", "video_frames_read", "video_frames_still", "views", "wrap_rounds",
 ))  # fmt: skip
-_STARTS = (("level", "of vacancy"), ("lambda_", "weight"))
+_STARTS = (("level_error_", "of vacancy"), ("lambda_", "weight"))
 
 
 def figure_rows(report: dict[str, Any]) -> list[tuple[str, str, str]]:

@@ -353,7 +353,7 @@ def test_the_mesh_lies_at_the_level() -> None:
     scene, arrays = scene_looked_into(), shell_arrays(0.95, sigma_n=0.05)
     region = cube(1.5)
     plain = region_field(scene, arrays, region, TrainingSettings(), MeshingSettings(), threads=1)
-    for level in (0.5, 0.7):
+    for level in (0.3, 0.7):
         settings = MeshingSettings(method="pivots", level=level)
         field = region_field(scene, arrays, region, TrainingSettings(), settings, threads=1)
         mesh = mesh_by_pivots(field, arrays, field.cameras, region, settings, Progress(), seed=0)
