@@ -502,13 +502,11 @@ class _Search:
         return normal / length, float(offset / length)
 
     def score(self, place: np.ndarray, level: int) -> float:
-        """Return the mean correlation less the penalty."""
-        return self.correlation(place, level) - PENALTY * float(((place / PENALTY_STEP) ** 2).sum())
-
-    def correlation(self, place: np.ndarray, level: int) -> float:
-        """Return the mean correlation; samples that get lost count as 0."""
+        """Return the mean correlation less the penalty; samples that get lost count as 0."""
         total, count = self._correlated(place, level)
-        return total / max(count, self.counts.setdefault(level, count), 1)
+        least = self.counts.setdefault(level, count)
+        penalty = PENALTY * float(((place / PENALTY_STEP) ** 2).sum())
+        return total / max(count, least, 1) - penalty
 
     def _correlated(self, place: np.ndarray, level: int) -> tuple[float, int]:
         """Return the sum of the correlations and the number of samples that were compared."""
@@ -571,7 +569,7 @@ class _Search:
                 other, left = self._correlated(place + move, 0)
                 if left < max(LEAST_LEFT * count, 1):
                     return False
-                if total / count < other / left + LEAST_CONTRAST:
+                if total / max(count, 1) < other / left + LEAST_CONTRAST:
                     return False
         return True
 
