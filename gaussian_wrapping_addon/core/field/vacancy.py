@@ -446,7 +446,7 @@ class VacancyField:
         """
         points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
         unseen_is_empty = not self._unseen_value <= level
-        level32 = np.float32(level if self.power == 1.0 else level ** (1.0 / self.power))
+        level32 = np.float32(level ** (1.0 / self.power))
         out = np.empty(len(points), bool)
         progress = progress or Progress()
         for begin, end, part in self._passes(len(points), progress):
@@ -486,8 +486,6 @@ class VacancyField:
     # -- inside -----------------------------------------------------------------------------------
 
     def _raised(self, best: np.ndarray) -> np.ndarray:
-        if self.power == 1.0:
-            return best
         return np.maximum(best, np.float32(0)) ** np.float32(self.power)  # -1 where unseen
 
     @property

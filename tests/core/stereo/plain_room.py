@@ -107,12 +107,15 @@ def depth_maps() -> tuple[DepthMap, ...]:
 def noisy_maps(noise: float) -> list[DepthMap]:
     """Return the depth maps with noise of a standard deviation, grey levels, in the photos."""
     random = np.random.default_rng(11)
-    found = []
-    for clean in depth_maps():
-        color = clean.color + noise * random.normal(size=clean.color.shape)
-        color = np.clip(np.rint(color), 0, 255).astype(np.uint8)
-        found.append(dataclasses.replace(clean, color=color))
-    return found
+    return [
+        with_noise(clean, noise * random.normal(size=clean.color.shape)) for clean in depth_maps()
+    ]
+
+
+def with_noise(clean: DepthMap, noise: np.ndarray) -> DepthMap:
+    """Return a depth map whose photo has noise added, grey levels that broadcast to (h, w, 3)."""
+    color = np.clip(np.rint(clean.color + noise), 0, 255).astype(np.uint8)
+    return dataclasses.replace(clean, color=color)
 
 
 @functools.cache

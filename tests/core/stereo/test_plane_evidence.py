@@ -25,7 +25,7 @@ from gaussian_wrapping_addon.core.stereo.plane_evidence import (
     count_votes,
     packed,
 )
-from gaussian_wrapping_addon.core.stereo.plane_fitting import segments_of
+from gaussian_wrapping_addon.core.stereo.plane_fitting import Plane, segments_of
 from tests.core.stereo.plain_room import (
     COUNT,
     FAINT_LEVELS,
@@ -39,6 +39,7 @@ from tests.core.stereo.plain_room import (
     noisy_maps,
     sparse_points,
     traced,
+    with_noise,
 )
 from tests.core.stereo.test_plane_fitting import wall_plane
 
@@ -183,16 +184,19 @@ def wall_parts(plain: np.ndarray | None = None) -> list[Part]:
     return parts
 
 
+def off_the_wall(plane: Plane) -> float:
+    """Return the largest distance of a plane to three corners of the wall."""
+    corners = np.array([[-1.5, WALL_Y, 0.3], [1.5, WALL_Y, 0.3], [1.5, WALL_Y, 2.0]])
+    return float(np.abs(corners @ plane.normal - plane.offset).max())
+
+
 @pytest.mark.parametrize("away", [0.06, -0.06])
 def test_a_plane_is_moved_to_where_the_texture_matches(away: float) -> None:
     turn = np.array([0.0, np.cos(0.008), np.sin(0.008)])
     start = wall_plane().moved(turn, float(turn @ [0.0, WALL_Y + away, 1.2]))
     found = aligner_of(depth_maps()).aligned(start, wall_parts())
     assert found is not None
-    corners = np.array([[-1.5, WALL_Y, 0.3], [1.5, WALL_Y, 0.3], [1.5, WALL_Y, 2.0]])
-    before = np.abs(corners @ start.normal - start.offset).max()
-    after = np.abs(corners @ found.normal - found.offset).max()
-    assert after < 0.55 * before
+    assert off_the_wall(found) < 0.55 * off_the_wall(start)
 
 
 def test_a_plane_far_from_the_surface_is_none() -> None:
@@ -207,8 +211,7 @@ def test_noise_makes_no_true_plane_false(noise: float) -> None:
     parts = wall_parts(aligner.plain)
     found = aligner.aligned(wall_plane(), parts)
     assert found is not None
-    corners = np.array([[-1.5, WALL_Y, 0.3], [1.5, WALL_Y, 0.3], [1.5, WALL_Y, 2.0]])
-    assert np.abs(corners @ found.normal - found.offset).max() < 0.02 * WALL_Y
+    assert off_the_wall(found) < 0.02 * WALL_Y
 
 
 @pytest.mark.parametrize("noise", [1.5, 3.0, 5.0])
@@ -223,9 +226,7 @@ def blotched_maps(level: float) -> list[DepthMap]:
     random, found = np.random.default_rng(12), []
     for clean in depth_maps():
         noise = ndimage.gaussian_filter(random.normal(size=clean.depth.shape), 2.0)
-        color = clean.color + (level / noise.std() * noise)[..., None]
-        color = np.clip(np.rint(color), 0, 255).astype(np.uint8)
-        found.append(dataclasses.replace(clean, color=color))
+        found.append(with_noise(clean, (level / noise.std() * noise)[..., None]))
     return found
 
 
@@ -235,8 +236,7 @@ def test_a_plane_that_matches_better_than_its_surroundings_stays(level: float) -
     parts = wall_parts(aligner.plain)
     found = aligner.aligned(wall_plane(), parts)
     assert found is not None
-    corners = np.array([[-1.5, WALL_Y, 0.3], [1.5, WALL_Y, 0.3], [1.5, WALL_Y, 2.0]])
-    assert np.abs(corners @ found.normal - found.offset).max() < 0.02 * WALL_Y
+    assert off_the_wall(found) < 0.02 * WALL_Y
     assert sum(aligner.contradicts(wall_plane(), part) for part in parts) <= len(parts) // 2
     false = wall_plane().moved(np.array([0.0, 1.0, 0.0]), 0.6 * WALL_Y)
     assert aligner.aligned(false, parts) is None
