@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,12 +26,12 @@ PROBES_PER_SIDE = 40
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Isosurface depth against the depth of the true surface, over the pixels that show it."""
+    """Depths against those of the true surface, over the pixels that show it."""
 
     pixels: int
     """Pixels whose ray meets the true surface."""
     found: float
-    """Share of them where the Gaussians have a depth."""
+    """Share of them that have a depth."""
     median: float
     """Median absolute difference along the ray where found, scene units."""
     percentile_95: float
@@ -63,26 +63,21 @@ class VacancyErrors:
 
 
 def depth_errors(
-    gaussians: OrientedGaussians,
-    cameras: Sequence[Camera],
+    depths: Iterable[tuple[Camera, np.ndarray]],
     vertices: np.ndarray,
     faces: np.ndarray,
     thresholds: Sequence[float],
     *,
     threads: int = 0,
 ) -> DepthErrors:
-    """Compare the 0.5-isosurface depth with the first hit of each pixel's ray.
-
-    See docs/method.md, section 2.4.
+    """Compare depths with the first hit of each pixel's ray.
 
     Parameters
     ----------
-    gaussians : OrientedGaussians
-        Scene frame.
-    cameras : sequence of Camera
-        In the same frame; all pixels are compared.
+    depths : iterable of (Camera, (h, w) array)
+        z-depths of all pixels of a camera; 0, or not finite, where there is none.
     vertices, faces : (v, 3) float64, (f, 3) int
-        The true surface in the same frame. Nothing else may occlude it.
+        The true surface in the cameras' frame. Nothing else may occlude it.
     thresholds : sequence of float
         Distances along the ray, unit of the frame.
 
@@ -92,17 +87,15 @@ def depth_errors(
         No pixel shows the surface.
     """
     threads = threads or default_threads()
+    faces = np.ascontiguousarray(faces, np.int32)
     errors, missing = [], 0
-    for camera in cameras:
-        true = depth_buffer(
-            vertices, np.ascontiguousarray(faces, np.int32), camera, threads=threads
-        )
+    for camera, depth in depths:
+        true = depth_buffer(vertices, faces, camera, threads=threads)
         shows = np.isfinite(true.depth)  # (h, w)
-        depth = render(gaussians, camera, RenderOptions(threads=threads)).depth.numpy()  # (h, w)
         stretch = np.linalg.norm(camera.rays(), axis=2)  # (h, w) ray length of one unit of z
-        found = shows & (depth > 0)
+        found = shows & (depth > 0) & np.isfinite(depth)
         missing += int(np.count_nonzero(shows & ~found))
-        errors.append((np.abs(depth.astype(np.float64) - true.depth) * stretch)[found])
+        errors.append(np.abs(depth[found].astype(np.float64) - true.depth[found]) * stretch[found])
     error = np.concatenate(errors) if errors else np.zeros(0)
     total = len(error) + missing
     if total == 0:
@@ -114,6 +107,23 @@ def depth_errors(
         float(np.percentile(error, 95)) if len(error) else float("inf"),
         tuple(float(np.count_nonzero(error <= limit)) / total for limit in thresholds),
     )
+
+
+def rendered_depths(
+    gaussians: OrientedGaussians, cameras: Iterable[Camera], threads: int
+) -> Iterator[tuple[Camera, np.ndarray]]:
+    """Yield each camera with the depth of the 0.5-isosurface (docs/method.md, section 2.4)."""
+    for camera in cameras:
+        yield camera, render(gaussians, camera, RenderOptions(threads=threads)).depth.numpy()
+
+
+def mesh_depths(
+    vertices: np.ndarray, faces: np.ndarray, cameras: Iterable[Camera], threads: int
+) -> Iterator[tuple[Camera, np.ndarray]]:
+    """Yield each camera with the depth of a mesh in its frame."""
+    faces = np.ascontiguousarray(faces, np.int32)
+    for camera in cameras:
+        yield camera, depth_buffer(vertices, faces, camera, threads=threads).depth
 
 
 def vacancy_errors(

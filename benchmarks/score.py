@@ -41,14 +41,17 @@ from gaussian_wrapping_addon.core.photos.store import PhotoStore
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
-from gaussian_wrapping_addon.core.scene.scene import Scene, load_saved_scene
+from gaussian_wrapping_addon.core.scene.scene import Scene, evenly_spaced, load_saved_scene
+from gaussian_wrapping_addon.core.stereo.depth_maps import FILE_NAME as PRIORS_FILE
 from gaussian_wrapping_addon.core.texture.file_checks import atlas_file
 
-from .field_errors import depth_errors, vacancy_errors
+from .field_errors import depth_errors, mesh_depths, rendered_depths, vacancy_errors
 from .runs import THRESHOLD_SHARES
 
 SURFACE_SAMPLES = 200_000
 VACANCY_SAMPLES = 4000
+DEPTH_VIEWS = 8
+"""Training photos whose depths are judged."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -132,7 +135,50 @@ def judge(mesh: Path, scene_folder: Path, job: Path, threads: int, stages: bool)
         gaussians = load_gaussians(stage_folder(job, "train") / "gaussians.npz")
         seen = mesh_scene(job, scene)
         scores |= judge_stages(gaussians, seen, truth, views, masks, thresholds, threads)
+        scores["depths"] = judge_depths(job, scene, gaussians, textured.mesh, truth, thresholds)
     return scores
+
+
+def judge_depths(
+    job: Path, scene: Scene, gaussians: OrientedGaussians, mesh: SurfaceMesh, truth: Truth,
+    thresholds: Sequence[float],
+) -> dict[str, Any]:  # fmt: skip
+    """Return the errors of depths in training photos, to see where accuracy is won or lost.
+
+    ``start``: what matching the photos knew; ``trained``: of the Gaussians; ``mesh``. All of the
+    same pixels, those of up to :data:`DEPTH_VIEWS` photos.
+    Empty for a training without a dense start.
+    """
+    path = stage_folder(job, "train") / PRIORS_FILE
+    if not path.is_file():
+        return {}
+    photos = PhotoStore(scene, read_job(job / "job.json").settings.training.max_image_px)
+    start = []
+    with np.load(path, allow_pickle=False) as arrays:
+        views = [int(name.partition(".")[2]) for name in arrays.files if name.startswith("known.")]
+        for view in evenly_spaced(sorted(views), DEPTH_VIEWS):
+            depth = arrays[f"known.{view}"]
+            start.append((photos.camera(view, photos.camera(view).width // depth.shape[1]), depth))
+    cameras = [camera for camera, _ in start]
+    inverse = scene.world_from_scene.inverse()
+    true = inverse.points(truth.vertices)
+    limits = [inverse.scale * limit for limit in thresholds]
+    found = {
+        "start": depth_errors(start, true, truth.faces, limits),
+        "trained": depth_errors(rendered_depths(gaussians, cameras, 0), true, truth.faces, limits),
+        "mesh": depth_errors(
+            mesh_depths(mesh.vertices, mesh.faces, cameras, 1), true, truth.faces, limits
+        ),
+    }
+    share = THRESHOLD_SHARES[-1] / limits[-1]  # of the diagonal, per scene unit
+    return {
+        name: {
+            "found": errors.found,
+            "median": finite_json(errors.median * share),
+            "within": list(errors.within),
+        }
+        for name, errors in found.items()
+    }
 
 
 def judge_stages(
@@ -160,9 +206,10 @@ def judge_stages(
         similar.append(figures.ssim)
         if mask.any():
             inside.append(score_images(image, photo, mask, threads=threads).psnr)
+    cameras = [camera for camera, _ in views]
     depth = depth_errors(
-        gaussians, [c for c, _ in views], inverse.points(truth.vertices), truth.faces, limits,
-        threads=threads,
+        rendered_depths(gaussians, cameras, threads), inverse.points(truth.vertices), truth.faces,
+        limits, threads=threads,
     ).to_json()  # fmt: skip
     seen = np.flatnonzero(truth.visible())
     chosen = np.random.default_rng(0).choice(seen, min(VACANCY_SAMPLES, len(seen)), replace=False)

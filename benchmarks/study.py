@@ -365,6 +365,8 @@ _SURFACE = (
     "chamfer_mean", "normal_consistency", "truth_count", "visible_count", "thin_count",
 )  # fmt: skip
 """What a record keeps of the scores of a surface."""
+_STAGES = ("gaussians", "depth", "depths", "vacancy")
+"""What it keeps of what lies before the mesh, where that was judged."""
 DIGITS = 6
 
 
@@ -521,7 +523,7 @@ def kept_scores(scores: dict[str, Any]) -> dict[str, Any]:
     """Return what a record keeps of the scores, lengths as shares of the diagonal."""
     texture = {name: scores["texture"].get(name) for name in ("psnr", "ssim", "coverage")}
     kept = {"surface": kept_surface(scores["surface"], scores["diagonal"]), "texture": texture}
-    kept |= {name: scores[name] for name in ("gaussians", "depth", "vacancy") if name in scores}
+    kept |= {name: scores[name] for name in _STAGES if name in scores}
     return dict(rounded(kept))
 
 

@@ -231,6 +231,31 @@ def scene_table(records: ByScene, baselines: ByScene, part: str) -> Table:
     )
 
 
+def depth_table(records: ByScene) -> Table:
+    """Return one row a scene: depths of the start, after training and of the mesh."""
+    rows: list[Row] = []
+    for name, r in records.items():
+        found = r.scores.get("depths")
+        if found:
+            rows.append(
+                {
+                    "scene": name,
+                    **{
+                        f"{stage} {share}": three(found[stage]["within"][k])
+                        for stage in ("start", "trained", "mesh")
+                        for k, share in enumerate(SHARES)
+                    },
+                }
+            )
+    return table_of(
+        "Depths",
+        rows,
+        "Of the pixels of up to eight training photos that show the true surface, the share whose "
+        "depth is within such a share of the diagonal: of the start (what matching photos knew), "
+        "of the Gaussians, and of the mesh.",
+    )
+
+
 def _shown(scene: ZooScene) -> str:
     words = [scene.surroundings, scene.path, "few" if scene.few else ""]
     return ", ".join(word for word in words if word)
@@ -306,6 +331,7 @@ def write_document(out: Path, root: Path = RECORDS) -> Path | None:
         tables = [
             make(records, baselines, part) for part in PARTS for make in (family_table, scene_table)
         ]
+        tables.append(depth_table(records))
         lines += [table.markdown() for table in tables if table.rows]
     every = [record for records in found.values() for record in records.values()]
     return write_page(out / PAGE, "Zoo of scenes", commits(every), lines)

@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from benchmarks.field_errors import depth_errors, vacancy_errors
+from benchmarks.field_errors import depth_errors, rendered_depths, vacancy_errors
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
@@ -54,9 +54,13 @@ def cameras() -> list:
     return [camera_at(3.0 * direction) for direction in unit_sphere(6)]
 
 
+def isosurface(views: list):
+    return rendered_depths(ball(), views, 1)
+
+
 def test_the_right_surface_has_no_error() -> None:
     mesh = sphere(RADIUS)
-    depth = depth_errors(ball(), cameras(), mesh.vertices, mesh.faces, THRESHOLDS)
+    depth = depth_errors(isosurface(cameras()), mesh.vertices, mesh.faces, THRESHOLDS)
     assert depth.pixels > 10_000
     # Depth needs T <= 0.45 behind the ray's peak, which rays near the silhouette do not reach: the
     # discs q_min < 2 ln(alpha / 0.55) and q_min < 2 ln(2 alpha) differ by this ratio of areas.
@@ -76,7 +80,7 @@ def test_the_right_surface_has_no_error() -> None:
 def test_a_known_offset_is_measured_with_its_sign(offset: float) -> None:
     """Judged against a sphere that is ``offset`` smaller, the isosurface lies outside by it."""
     mesh = sphere(RADIUS - offset)
-    depth = depth_errors(ball(), cameras(), mesh.vertices, mesh.faces, THRESHOLDS)
+    depth = depth_errors(isosurface(cameras()), mesh.vertices, mesh.faces, THRESHOLDS)
     assert 0.0099 < depth.median < 0.015  # along slanted rays the gap is longer than the normal
     assert depth.within[0] == 0.0
     assert depth.within[1] > 0.5
@@ -104,7 +108,7 @@ def test_depth_is_compared_along_the_ray_far_off_the_axis() -> None:
     reach = [np.sqrt(radius**2 - missed_sq[valid]) for radius in (RADIUS, RADIUS - offset)]
     gaps = reach[0] - reach[1]  # along the ray, from the outer sphere to the inner one
     mesh = trimesh.creation.icosphere(6, RADIUS - offset)
-    depth = depth_errors(ball(), [camera], mesh.vertices, mesh.faces, (float(np.median(gaps)),))
+    depth = depth_errors(isosurface([camera]), mesh.vertices, mesh.faces, (float(np.median(gaps)),))
     assert depth.pixels == pytest.approx(shown.sum(), rel=2e-3)
     assert depth.found == pytest.approx(valid.sum() / shown.sum(), abs=3e-3)
     assert depth.median == pytest.approx(np.median(gaps), rel=5e-3)
@@ -114,7 +118,7 @@ def test_depth_is_compared_along_the_ray_far_off_the_axis() -> None:
 def test_what_is_missing_is_counted_as_missing() -> None:
     far = sphere(RADIUS)
     far.apply_translation([0.0, 0.0, 2.0 * RADIUS])
-    depth = depth_errors(ball(), cameras()[2:4], far.vertices, far.faces, THRESHOLDS)
+    depth = depth_errors(isosurface(cameras()[2:4]), far.vertices, far.faces, THRESHOLDS)
     assert depth.found < 0.9
     field = VacancyField(ball().arrays(), cameras())
     points = unit_sphere(100)
@@ -127,7 +131,7 @@ def test_nothing_to_compare_is_refused() -> None:
     mesh = sphere(RADIUS)
     behind = np.add(mesh.vertices, [0.0, 0.0, 1e4])
     with pytest.raises(UsageError, match="No pixel"):
-        depth_errors(ball(), cameras()[:1], behind, mesh.faces, THRESHOLDS)
+        depth_errors(isosurface(cameras()[:1]), behind, mesh.faces, THRESHOLDS)
     with pytest.raises(UsageError, match="no sample"):
         vacancy_errors(
             VacancyField(ball().arrays(), cameras()), np.zeros((0, 3)), np.zeros((0, 3)), THRESHOLDS

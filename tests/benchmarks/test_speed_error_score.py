@@ -14,15 +14,17 @@ from PIL import Image
 
 from benchmarks.score import judge, judge_truth
 from benchmarks.speed_vs_error import write_comparison
+from gaussian_wrapping_addon.core.evaluation.surface_scores import read_truth
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.gaussians.files import save_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.loading.load import load_scene
+from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.scene_regions import write_region
 from gaussian_wrapping_addon.core.regions.shapes import Region
-from gaussian_wrapping_addon.core.scene.scene import save_scene
+from gaussian_wrapping_addon.core.scene.scene import load_saved_scene, save_scene
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.field.field_scenes import unit_sphere
 from tests.synthetic import write_ball_scene
@@ -134,6 +136,42 @@ def test_stages_are_judged_in_shares_of_the_diagonal(run: tuple[Path, Path]) -> 
     assert outside / 2 < scores["depth"]["median"] < 4 * outside
     assert scores["gaussians"]["count"] == 5000
     assert scores["gaussians"]["object_psnr"] > scores["gaussians"]["psnr"] - 10.0
+
+
+def test_depths_of_start_training_and_mesh_stand_side_by_side(run: tuple[Path, Path]) -> None:
+    """The start is the true depth of one photo, and 0.7 % of the diagonal behind it in another."""
+    scene_folder, folder = run
+    job = folder / "out"
+    scene = load_saved_scene(job / "stages" / "cameras-0")
+    ball = trimesh.creation.icosphere(5, 1.0)
+    world = scene.world_from_scene
+    truth = read_truth(scene_folder)
+    layers, shown = {}, []
+    for view, behind in ((0, 0.0), (7, 0.007)):
+        depth = depth_buffer(
+            world.inverse().points(truth.vertices), ball.faces.astype(np.int32),
+            scene.cameras[view], threads=1,
+        ).depth  # fmt: skip
+        shown.append(np.isfinite(depth).sum())
+        stretch = np.linalg.norm(scene.cameras[view].rays(), axis=2)
+        diagonal = 2.0 * SIDE * SCALE * math.sqrt(3.0) / world.scale
+        far = depth + behind * diagonal / stretch
+        layers[f"known.{view}"] = np.where(np.isfinite(depth), far, 0.0).astype(np.float32)
+    priors = job / "stages" / "train-0" / "depth_priors.npz"
+    assert judge(folder / "mesh", scene_folder, job, 1, stages=True)["depths"] == {}
+    np.savez(priors, **layers)
+    try:
+        scores = judge(folder / "mesh", scene_folder, job, 1, stages=True)
+        depths = scores["depths"]
+    finally:
+        priors.unlink()
+    assert depths["start"]["found"] == depths["mesh"]["found"] == 1.0
+    exact = shown[0] / sum(shown)
+    assert depths["start"]["within"] == pytest.approx([exact, exact, 1.0], abs=1e-9)
+    assert depths["start"]["median"] < 0.0071
+    assert depths["mesh"]["within"] == [1.0, 1.0, 1.0]
+    assert depths["mesh"]["median"] < 1e-6
+    assert depths["trained"]["median"] == pytest.approx(scores["depth"]["median"], rel=0.1)
 
 
 def test_the_truth_judged_by_itself(run: tuple[Path, Path]) -> None:

@@ -239,6 +239,7 @@ def test_lengths_are_kept_as_shares_of_the_diagonal() -> None:
         "surface": {"uniform": surface(0.7), "scan": surface(0.8), "legacy": surface(0.5)},
         "texture": {"psnr": 24.123456789, "views": [1, 2]},
         "gaussians": {"count": 7},
+        "depths": {"start": {"within": [0.1, 0.2, 0.3]}},
     }
     kept = kept_scores(scores)
     assert set(kept["surface"]) == {"uniform", "scan"}
@@ -246,6 +247,7 @@ def test_lengths_are_kept_as_shares_of_the_diagonal() -> None:
     assert kept["surface"]["uniform"]["f1"] == [0.7, 0.701, 0.702]
     assert kept["texture"] == {"psnr": 24.1235, "ssim": None, "coverage": None}
     assert kept["gaussians"] == {"count": 7}
+    assert kept["depths"] == {"start": {"within": [0.1, 0.2, 0.3]}}
     assert "depth" not in kept
 
 
