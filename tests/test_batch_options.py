@@ -34,7 +34,8 @@ from gaussian_wrapping_addon.core.settings.job import write_saved_settings
 
 BATCH = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon" / "batch.py"
 
-DECIDED = tuple(name for name in MODEL_SELECTION if name not in ("harmonics", "wrapping"))
+SWITCHES = {"harmonics": "on", "growth": "on", "wrapping": "off"}
+DECIDED = tuple(name for name in MODEL_SELECTION if name not in SWITCHES)
 
 
 def settings_of(*arguments: str) -> JobSettings:
@@ -59,8 +60,8 @@ def test_without_options_the_preset_stands(name: str) -> None:
         ("--set", "preview_every=2.5", "preview_every_s", 2.5),
         ("--set", "mask_mode=background", "mask_mode", "background"),
         *(("--set", f"{n}=off", n, "off") for n in DECIDED),
-        *(("--set", f"{n}=on", n, "on") for n in MODEL_SELECTION if n != "harmonics"),
-        ("--set", "harmonics=off", "harmonics", "off"),
+        *(("--set", f"{n}=on", n, "on") for n in MODEL_SELECTION if SWITCHES.get(n) != "on"),
+        *(("--set", f"{n}=off", n, "off") for n in ("harmonics", "growth")),
     ],
 )
 def test_an_option_changes_its_setting_alone(
@@ -433,7 +434,7 @@ def test_export_asks_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "elsewhere"), [("harmonics", "on"), ("wrapping", "off")])
+@pytest.mark.parametrize(("name", "elsewhere"), SWITCHES.items())
 def test_parts_that_photos_do_not_decide_on(name: str, elsewhere: str) -> None:
     for word in PRESETS:
         given = getattr(settings_of("--preset", word, "--needs", "auto").training, name)

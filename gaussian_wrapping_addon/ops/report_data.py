@@ -28,7 +28,7 @@ MAX_ROWS = 100
 """Stages and regions stored at most."""
 
 _DECISIONS = {
-    "exposure": "Exposure", "multi_view": "Compare Photos", "growth": "Add Gaussians",
+    "exposure": "Exposure", "multi_view": "Compare Photos",
     "full_size": "Photo Size", "dense_start": "Dense Start", "refine_poses": "Refine Cameras",
     "region_weight": "Regions First",
 }  # fmt: skip

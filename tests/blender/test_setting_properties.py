@@ -35,7 +35,6 @@ STORED: dict[str, list[str] | None] = {
     "texture_source": ["PHOTOS", "GAUSSIANS"],
     "training.exposure": ["AUTO", "ON", "OFF"],
     "training.multi_view": ["AUTO", "ON", "OFF"],
-    "training.growth": ["AUTO", "ON", "OFF"],
     "training.mask_mode": ["IGNORE", "BACKGROUND", "AUTO"],
     "training.turntable": ["AUTO", "ON", "OFF"],
     "training.georeference": ["AUTO", "ON", "OFF"],
@@ -43,7 +42,8 @@ STORED: dict[str, list[str] | None] = {
         (
             "edge_length", "points", "most_parts", "decimate", "target_faces", "smooth_steps",
             "ambient_occlusion", "lods", "max_atlases", "training.reflections",
-            "training.orientations", "training.mask_invert", "training.mask_grow_px",
+            "training.orientations", "training.add_gaussians",
+            "training.mask_invert", "training.mask_grow_px",
             "training.markers", "training.control_points", "training.iterations",
             "training.max_gaussians", "training.max_image_px", "training.start_splat",
             "training.more_iterations",

@@ -177,17 +177,17 @@ class MethodSettings:
     )
     overlap_price: float = _constant(
         2e-5,
-        "Footprint regulariser, where `growth` is auto: cost, in the unit of the loss, of one more "
-        "Gaussian over every pixel.",
+        "Footprint regulariser: cost, in the unit of the loss, of one more Gaussian over every "
+        "pixel.",
         _SHARE, paper=0.0,
     )
     # Of 40 photos of a thing in a studio, this prunes as many as half a per cent of the weights of
     # all views together would.
     prune_share: float = _constant(
         0.03,
-        "Where `growth` is auto, Gaussians that in no training view belong to more than the least "
-        "contributors, which together make up this share of its blending weights, are pruned at "
-        "intervals; 0 prunes none.",
+        "Gaussians that in no training view belong to more than the least contributors, which "
+        "together make up this share of its blending weights, are pruned at intervals; 0 prunes "
+        "none.",
         Range(0.0, 0.5, below_high=True), unit="share", paper=0.0,
     )
     orient_from: float = _constant(
@@ -243,8 +243,9 @@ def _switch(default: str, *, label: str, tooltip: str, name: str, **more: Any) -
     """Declare a part of the model that no photo decides on; the preset Paper has all of them.
 
     Version 0.1.0 decided on it from the photos: its job files say ``"auto"``, which trains without
-    it; saved settings that do take the default. The property in the panel has a ``name`` that is
-    not the setting's, which .blend files hold as an enum.
+    harmonics and orientations, and with growth; saved settings that do take the default. The
+    property in the panel has a ``name`` that is not the setting's, which .blend files hold as an
+    enum.
     """
     return setting(
         default, check=Choices(SWITCH, earlier=("auto",)),
@@ -344,17 +345,16 @@ class TrainingSettings(MethodSettings):
         "short trainings lose a little. The preset Paper always does",
         name="orientations",
     )
-    growth: str = _model_selection(
-        help="Densification. auto: it stops where more Gaussians gain little, and Gaussians that "
-        "contribute little are kept small (`overlap_price`) and pruned (`prune_share`); on: only "
-        "the cap stops it; off: none are added.",
-        paper="on",
-        option=Option(
-            "--growth", help="more Gaussians: while they lower the error, up to the cap, or none",
-        ),
-        label="Add Gaussians", tooltip="Whether more Gaussians are added where detail is missing",
-        auto="Add Gaussians while they lower the error", on="Add Gaussians up to the limit",
-        off="Keep the number that training starts with",
+    growth: str = _switch(
+        "on",
+        help="Density control: Gaussians are added up to the limit where the photos show more, "
+        "kept small (`overlap_price`) and removed where they contribute little (`prune_share`). "
+        "off: their number stays that of the start.",
+        option=Option("--growth", help="Gaussians added up to the limit, and pruned"),
+        label="Add Gaussians",
+        tooltip="Add Gaussians up to the limit where detail is missing, and remove those that "
+        "contribute little",
+        name="add_gaussians",
     )
     full_size: str = _model_selection(
         help="Training image size. auto: photos that show nothing finer than half their size are "

@@ -36,7 +36,7 @@ from .backend import Backend
 from .density import largest_contributors
 from .exposure import Exposure
 from .focus import Focus
-from .growth_selection import photo_detail, select_image_size
+from .image_size_selection import photo_detail, select_image_size
 from .live_view import divisor_for
 from .model_selection import ModelSelection
 from .start import Handover
@@ -220,10 +220,8 @@ class BlockPlan:
 
         ``part`` names it among those of the plan; ``further`` are the other fields.
         """
-        # Growth ended, or did not, at the size of the coarse photos: each block decides that anew,
-        # and by its own photos whether it is for the regions.
-        anew = ("growth", "region_weight")
-        lasting = tuple(d for d in self.coarse.model_selection if d.name not in anew)
+        # Each block decides by its own photos whether it is for the regions.
+        lasting = tuple(d for d in self.coarse.model_selection if d.name != "region_weight")
         return Handover(
             degree=self.coarse.gaussians.sh_degree,
             model_selection=ModelSelection(lasting),

@@ -234,7 +234,7 @@ ROUND_GROWTH = 1.8
 the first one)."""
 
 LITTLE_GROWTH = 0.4
-"""Least share of the room for growth that is used if the photos decide on growth."""
+"""Least share of the room for growth that is used where Gaussians are pruned."""
 
 BASE_BYTES = 520 * 2**20
 """Python with torch, scipy and the compiled kernels. With this, a training of 8000 Gaussians at 96
@@ -361,7 +361,7 @@ def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float
     start = min(limit, max(facts.points, MIN_START_POINTS))
     if settings.dense_start != "off" and facts.photos > 1:
         start = max(start, start_budget(limit))
-    top = limit if settings.growth == "on" else start + growth * (limit - start)
+    top = start + growth * (limit - start) if settings.prune_share > 0.0 else limit
     if settings.growth == "off":
         top = start
     total = settings.iterations + settings.extra_iterations

@@ -342,7 +342,7 @@ def first_decisions(
     scene: Scene, photos: PhotoSource, views: Sequence[int], neighbours: Mapping[int, np.ndarray],
     settings: TrainingSettings, image_size: Decision,
 ) -> tuple[ModelSelection, Exposure | None]:  # fmt: skip
-    """Decide on exposure and multi-view terms, and on growth where the settings do.
+    """Decide on exposure and multi-view terms.
 
     ``views`` are those trained on, ``image_size`` was decided before.
     """
@@ -354,7 +354,4 @@ def first_decisions(
     if selection.chose("exposure"):
         exposure = Exposure(len(scene.views), views, found.log_gains)
     pairs = [neighbours[view] for view in views]
-    selection = selection.with_decision(select_multi_view(pairs, settings.multi_view))
-    if settings.growth == "off":
-        selection = selection.with_decision(Decision.by_settings("growth", "off"))
-    return selection, exposure
+    return selection.with_decision(select_multi_view(pairs, settings.multi_view)), exposure

@@ -29,12 +29,6 @@ from .state import TrainingState
 AVERAGE_SHARE = 0.05
 """Weight of the newest iteration in the moving averages of the progress message."""
 
-_MAX_WINDOWS = 1 << 12
-"""Upper bound of the windows per photo; combines view and window into one history index."""
-
-_FIRST_OF_FOCUS = _MAX_WINDOWS // 2
-"""Number of the first window of what the regions cover in a photo."""
-
 
 class NotFinite(Exception):  # noqa: N818 - asks for a restart, caught in trainer.py
     """A loss is not finite."""
@@ -48,7 +42,6 @@ class _Sample:
     divisor: int
     whole: Camera
     window: Window
-    number: int
     camera: Camera
     shown: Shown
     of_surroundings: bool
@@ -129,7 +122,7 @@ class Stepper:
             raise NotFinite()
         seen = backend.backward(image, gradients)
         # Before merging the other view's gradients: culled Gaussians have no boxes in this view.
-        price = self.settings.overlap_price if self.schedule.compact else 0.0
+        price = self.settings.overlap_price if self.schedule.controls_density else 0.0
         opacity_weight = schedule.opacity_weight(iteration)
         if not state.model_selection.chose("dense_start"):
             opacity_weight = 0.0
@@ -157,10 +150,8 @@ class Stepper:
             state.exposure.step(sample.view, state.rate_factor * rate)
         state.iteration = iteration + 1
         if self._is_empty(sample) or sample.of_surroundings:
-            return  # no pixel was compared, or growth is not for what was
-        window_id = sample.view * _MAX_WINDOWS + sample.number
+            return  # no pixel was compared, or only pixels that training is not for
         error = float(found[1])
-        state.error_history.add(iteration, window_id, len(adam), error, sample.divisor)
         share = AVERAGE_SHARE if state.error_average > 0.0 else 1.0
         state.error_average += share * (error - state.error_average)
         state.loss_average += share * (float(found[0]) - state.loss_average)
@@ -187,18 +178,13 @@ class Stepper:
             for box in boxes or [Window(0, 0, whole.width, whole.height)]
             for part in windows(box.width, box.height, self.settings.pixels_per_iteration)
         ]
-        numbers = np.arange(len(choices))
+        useful = choices
         if mask is not None and self.settings.mask_mode == "ignore":
-            shown = np.array([bool(window.of(mask).any()) for window in choices])
-            numbers = np.flatnonzero(shown) if shown.any() else numbers
-        number = int(numbers[int(state.random.integers(len(numbers)))])
-        window = choices[number]
+            useful = [window for window in choices if window.of(mask).any()] or choices
+        window = useful[int(state.random.integers(len(useful)))]
         part = None if len(choices) == 1 and not boxes else window
-        number += _FIRST_OF_FOCUS if boxes else 0
         seen = self.backend.shown(self.photos, view, divisor, part)
-        return _Sample(
-            view, divisor, whole, window, number, window.camera(whole), seen, boxes == []
-        )
+        return _Sample(view, divisor, whole, window, window.camera(whole), seen, boxes == [])
 
     def _boxes(self, state: TrainingState, view: int, divisor: int) -> list[Window] | None:
         """Return the rectangles of the regions in a photo to train on this time.

@@ -68,8 +68,6 @@ class Rounds:
         iteration, schedule = state.iteration, self.schedule
         if iteration > 0 and schedule.divisor(iteration) != schedule.divisor(iteration - 1):
             self.filter(state)
-        if schedule.starts_depth(iteration):
-            state.error_history.clear()  # colour errors rise when other terms are added
         if schedule.starts_orientation(iteration):
             start_orientation(
                 state.adam, self._views(VOTE_DIVISOR), self.stepper.renderer,
@@ -104,7 +102,6 @@ class Rounds:
             self.filter(state)
         if schedule.resets_opacity(iteration):
             reset_opacity(adam)
-            state.error_history.clear()
 
     def filter(self, state: TrainingState) -> None:
         """Compute the 3D filter for the image size of the coming iteration."""
@@ -136,16 +133,8 @@ class Rounds:
         state.model_selection = state.model_selection.with_decision(decision)
 
     def _densify(self, state: TrainingState) -> None:
-        """Densify and prune; stop densifying for good once growth no longer pays."""
-        setting, limit = self.settings.growth, self.schedule.budget(state.iteration)
-        known = state.model_selection.get("growth")
-        stopped = setting == "auto" and known is not None and known.chosen == "stopped"
-        if not stopped and (setting == "auto" or known is None):
-            evidence = state.error_history.growth_evidence()
-            state.model_selection = state.model_selection.with_decision(evidence.decision(setting))
-            stopped = setting == "auto" and not evidence.pays
         change = densify_and_prune(
-            state.adam, state.statistics, 0 if stopped else limit, state.random,
+            state.adam, state.statistics, self.schedule.budget(state.iteration), state.random,
             self._region_weights(state), least_score=self.settings.densify_score,
             min_opacity=self.settings.min_opacity,
         )  # fmt: skip

@@ -164,10 +164,6 @@ class Schedule:
         begin, end = self._at(self.settings.depth_from), self._at(self.settings.multi_view_until)
         return begin <= iteration < end and iteration % self.settings.multi_view_every == 0
 
-    def starts_depth(self, iteration: int) -> bool:
-        """Tell whether this is the first iteration of the depth-normal loss."""
-        return iteration == self._at(self.settings.depth_from)
-
     def is_oriented(self, iteration: int) -> bool:
         """Tell whether the orientation is trained."""
         return self.settings.wrapping == "on" and iteration >= self._at(self.settings.orient_from)
@@ -178,30 +174,22 @@ class Schedule:
 
     def gathers_statistics(self, iteration: int) -> bool:
         """Tell whether this iteration collects statistics for density control."""
-        return self._controls_density and iteration < self._at(self.settings.densify_until)
+        return self.controls_density and iteration < self._at(self.settings.densify_until)
 
     def densifies(self, iteration: int) -> bool:
         """Tell whether density control runs after this iteration."""
         begin, end = self._at(self.settings.densify_from), self._at(self.settings.densify_until)
         due = begin < iteration <= end and iteration % self.settings.densify_every == 0
-        return self._controls_density and due
+        return self.controls_density and due
 
     @property
-    def _controls_density(self) -> bool:
+    def controls_density(self) -> bool:
+        """Whether Gaussians are added, kept small and removed."""
         return self.settings.growth != "off"
-
-    @property
-    def compact(self) -> bool:
-        """Tell whether the model is kept compact: footprint regulariser and pruning are on.
-
-        Both belong to the automatic choice of the number of Gaussians; a setting that fixes it
-        switches them off.
-        """
-        return self.settings.growth == "auto"
 
     def prunes(self, iteration: int) -> bool:
         """Tell whether Gaussians of little contribution are pruned after this iteration."""
-        wanted = self.compact and self.settings.prune_share > 0.0
+        wanted = self.controls_density and self.settings.prune_share > 0.0
         return wanted and iteration in {self._at(x) for x in PRUNE_AT}
 
     def growth_limit(self) -> int:
@@ -227,7 +215,7 @@ class Schedule:
         """Tell whether opacities are reset after this iteration."""
         until = self._at(self.settings.densify_until)
         return (
-            self._controls_density
+            self.controls_density
             and iteration % RESET_EVERY == 0
             and 0 < iteration <= until - RESET_EVERY
         )

@@ -29,7 +29,6 @@ from .adam import Adam
 from .camera_poses import CameraPoses
 from .density import DensityStatistics
 from .exposure import Exposure
-from .growth_selection import ErrorHistory
 from .model_selection import ModelSelection
 
 # -- Cancellation inside the loops of a training that render many views per iteration -------------
@@ -124,8 +123,6 @@ class TrainingState:
     """Per-photo exposures; ``None`` where they are not modelled."""
     poses: CameraPoses | None = None
     """Refined poses of the cameras; ``None`` where they stay as given."""
-    error_history: ErrorHistory = field(default_factory=ErrorHistory)
-    """Per-view errors from which growth is decided; stored under the prefix ``visits.``."""
     warnings: list[ReportWarning] = field(default_factory=list)
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
@@ -179,7 +176,7 @@ class TrainingState:
             arrays |= {f"exposure.{k}": v for k, v in self.exposure.to_arrays().items()}
         if self.poses is not None:
             arrays |= {f"poses.{k}": v for k, v in self.poses.to_arrays().items()}
-        return arrays | {f"visits.{k}": v for k, v in self.error_history.to_arrays().items()}
+        return arrays
 
     def to_json(self) -> dict[str, Any]:
         """Return the rest of the state as plain JSON values."""
@@ -245,7 +242,6 @@ class TrainingState:
         state.exposure = Exposure.restore(exposure) if exposure else None
         poses = _part(arrays, "poses.")
         state.poses = CameraPoses.restore(poses) if poses else None
-        state.error_history = ErrorHistory.restore(_part(arrays, "visits."))
         return state
 
 

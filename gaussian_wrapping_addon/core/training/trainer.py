@@ -40,7 +40,7 @@ from .cpu_backend import CpuBackend
 from .exposure import Exposure
 from .exposure_selection import first_decisions
 from .focus import Focus, favour
-from .growth_selection import photo_detail, select_image_size
+from .image_size_selection import photo_detail, select_image_size
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import LiveView, divisor_for, held_out_metrics, measure_held_out
 from .model_selection import Decision, start_poses

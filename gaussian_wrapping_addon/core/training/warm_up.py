@@ -25,7 +25,7 @@ SIDE_PX = 64
 POINTS = 200
 ITERATIONS = 24
 _DISTANCE = 4.0
-_DECIDED = ("exposure", "multi_view", "growth")
+_DECIDED = ("exposure", "multi_view")
 
 
 class _NoisePhotos:

@@ -28,7 +28,7 @@ ITERATIONS, STOP, SEED = 20, 10, 1
 SETTINGS = TrainingSettings(
     iterations=ITERATIONS, max_gaussians=160, max_image_px=32, sh_degree=1, densify_every=4,
     wrap_rounds=1, wrap_from=0.6, orient_from=0.3, depth_from=0.1, checkpoint_every_s=1e9,
-    dense_start="off", multi_view="off", harmonics="on", wrapping="on", growth="on",
+    dense_start="off", multi_view="off", harmonics="on", wrapping="on", prune_share=0.0,
     exposure="on", refine_poses="on",
 )  # fmt: skip
 

@@ -76,11 +76,11 @@ CASES = {
         dataclasses.replace(SETTINGS, mask_mode="ignore"), masks=True, exposure=True, poses=True
     ),
     "background": Case(
-        dataclasses.replace(SETTINGS, mask_mode="background", growth="auto"),
+        dataclasses.replace(SETTINGS, mask_mode="background", growth="on"),
         masks=True, exposure=True, priors=True,
     ),
     "windows": Case(
-        dataclasses.replace(SETTINGS, pixels_per_iteration=1500, growth="auto"),
+        dataclasses.replace(SETTINGS, pixels_per_iteration=1500, growth="on"),
         size_px=64, masks=True, poses=True,
     ),
 }  # fmt: skip
@@ -165,8 +165,6 @@ class Run:
         """Return a state of which no value is one at which a derivative jumps."""
         state = TrainingState.start(perturbed_sphere(120, seed), seed)
         selection = ModelSelection((Decision.by_settings("multi_view", "on"),))
-        for name in ("wrapping", "growth") if self.case.settings.growth == "on" else ("wrapping",):
-            selection = selection.with_decision(Decision.by_settings(name, "on"))
         if self.case.priors:
             selection = selection.with_decision(Decision.by_settings("dense_start", "on"))
         state.model_selection = selection

@@ -38,7 +38,6 @@ from .region_section import Picture, closedness, note_lines, region_lines, regio
 _TITLES = {
     "exposure": "Brightness and tint of each photo",
     "multi_view": "Comparison of neighbouring photos",
-    "growth": "Number of Gaussians",
     "full_size": "Size of the training images",
     "dense_start": "Start on surfaces found by matching photos",
     "refine_poses": "Camera poses refined",
@@ -53,7 +52,6 @@ _EFFECTS = {
     "refine_poses": '"on" refines them in any case; "off" takes them as given',
     "dense_start": '"on" starts on whatever is found; "off" starts from the sparse points',
     "region_weight": "1 trains for all that the photos show, more for regions in them",
-    "growth": '"on" lets the number grow up to `max_gaussians`; "off" adds none',
 }
 
 _DECIDED_BY = {"auto": "the photos", "on": "you (on)", "off": "you (off)"}

@@ -488,7 +488,7 @@ def test_each_judgement_stands_alone(path: tuple[str, ...], value: Any, words: s
     assert warning.code
 
 
-NAMES = ("exposure", "multi_view", "growth", "full_size", "dense_start", "refine_poses")
+NAMES = ("exposure", "multi_view", "full_size", "dense_start", "refine_poses")
 
 
 def training() -> dict[str, Any]:
