@@ -105,12 +105,9 @@ def write_viewer_ply(path: Path, gaussians: OrientedGaussians) -> None:
     MeshingError
         If a Gaussian is not finite in single precision: viewers would show nothing, or crash.
     """
-    wide = gaussians.mapped(lambda value: value.detach().cpu().double())
-    log_opacity = wide.log_opacities()
-    # logit = log(a / (1 - a)), from log a without losing a close to 1
-    logit = log_opacity - torch.log(-torch.expm1(log_opacity.clamp_max(-1e-12)))
-    logit = logit.clamp(-MAX_OPACITY_LOGIT, MAX_OPACITY_LOGIT)
-    baked = wide.replaced(log_scales=torch.log(wide.scales()), opacity_logits=logit)
+    baked = gaussians.baked()
+    logits = baked.opacity_logits.clamp(-MAX_OPACITY_LOGIT, MAX_OPACITY_LOGIT)
+    baked = baked.replaced(opacity_logits=logits)
     arrays = {name: t.numpy() for name, t in baked.tensors()}
     valid = np.ones(len(arrays["means"]), np.bool_)
     for name in ("means", "sh", "opacity_logits", "log_scales", "quats"):

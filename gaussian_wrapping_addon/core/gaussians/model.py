@@ -29,6 +29,9 @@ TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation"
 instead (docs/method.md, section 1.5)."""
 
 
+_LEAST_TRANSPARENCY = 1e-12  # of baked opacities
+
+
 @dataclass(frozen=True)
 class GaussianArrays:
     """Activated Gaussians as C-contiguous float64 numpy arrays, mip filter applied.
@@ -110,6 +113,20 @@ class OrientedGaussians:
         """(n,) log of the effective opacity, numerically stable (docs/method.md, section 5.4)."""
         loss = self.log_scales - torch.log(self.scales())  # (n, 3), <= 0
         return -torch.nn.functional.softplus(-self.opacity_logits) + loss.sum(1)
+
+    def baked(self, more: Tensor | float = 0.0) -> OrientedGaussians:
+        """Return the same Gaussians, float64 and detached, with the filter in their own parameters.
+
+        ``more`` (n,) is added to the logarithms of the opacities, which stay below 1.
+        """
+        wide = self.mapped(lambda value: value.detach().cpu().double())
+        log_opacity = (wide.log_opacities() + more).clamp_max(-_LEAST_TRANSPARENCY)
+        # logit = log(a / (1 - a)), from log a without losing a close to 1
+        logit = log_opacity - torch.log(-torch.expm1(log_opacity))
+        return wide.replaced(
+            log_scales=torch.log(wide.scales()), opacity_logits=logit,
+            filter_3d=torch.zeros_like(wide.filter_3d),
+        )  # fmt: skip
 
     def rotations(self) -> Tensor:
         """(n, 3, 3) rotation matrices; columns are the axes. A zero quaternion is the identity."""
@@ -209,6 +226,41 @@ def _pack(camera: Camera) -> list[float]:
         camera.fx, camera.fy, camera.cx, camera.cy,
         -wide, camera.width + wide, -high, camera.height + high,
     ]  # fmt: skip
+
+
+# -- Opacity that the photos' blur took from thin parts (docs/method.md, section 5.7) -------------
+
+
+LEAST_WIDTH_SHARE, MOST_OPACITY = 0.3, 0.99
+"""Least share of a Gaussian's width that counts as its own: no opacity rises by more than 3.3; and
+that to which it rises at most."""
+
+
+def without_blur(
+    gaussians: OrientedGaussians, variance_px: float, filter_variance_px: float
+) -> OrientedGaussians:
+    """Return Gaussians with the opacity that lens and pixels took from what is thin, float32.
+
+    A photo shows a rod wider and fainter than it is, and so Gaussians learn it. Across the rod blur
+    keeps the product of opacity and width, hence ``a' = a s / sqrt(s^2 - b^2)``, with ``s`` the
+    middle one of the three standard deviations: of a rod the wide one of the two that are narrow;
+    parts of a surface are wide in two directions, and keep their opacity. The width stays what
+    photos show: a mesh resolves no less than their pixels.
+
+    Parameters
+    ----------
+    variance_px : float
+        Variance ``b^2`` of the blur in squared pixels of the closest camera; 0 changes nothing.
+    filter_variance_px : float
+        That of the Gaussians' 3D filter, which knows the size of these pixels; 0 changes nothing.
+    """
+    if variance_px <= 0.0 or filter_variance_px <= 0.0:
+        return gaussians
+    square = gaussians.scales().detach().cpu().double().sort(1).values[:, 1] ** 2  # (n,)
+    blur = gaussians.filter_3d.detach().cpu().double() ** 2 * (variance_px / filter_variance_px)
+    own = torch.maximum(square - blur, LEAST_WIDTH_SHARE**2 * square)
+    room = (math.log(MOST_OPACITY) - gaussians.log_opacities().detach().cpu().double()).clamp_min(0)
+    return gaussians.baked(torch.minimum(0.5 * torch.log(square / own), room)).mapped(Tensor.float)
 
 
 # -- Initial Gaussians: from sparse points, and along camera rays if these are few ----------------

@@ -221,6 +221,15 @@ class MeshingSettings:
         check=Range(0.3, 0.9), since="0.2.0", unit="vacancy",
         option=Option("--level", help="vacancy at which the surface is (default: 0.5)"),
     )
+    blur_variance: float = setting(
+        0.25,
+        help="Variance of the blur of lens and pixels: thin parts get the opacity back that it "
+        "takes from them. 0: Gaussians as they were trained, as published.",
+        check=Range(0.0, 1.0), presets={"paper": 0.0}, since="0.2.0", unit="squared pixels",
+        option=Option(
+            "--blur-variance", "X", "variance of the photos' blur, which takes opacity from rods",
+        ),
+    )
     cameras: str = setting(
         "training",
         help="Cameras that the mesh is made from. training: those that were trained on, as the "

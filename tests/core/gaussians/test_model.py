@@ -15,9 +15,11 @@ from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.gaussians.model import (
     MIN_START_POINTS,
     SH_C0,
+    OrientedGaussians,
     gaussians_at,
     initial_gaussians,
     mip_filter,
+    without_blur,
 )
 from gaussian_wrapping_addon.core.limits import NEAR_Z, POINT_REACH, SCENE_RADIUS
 from gaussian_wrapping_addon.core.render.render import render
@@ -263,3 +265,74 @@ def test_nothing_seen_or_nothing_there() -> None:
     assert 0 < behind[0] < 1
     assert mip_filter(np.zeros((0, 3)), [camera]).shape == (0,)
     assert mip_filter(np.zeros((2, 3)), []).tolist() == [0.0, 0.0]
+
+
+# -- Opacity without the photos' blur -------------------------------------------------------------
+
+PIXEL, FILTER_PX2, BLUR_PX2 = 0.02, 0.05, 0.25
+
+
+def learnt(own_px: list[tuple[float, float, float]], opacity: list[float]) -> OrientedGaussians:
+    """Return Gaussians as photos with blur show them: widths in pixels and opacities are their own.
+
+    A photo keeps the integral of the opacity across what it shows.
+    """
+    own = np.array(own_px)
+    wide = np.sqrt(own**2 + BLUR_PX2)  # (n, 3)
+    across = np.sort(own / wide, axis=1)[:, 1]
+    shown = np.array(opacity) * across
+    count = len(own)
+    filter_sq = FILTER_PX2 * PIXEL**2
+    raw = np.sqrt((PIXEL * wide) ** 2 - filter_sq)
+    log_loss = np.log(raw / (PIXEL * wide)).sum(1)
+    trained = shown / np.exp(log_loss)
+    assert (trained < 1).all()
+    return OrientedGaussians(
+        means=torch.zeros(count, 3), log_scales=torch.from_numpy(np.log(raw)).float(),
+        quats=torch.tensor([[0.7, 0.1, -0.2, 0.5]]).repeat(count, 1),
+        opacity_logits=torch.from_numpy(np.log(trained / (1 - trained))).float(),
+        sh=torch.zeros(count, 1, 3), orientation=torch.zeros(count, 4),
+        filter_3d=torch.full((count,), math.sqrt(filter_sq)),
+    )  # fmt: skip
+
+
+def test_rods_get_back_the_opacity_that_blur_took() -> None:
+    """A rod of any orientation of its axes, a thinner one, a dot."""
+    own = [(0.9, 0.9, 20.0), (20.0, 0.5, 0.5), (0.6, 0.6, 0.6)]
+    opacity = [0.9, 0.8, 0.7]
+    gaussians = learnt(own, opacity)
+    sharp = without_blur(gaussians, BLUR_PX2, FILTER_PX2)
+    assert sharp.opacity_logits.dtype == torch.float32
+    assert (torch.exp(gaussians.log_opacities()).numpy() < np.array(opacity) - 0.05).all()
+    assert torch.exp(sharp.log_opacities()).numpy() == pytest.approx(opacity, abs=1e-4)
+    assert sharp.scales().numpy() == pytest.approx(gaussians.scales().numpy(), rel=1e-5)
+    for name in ("means", "quats", "sh", "orientation"):
+        assert torch.equal(getattr(sharp, name), getattr(gaussians, name))
+
+
+def test_surfaces_keep_their_opacity_and_none_is_lost_or_becomes_solid() -> None:
+    gaussians = learnt([(5.0, 8.0, 0.1), (0.2, 0.2, 9.0), (4.0, 4.0, 4.0)], [0.6, 0.95, 0.99])
+    before = torch.exp(gaussians.log_opacities()).numpy()
+    after = torch.exp(without_blur(gaussians, BLUR_PX2, FILTER_PX2).log_opacities()).numpy()
+    assert after[0] == pytest.approx(before[0], rel=0.01)
+    assert before[1] < 0.4
+    assert after[1] == pytest.approx(0.95, abs=1e-4)  # its width is .37 of what is shown
+    twice = without_blur(gaussians, 10.0 * BLUR_PX2, FILTER_PX2)
+    assert torch.exp(twice.log_opacities()).max() <= 0.99 + 1e-6
+    solid = gaussians.replaced(opacity_logits=torch.full((3,), 12.0))
+    kept = without_blur(solid.baked().mapped(torch.Tensor.float), BLUR_PX2, FILTER_PX2)
+    assert (kept.log_opacities() >= solid.log_opacities() - 1e-6).all()
+
+
+@pytest.mark.parametrize(("blur", "filtered"), [(0.0, FILTER_PX2), (BLUR_PX2, 0.0)])
+def test_without_blur_or_the_size_of_pixels_nothing_changes(blur: float, filtered: float) -> None:
+    gaussians = learnt([(0.5, 0.5, 9.0)], [0.8])
+    assert without_blur(gaussians, blur, filtered) is gaussians
+
+
+def test_baked_gaussians_are_the_same_without_a_filter() -> None:
+    gaussians = learnt([(0.5, 0.7, 9.0), (3.0, 2.0, 0.1)], [0.8, 0.5])
+    baked, before = gaussians.baked().arrays(), gaussians.arrays()
+    assert not gaussians.baked().filter_3d.any()
+    for name in ("means", "scales", "rotations", "log_opacities", "normals"):
+        assert np.allclose(getattr(baked, name), getattr(before, name), rtol=1e-9, atol=1e-12)

@@ -172,6 +172,7 @@ _NAMES = {
     "times the reference machine": ("speed",),
     "1/s": ("video_fps",),
     "of vacancy": ("level",),
+    "px²": ("blur_variance",),
 }  # fmt: skip
 """Names of figures by their unit."""
 _UNITS = {name: unit for unit, names in _NAMES.items() for name in names}

@@ -16,6 +16,7 @@ from ..stages.cameras import scene_stage_name
 from ..stages.meshing import (
     estimate_region_mesh,
     estimate_region_pivots,
+    field_gaussians,
     field_views,
     free_bytes,
     requested_region,
@@ -48,7 +49,6 @@ def _newest_stage(stages: Path, name: str) -> Path:
 def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     from ...field.samples import sample_depth_maps
     from ...field.vacancy import VacancyField
-    from ...gaussians.files import load_gaussians
     from ...meshing.spacing import checked_request
     from ...photos.store import PhotoStore
     from ...regions.files import parse_region_file, read_region_body
@@ -68,10 +68,10 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     trained = _newest_stage(folder.stages, "train")
     scene_stage = _newest_stage(folder.stages, scene_stage_name(finished_job(folder)))
     scene = load_refined_scene(scene_stage, trained)
-    gaussians = load_gaussians(trained / "gaussians.npz")
+    training = read_job(folder.job_path).settings.training
+    gaussians = field_gaussians(trained, training, meshing)
     arrays = gaussians.arrays()
     region, _ = requested_region(wanted, body, scene, arrays)
-    training = read_job(folder.job_path).settings.training
     photos = PhotoStore(scene, training.max_image_px)
     views = field_views(scene, photos, training.holdout_every, meshing.cameras)
     cameras = [scene.views[index].camera for index in views]

@@ -24,7 +24,7 @@ from ...field.samples import DepthSamples
 from ...field.vacancy import PackedMask, VacancyField
 from ...field.vector_field import VectorField
 from ...gaussians.files import load_gaussians
-from ...gaussians.model import GaussianArrays, OrientedGaussians
+from ...gaussians.model import GaussianArrays, OrientedGaussians, without_blur
 from ...mesh.surface_mesh import SurfaceMesh, save_mesh
 from ...meshing import estimate, pivot_meshing
 from ...meshing.checks import mesh_statistics, validate_manifold
@@ -100,7 +100,7 @@ def load_region(
     DeviceError: as :func:`~.choice.stage_device`.
     """
     scene = scene_files.load_refined_scene(cameras.folder, trained.folder)
-    gaussians = load_gaussians(trained.folder / "gaussians.npz")
+    gaussians = field_gaussians(trained.folder, job.settings.training, job.meshing_of(request))
     arrays = gaussians.arrays()
     region, world_region = requested_region(request, job.region_bodies.get(request), scene, arrays)
     if device.is_cuda:
@@ -112,6 +112,17 @@ def load_region(
     )  # fmt: skip
     field = Field(vacancy, VectorField(arrays, threads=threads), threads)
     return RegionInputs(scene, gaussians, arrays, region, world_region, field)
+
+
+def field_gaussians(
+    trained: Path, training: TrainingSettings, meshing: MeshingSettings
+) -> OrientedGaussians:
+    """Return the Gaussians of a finished training as fields take them.
+
+    Raises ParseError: the file is damaged or missing.
+    """
+    gaussians = load_gaussians(trained / "gaussians.npz")
+    return without_blur(gaussians, meshing.blur_variance, training.filter_variance)
 
 
 def requested_region(
