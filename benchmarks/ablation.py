@@ -314,8 +314,8 @@ COMMAND = "python -m benchmarks.ablation"
 
 _GROWTH = {
     "on": (
-        "With `--growth on` only the cap ends growth. Where versions still decided about it,",
-        "nothing was pruned then, either.",
+        "With `--growth on` only the cap ends growth. Versions that had `auto` pruned nothing",
+        "then; later ones do, and have the footprint regulariser.",
     )
 }
 

@@ -6,18 +6,28 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians, without_blur
 from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
 from gaussian_wrapping_addon.core.parallel import default_threads
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.scene.camera import Camera
+from gaussian_wrapping_addon.core.settings import MeshingSettings, TrainingSettings
+
+
+def field_gaussians(path: Path) -> OrientedGaussians:
+    """Read trained Gaussians as fields take them by default (docs/method.md, section 5.7)."""
+    variances = MeshingSettings.blur_variance, TrainingSettings.filter_variance
+    return without_blur(load_gaussians(path), *variances)
+
 
 PROBE_REACH = 2.0
 """Vacancy is sampled along each normal over this many largest thresholds to both sides."""

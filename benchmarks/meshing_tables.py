@@ -25,7 +25,6 @@ from gaussian_wrapping_addon.core.field.samples import sample_depth_maps
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.files import read_json, write_json
-from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.loading.load import load_scene
 from gaussian_wrapping_addon.core.mesh.sampling import distances_to_mesh, sample_triangles
@@ -39,6 +38,7 @@ from gaussian_wrapping_addon.core.regions.shapes import Region
 from gaussian_wrapping_addon.core.scene.camera import Camera, Similarity
 from gaussian_wrapping_addon.core.settings import SPACINGS, MeshingSettings
 
+from .field_errors import field_gaussians
 from .meshing_runs import (
     ADAPTIVE,
     FUSION,
@@ -208,7 +208,7 @@ def open_scene(scene_folder: Path, gaussian_file: Path, *, threads: int) -> Meas
         region = automatic_region(scene)
     truth = read_truth(scene_folder) if (scene_folder / "truth.npz").exists() else None
     return MeasuredScene(
-        load_gaussians(gaussian_file), scene.cameras, region, threads=threads, truth=truth,
+        field_gaussians(gaussian_file), scene.cameras, region, threads=threads, truth=truth,
         world_from_scene=scene.world_from_scene,
     )  # fmt: skip
 

@@ -18,7 +18,6 @@ from gaussian_wrapping_addon.core.field.samples import sample_depth_maps
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh, save_mesh
 from gaussian_wrapping_addon.core.meshing.clean_up import clean_up
@@ -36,6 +35,7 @@ from gaussian_wrapping_addon.core.scene.scene import Scene, load_saved_scene
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from gaussian_wrapping_addon.core.worker.helper_process import largest_helper_bytes, own_peak_bytes
 
+from .field_errors import field_gaussians
 from .meshing_runs import FUSION, MEASURED, MESH, METHODS, PAM, TETRAHEDRA, Method
 from .score import mesh_scene, stage_folder
 
@@ -53,7 +53,7 @@ class Trained:
 def open_trained(scene_folder: Path, job: Path) -> Trained:
     """Read a finished job; the region is that of the scene's folder, else the automatic one."""
     scene = load_saved_scene(stage_folder(job, "cameras"))
-    gaussians = load_gaussians(stage_folder(job, "train") / "gaussians.npz")
+    gaussians = field_gaussians(stage_folder(job, "train") / "gaussians.npz")
     path = scene_folder / "region.json"
     if path.is_file():
         region = read_region(path).transformed(scene.world_from_scene.inverse())

@@ -30,7 +30,7 @@ from gaussian_wrapping_addon.core.evaluation.surface_scores import (
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.files import finite_json, read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
-from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians, without_blur
 from gaussian_wrapping_addon.core.image_metrics import lpips_if_ready, score_images
 from gaussian_wrapping_addon.core.jobs.stages.meshing import field_views
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
@@ -134,20 +134,26 @@ def judge(mesh: Path, scene_folder: Path, job: Path, threads: int, stages: bool)
     if stages:
         gaussians = load_gaussians(stage_folder(job, "train") / "gaussians.npz")
         seen = mesh_scene(job, scene)
-        scores |= judge_stages(gaussians, seen, truth, views, masks, thresholds, threads)
-        scores["depths"] = judge_depths(job, scene, gaussians, textured.mesh, truth, thresholds)
+        settings = read_job(job / "job.json").settings
+        sharp = without_blur(
+            gaussians, settings.meshing.blur_variance, settings.training.filter_variance
+        )
+        scores |= judge_stages(gaussians, sharp, seen, truth, views, masks, thresholds, threads)
+        scores["depths"] = judge_depths(
+            job, scene, gaussians, textured.mesh, truth, thresholds, threads
+        )
     return scores
 
 
 def judge_depths(
     job: Path, scene: Scene, gaussians: OrientedGaussians, mesh: SurfaceMesh, truth: Truth,
-    thresholds: Sequence[float],
+    thresholds: Sequence[float], threads: int,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the errors of depths in training photos, to see where accuracy is won or lost.
 
-    ``start``: what matching the photos knew; ``trained``: of the Gaussians; ``mesh``. All of the
-    same pixels, those of up to :data:`DEPTH_VIEWS` photos.
-    Empty for a training without a dense start.
+    ``start``: what matching the photos knew; ``trained``: of the Gaussians, with the opacities that
+    they were trained with; ``mesh``. All of the same pixels, those of up to :data:`DEPTH_VIEWS`
+    photos. Empty where a training kept no confirmed depths.
     """
     path = stage_folder(job, "train") / PRIORS_FILE
     if not path.is_file():
@@ -163,12 +169,14 @@ def judge_depths(
     inverse = scene.world_from_scene.inverse()
     true = inverse.points(truth.vertices)
     limits = [inverse.scale * limit for limit in thresholds]
+    stages = {
+        "start": start,
+        "trained": rendered_depths(gaussians, cameras, threads),
+        "mesh": mesh_depths(mesh.vertices, mesh.faces, cameras, threads or 1),
+    }
     found = {
-        "start": depth_errors(start, true, truth.faces, limits),
-        "trained": depth_errors(rendered_depths(gaussians, cameras, 0), true, truth.faces, limits),
-        "mesh": depth_errors(
-            mesh_depths(mesh.vertices, mesh.faces, cameras, 1), true, truth.faces, limits
-        ),
+        name: depth_errors(depths, true, truth.faces, limits, threads=threads)
+        for name, depths in stages.items()
     }
     share = THRESHOLD_SHARES[-1] / limits[-1]  # of the diagonal, per scene unit
     return {
@@ -183,6 +191,7 @@ def judge_depths(
 
 def judge_stages(
     gaussians: OrientedGaussians,
+    sharp: OrientedGaussians,
     scene: Scene,
     truth: Truth,
     views: Sequence[tuple[Camera, np.ndarray]],
@@ -190,7 +199,7 @@ def judge_stages(
     thresholds: Sequence[float],
     threads: int,
 ) -> dict[str, Any]:
-    """Return the errors of images, depth and vacancy of the Gaussians.
+    """Return the errors of images and depth of the Gaussians, and of the vacancy of sharp ones.
 
     Lengths are shares of the crop volume's diagonal, as thresholds are.
     """
@@ -213,7 +222,7 @@ def judge_stages(
     ).to_json()  # fmt: skip
     seen = np.flatnonzero(truth.visible())
     chosen = np.random.default_rng(0).choice(seen, min(VACANCY_SAMPLES, len(seen)), replace=False)
-    field = VacancyField(gaussians.arrays(), scene.cameras, threads=threads)
+    field = VacancyField(sharp.arrays(), scene.cameras, threads=threads)
     vacancy = vacancy_errors(
         field, inverse.points(truth.samples.points[chosen]),
         inverse.directions(truth.samples.normals[chosen]), limits,

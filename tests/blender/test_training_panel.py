@@ -55,7 +55,8 @@ def training() -> bpy.types.PropertyGroup:
     return bpy.context.scene.gwrap.training
 
 
-DECIDED = tuple(name for name in MODEL_SELECTION if name not in ("harmonics", "wrapping"))
+SWITCHES = ("harmonics", "growth", "wrapping")
+DECIDED = tuple(name for name in MODEL_SELECTION if name not in SWITCHES)
 
 
 def choices_of(name: str) -> set[str]:

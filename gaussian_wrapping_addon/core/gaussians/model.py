@@ -114,13 +114,13 @@ class OrientedGaussians:
         loss = self.log_scales - torch.log(self.scales())  # (n, 3), <= 0
         return -torch.nn.functional.softplus(-self.opacity_logits) + loss.sum(1)
 
-    def baked(self, more: Tensor | float = 0.0) -> OrientedGaussians:
+    def baked(self, more_log_opacity: Tensor | float = 0.0) -> OrientedGaussians:
         """Return the same Gaussians, float64 and detached, with the filter in their own parameters.
 
-        ``more`` (n,) is added to the logarithms of the opacities, which stay below 1.
+        ``more_log_opacity`` (n,) is added to the logarithms of the opacities, which stay below 1.
         """
         wide = self.mapped(lambda value: value.detach().cpu().double())
-        log_opacity = (wide.log_opacities() + more).clamp_max(-_LEAST_TRANSPARENCY)
+        log_opacity = (wide.log_opacities() + more_log_opacity).clamp_max(-_LEAST_TRANSPARENCY)
         # logit = log(a / (1 - a)), from log a without losing a close to 1
         logit = log_opacity - torch.log(-torch.expm1(log_opacity))
         return wide.replaced(
@@ -256,11 +256,12 @@ def without_blur(
     """
     if variance_px <= 0.0 or filter_variance_px <= 0.0:
         return gaussians
-    square = gaussians.scales().detach().cpu().double().sort(1).values[:, 1] ** 2  # (n,)
-    blur = gaussians.filter_3d.detach().cpu().double() ** 2 * (variance_px / filter_variance_px)
+    wide = gaussians.mapped(lambda value: value.detach().cpu().double())
+    square = wide.scales().sort(1).values[:, 1] ** 2  # (n,)
+    blur = wide.filter_3d**2 * (variance_px / filter_variance_px)
     own = torch.maximum(square - blur, LEAST_WIDTH_SHARE**2 * square)
-    room = (math.log(MOST_OPACITY) - gaussians.log_opacities().detach().cpu().double()).clamp_min(0)
-    return gaussians.baked(torch.minimum(0.5 * torch.log(square / own), room)).mapped(Tensor.float)
+    room = (math.log(MOST_OPACITY) - wide.log_opacities()).clamp_min(0.0)
+    return wide.baked(torch.minimum(0.5 * torch.log(square / own), room)).mapped(Tensor.float)
 
 
 # -- Initial Gaussians: from sparse points, and along camera rays if these are few ----------------

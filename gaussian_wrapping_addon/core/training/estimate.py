@@ -361,9 +361,9 @@ def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float
     start = min(limit, max(facts.points, MIN_START_POINTS))
     if settings.dense_start != "off" and facts.photos > 1:
         start = max(start, start_budget(limit))
-    top = start + growth * (limit - start) if settings.prune_share > 0.0 else limit
-    if settings.growth == "off":
-        top = start
+    top = float(start)
+    if settings.growth != "off":
+        top = start + growth * (limit - start) if settings.prune_share > 0.0 else limit
     total = settings.iterations + settings.extra_iterations
     counts = np.empty(total)
     count = float(start)

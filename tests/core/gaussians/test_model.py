@@ -318,7 +318,10 @@ def test_surfaces_keep_their_opacity_and_none_is_lost_or_becomes_solid() -> None
     assert before[1] < 0.4
     assert after[1] == pytest.approx(0.95, abs=1e-4)  # its width is .37 of what is shown
     twice = without_blur(gaussians, 10.0 * BLUR_PX2, FILTER_PX2)
-    assert torch.exp(twice.log_opacities()).max() <= 0.99 + 1e-6
+    assert torch.exp(twice.log_opacities()).max() == pytest.approx(0.99, abs=1e-6)
+    faint = gaussians.replaced(opacity_logits=torch.full((3,), -6.0))
+    rise = without_blur(faint, 1000.0, FILTER_PX2).log_opacities() - faint.log_opacities()
+    assert rise.numpy() == pytest.approx(math.log(1 / 0.3), abs=1e-4)
     solid = gaussians.replaced(opacity_logits=torch.full((3,), 12.0))
     kept = without_blur(solid.baked().mapped(torch.Tensor.float), BLUR_PX2, FILTER_PX2)
     assert (kept.log_opacities() >= solid.log_opacities() - 1e-6).all()

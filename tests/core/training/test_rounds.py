@@ -119,7 +119,17 @@ def test_growth_off_keeps_the_number_of_gaussians() -> None:
         rounds.stepper.step(state)
         rounds.after_step(state)
         assert len(state.adam) == len(before)
-    assert not rounds.schedule.controls_density  # no footprint regulariser either
+
+
+def test_the_footprint_regulariser_belongs_to_density_control() -> None:
+    def means(growth: str, price: float) -> np.ndarray:
+        settings = dataclasses.replace(
+            SETTINGS, growth=growth, wrapping="off", prune_share=0.0, overlap_price=price
+        )
+        return run(settings, 4)[1].adam.array("log_scales")
+
+    assert np.array_equal(means("off", 0.0), means("off", 0.5))
+    assert not np.array_equal(means("on", 0.0), means("on", 0.5))
 
 
 @pytest.mark.parametrize(("free_views", "left"), [(2, 0), (0, 1)])

@@ -16,7 +16,6 @@ from ..stages.cameras import scene_stage_name
 from ..stages.meshing import (
     estimate_region_mesh,
     estimate_region_pivots,
-    field_gaussians,
     field_views,
     free_bytes,
     requested_region,
@@ -49,6 +48,8 @@ def _newest_stage(stages: Path, name: str) -> Path:
 def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     from ...field.samples import sample_depth_maps
     from ...field.vacancy import VacancyField
+    from ...gaussians.files import load_gaussians
+    from ...gaussians.model import without_blur
     from ...meshing.spacing import checked_request
     from ...photos.store import PhotoStore
     from ...regions.files import parse_region_file, read_region_body
@@ -69,9 +70,11 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     scene_stage = _newest_stage(folder.stages, scene_stage_name(finished_job(folder)))
     scene = load_refined_scene(scene_stage, trained)
     training = read_job(folder.job_path).settings.training
-    gaussians = field_gaussians(trained, training, meshing)
+    trained_ones = load_gaussians(trained / "gaussians.npz")
+    whole = trained_ones.arrays() if wanted == "all" else None
+    region, _ = requested_region(wanted, body, scene, whole)
+    gaussians = without_blur(trained_ones, meshing.blur_variance, training.filter_variance)
     arrays = gaussians.arrays()
-    region, _ = requested_region(wanted, body, scene, arrays)
     photos = PhotoStore(scene, training.max_image_px)
     views = field_views(scene, photos, training.holdout_every, meshing.cameras)
     cameras = [scene.views[index].camera for index in views]

@@ -46,12 +46,11 @@ _logger = logging.getLogger(__name__)
 COARSE: dict[str, Any] = {
     "iterations": 500, "extra_iterations": 0, "max_gaussians": 20_000, "max_image_px": 320,
     "sh_degree": 0, "holdout_every": 0, "harmonics": "off", "multi_view": "off", "wrapping": "off",
-    "growth": "on", "prune_share": 0.0, "overlap_price": 0.0, "full_size": "on",
-    "dense_start": "off", "refine_poses": "off", "region_weight": 1.0, "focus": "",
-    "preview_every_s": 0.0,
+    "growth": "on", "full_size": "on", "dense_start": "off", "refine_poses": "off",
+    "region_weight": 1.0, "focus": "", "preview_every_s": 0.0,
 }  # fmt: skip
 """Settings of the short training: silhouettes need neither detail nor directions. Exposure and the
-constants of the method are the job's."""
+constants of the method are the job's, but nothing is pruned. All are in the key of the masks."""
 SILHOUETTE_PX = 800
 """Longest side of the rendered silhouettes."""
 MOST_SIZE_SHARE = 0.1
@@ -136,7 +135,9 @@ def _coarse_training(
     done = folder / "gaussians.npz"
     if done.is_file():
         return load_gaussians(done)
-    settings = dataclasses.replace(job.settings.training, **COARSE)
+    settings = dataclasses.replace(
+        job.settings.training, **COARSE, prune_share=0.0, overlap_price=0.0
+    )
     folder.mkdir(exist_ok=True)
     compile_if_needed(settings, folder, progress, threads, device)
     photos = PhotoStore(scene, settings.max_image_px)

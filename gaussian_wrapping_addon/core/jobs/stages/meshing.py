@@ -100,29 +100,20 @@ def load_region(
     DeviceError: as :func:`~.choice.stage_device`.
     """
     scene = scene_files.load_refined_scene(cameras.folder, trained.folder)
-    gaussians = field_gaussians(trained.folder, job.settings.training, job.meshing_of(request))
+    trained_ones = load_gaussians(trained.folder / "gaussians.npz")
+    whole = trained_ones.arrays() if request == "all" else None
+    region, world_region = requested_region(request, job.region_bodies.get(request), scene, whole)
+    training, meshing = job.settings.training, job.meshing_of(request)
+    gaussians = without_blur(trained_ones, meshing.blur_variance, training.filter_variance)
     arrays = gaussians.arrays()
-    region, world_region = requested_region(request, job.region_bodies.get(request), scene, arrays)
     if device.is_cuda:
         needed = cuda_vacancy.needed_bytes(len(arrays))
         device = stage_device(device, job.settings.device, needed, "Vacancy")
     vacancy = region_field(
-        scene, arrays, region, job.settings.training, job.meshing_of(request), threads=threads,
-        device=device.device,
-    )  # fmt: skip
+        scene, arrays, region, training, meshing, threads=threads, device=device.device
+    )
     field = Field(vacancy, VectorField(arrays, threads=threads), threads)
     return RegionInputs(scene, gaussians, arrays, region, world_region, field)
-
-
-def field_gaussians(
-    trained: Path, training: TrainingSettings, meshing: MeshingSettings
-) -> OrientedGaussians:
-    """Return the Gaussians of a finished training as fields take them.
-
-    Raises ParseError: the file is damaged or missing.
-    """
-    gaussians = load_gaussians(trained / "gaussians.npz")
-    return without_blur(gaussians, meshing.blur_variance, training.filter_variance)
 
 
 def requested_region(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,13 +27,14 @@ from gaussian_wrapping_addon.core.errors import (
 from gaussian_wrapping_addon.core.field import cuda_vacancy, samples
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField, VacancyResult
 from gaussian_wrapping_addon.core.files import read_json
-from gaussian_wrapping_addon.core.gaussians.files import load_gaussians
+from gaussian_wrapping_addon.core.gaussians.files import load_gaussians, save_gaussians
 from gaussian_wrapping_addon.core.jobs.parts.graph import Part, read_state
 from gaussian_wrapping_addon.core.jobs.parts.runner import InProcess, PartResult, PartRunner, Walk
 from gaussian_wrapping_addon.core.jobs.stages import meshing
 from gaussian_wrapping_addon.core.jobs.stages.meshing import (
     field_figures,
     field_views,
+    load_region,
     region_field,
     requested_region,
 )
@@ -56,7 +58,12 @@ from gaussian_wrapping_addon.core.render.cuda.device_renderer import DeviceRende
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.scene.camera import Similarity
 from gaussian_wrapping_addon.core.scene.scene import Scene, View, load_saved_scene
-from gaussian_wrapping_addon.core.settings import MeshingSettings, TrainingSettings
+from gaussian_wrapping_addon.core.settings import (
+    JobSettings,
+    MeshingSettings,
+    TrainingSettings,
+    preset,
+)
 from tests.core.field.field_scenes import camera_at, cameras_around, shell_arrays
 from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
 from tests.core.jobs.test_device_job import emulate
@@ -359,6 +366,41 @@ def test_the_mesh_lies_at_the_level() -> None:
         mesh = mesh_by_pivots(field, arrays, field.cameras, region, settings, Progress(), seed=0)
         at = plain.vacancy(mesh.vertices).vacancy
         assert abs(float(np.median(at)) - level) < 0.02
+
+
+@pytest.mark.parametrize("blur", [0.25, 0.0])
+def test_fields_take_the_opacity_without_blur_and_regions_the_trained_one(
+    tmp_path: Path, blur: float
+) -> None:
+    """Of rods half a pixel wide; what is one of them is faint enough to widen no region."""
+    folder = write_finished_sphere(tmp_path)
+    cameras, train = (
+        Stage(name, "", next(folder.stages.glob(f"{name}-*")), {}, True)
+        for name in ("cameras", "train")
+    )
+    training = TrainingSettings()
+    rods = load_gaussians(train.folder / "gaussians.npz")
+    pixel = 0.01
+    rods.log_scales[:] = torch.log(torch.tensor([0.2, 0.6 * pixel, 0.5 * pixel]))
+    rods.opacity_logits[:] = -0.5
+    rods.filter_3d[:] = math.sqrt(training.filter_variance) * pixel
+    rods.means[0], rods.opacity_logits[0] = torch.tensor([9.0, 0.0, 0.0]), -2.3
+    save_gaussians(train.folder / "gaussians.npz", rods)
+    earlier = read_job(folder.job_path)
+    settings = dataclasses.replace(
+        earlier.settings, meshing=MeshingSettings(blur_variance=blur), regions=("all",)
+    )
+    job = make_job("mesh", Path(earlier.source), settings)
+    inputs = load_region(job, "all", cameras, train, PROCESSOR, 1)
+    trained = rods.arrays().log_opacities
+    rise = inputs.arrays.log_opacities - trained
+    wide_sq = 0.6**2 + training.filter_variance
+    wanted = 0.5 * math.log(wide_sq / (wide_sq - blur))
+    assert rise == pytest.approx(wanted, abs=1e-5)
+    assert (blur > 0) == (wanted > 0.4)
+    assert inputs.region.vertices.max() < 5.0, "the faint one is not within the region"
+    assert JobSettings().meshing.blur_variance == 0.25
+    assert preset("paper").meshing.blur_variance == 0.0
 
 
 def test_the_method_asks_the_cameras_that_were_trained_on(tmp_path: Path) -> None:
