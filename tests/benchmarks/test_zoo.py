@@ -235,6 +235,10 @@ def test_a_page_is_written_from_records_alone(tmp_path: Path) -> None:
     ]
     for record in records[:2] + records[4:]:  # the others are of an earlier version of the scene
         record.scores[FIGURES] = {"scene": scene_folder(record.case.scene).name}
+    records[0].scores["depths"] = {
+        stage: {"within": [share, share + 0.1, share + 0.2]}
+        for stage, share in (("start", 0.1), ("trained", 0.4), ("mesh", 0.7))
+    }
     for record in records:
         write_record(record, tmp_path)
     found = read_labels(tmp_path)
@@ -258,6 +262,10 @@ def test_a_page_is_written_from_records_alone(tmp_path: Path) -> None:
     assert f"{floaters(records[1]):.3f}" in row
     assert "| thin-t1 * |" in text
     assert "| thin-d2 |" in text.replace("  ", "")
+    depths = text.split("## more")[0].split("### Depths")[1].splitlines()
+    (row,) = [line for line in depths if line.startswith("| thin-")]
+    cells = [cell.strip() for cell in row.strip("| ").split("|")]
+    assert cells == ["thin-d1", *(f"{k / 10:.3f}" for k in range(1, 10))]
     alpha = next(line for line in text.splitlines() if line.startswith("| thin-d1 |"))
     assert three(records[4].f1(1, "scan")) in alpha
     assert write_document(tmp_path, tmp_path / "nothing") is None
